@@ -93,7 +93,7 @@ def require_pair(first: Sweep, second: Sweep) -> None:
 
 def stack_for(sweep: Sweep, config: Config) -> ImageStack:
     """Where the reduced images of a sweep are to be kept while it is tracked."""
-    return ImageStack(IntensityExtractor.for_sweep(sweep, config.intensity).grid)
+    return ImageStack(IntensityExtractor(sweep.signal, sweep.grid, config.intensity).grid)
 
 
 def crossing_side(sweep: Sweep, tracked: Tracked, stack: ImageStack, config: Config) -> CrossingSweep:

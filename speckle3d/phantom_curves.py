@@ -23,7 +23,7 @@ from speckle3d.matching.matcher import FrameMatcher
 from speckle3d.matching.patches import PatchGrid
 from speckle3d.matching.schedule import KnownSchedule
 from speckle3d.matching.table import CorrelationTable
-from speckle3d.matching.texture import PHANTOM_FRAMES, Texture, mean_spectra
+from speckle3d.matching.texture import PHANTOM_FRAMES, mean_spectra
 from speckle3d.motion.phantom import CurveSettings, PhantomSamples, fit_curves
 
 SMOOTHED_FRAMES = 8
@@ -57,11 +57,16 @@ def calibrate_curves(
     settings = config or Config()
     if not sweeps:
         raise InsufficientDataError("expected at least one phantom sweep, got none")
-    keys, samples, textures, before = [], [], [], 0
+    keys, samples, sizes, spectra, before = [], [], [], [], 0
     total = sum(len(sweep) for sweep in sweeps)
     for sweep in sweeps:
         matcher = FrameMatcher(
-            sweep, settings.intensity, settings.patches, settings.inplane, settings.matching
+            sweep,
+            settings.intensity,
+            settings.patches,
+            settings.inplane,
+            settings.matching,
+            settings.quality,
         )
         keys.append(matcher.key)
         keys[0].require_same(matcher.key, "the phantom sweeps do not match each other")
@@ -71,18 +76,17 @@ def calibrate_curves(
             sweep,
             matcher,
             KnownSchedule(pairs),
-            settings.quality,
             after(progress, before, total),
             textures=PHANTOM_FRAMES,
         )
         samples.append(phantom_samples(poses, matcher.patches, matches.table, pairs))
-        textures.append((matcher.patches.row_depth_mm, matches.texture))
+        sizes.append((matcher.patches.row_depth_mm, matches.texture.speckle_size()))
+        spectra.append(matches.texture.spectra())
         before += len(sweep)
     curves = fit_curves(keys[0], samples, settings.curves)
-    spectra = [texture.spectra() for _, texture in textures]
     return replace(
         curves,
-        speckle=_mean_speckle(curves.depth_mm, textures),
+        speckle=_mean_speckle(curves.depth_mm, sizes),
         spectrum=mean_spectra([each for each in spectra if each is not None]),
     )
 
@@ -156,9 +160,11 @@ def phantom_samples(
     )
 
 
-def _mean_speckle(depth_mm: FloatArray, textures: Sequence[tuple[FloatArray, Texture]]) -> SpeckleSize | None:
+def _mean_speckle(
+    depth_mm: FloatArray, sizes: Sequence[tuple[FloatArray, SpeckleSize]]
+) -> SpeckleSize | None:
     """Mean speckle size of phantom sweeps at the depths of the curves; None if unknown."""
-    means, sizes = [], [(depths, texture.speckle_size()) for depths, texture in textures]
+    means = []
     for name in ("lateral_mm", "axial_mm"):
         known = [(depths, getattr(size, name)) for depths, size in sizes]
         known = [(depths[fair], size[fair]) for depths, size in known if (fair := np.isfinite(size)).any()]

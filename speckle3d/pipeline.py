@@ -25,21 +25,22 @@ from speckle3d.core.progress import Progress
 from speckle3d.core.reconstruction import FramePairs, SharedErrors
 from speckle3d.core.relative import RelativePoses
 from speckle3d.core.shown import shown
-from speckle3d.core.sweep import BModeSettings, Sweep
+from speckle3d.core.sweep import Sweep
+from speckle3d.examine.curves import examine_key, unrefuted
 from speckle3d.examine.disagreements import disagreements
-from speckle3d.examine.images import examine_images
+from speckle3d.examine.images import examine_echoes, examine_images
 from speckle3d.examine.processing import processing_doubts, shortening, structure_openness
-from speckle3d.examine.recording import examine_recording, unrefuted
 from speckle3d.examine.sensors import examined_sensors
 from speckle3d.io.curves import curves_beside, read_curves, trust_words
-from speckle3d.matching.frames import ImageSink, MatchedSweep, match_sweep
+from speckle3d.matching.frames import ImageSink, match_sweep
 from speckle3d.matching.matcher import FrameMatcher
-from speckle3d.matching.quality import FrameFlag, describe, flag_frames
+from speckle3d.matching.quality import FrameFlag, require_placed
 from speckle3d.matching.schedule import PairSchedule
 from speckle3d.motion.attenuation import Attenuation, estimate_attenuation
 from speckle3d.motion.coherence import Coherence
+from speckle3d.motion.compression import compression_sigma
 from speckle3d.motion.direction import sensed_orientation, settle_direction
-from speckle3d.motion.estimate import Motion, estimate_motion, frame_pairs
+from speckle3d.motion.estimate import estimate_motion, frame_pairs
 from speckle3d.motion.lens import stretched
 from speckle3d.motion.planes import MotionProblem
 from speckle3d.motion.subset import consistent_poses
@@ -48,9 +49,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 PairSink = Callable[[FramePairs], None]
-"""Called with some pairs at a time, in the order of their second frames, once the signs are settled."""
-MOST_LOST = 0.3
-"""Share of frames that may not be placed; with more, lengths are mostly guesses."""
+"""Called with the frame pairs, in the order of their second frames, once the signs are settled."""
 
 
 @shown
@@ -195,7 +194,7 @@ def track(
     progress : callable, optional
         Called with frames done and frames in all; `speckle3d.progress_bar` makes one.
     sink : callable, optional
-        Called with the frame pairs, some at a time.
+        Called with the frame pairs.
     images : callable, optional
         Called with every intensity image.
 
@@ -222,69 +221,78 @@ def track(
     """
     require_kind(sweep, Sweep, "sweep", "load_sweep(path)")
     settings = config or Config()
-    curves = _curves_beside(sweep, settings.curves.same_probe) if curves is None else curves
-    require_kind(curves, DecorrelationCurves, "curves", "load_curves(path)")
-    if len(sweep) < 2:
-        raise InsufficientDataError(f"{sweep.name}: expected at least 2 frames, got {len(sweep)}")
-    sweep = _with_known_range(sweep, curves)
-    matcher = matcher_for(sweep, curves, settings)
-    doubts = examine_recording(sweep, matcher, curves)
+    if curves is None:
+        curves = _curves_beside(sweep, settings.curves.same_probe)
+    else:
+        require_kind(curves, DecorrelationCurves, "curves", "load_curves(path)")
+    with naming(sweep.name):
+        if len(sweep) < 2:
+            raise InsufficientDataError(f"expected at least 2 frames, got {len(sweep)}")
+        matcher = FrameMatcher(
+            sweep,
+            settings.intensity,
+            settings.patches,
+            settings.inplane,
+            settings.matching,
+            settings.quality,
+            curves,
+        )
+        doubts = examine_key(curves, matcher.laid, matcher.patches)
+        matches = match_sweep(sweep, matcher, PairSchedule(settings.trajectory), progress, images)
+        doubts += examine_echoes(matches)
+        flags = matches.flags(settings.quality, settings.trajectory.least_correlation)
+        require_placed(flags)
 
-    matches = match_sweep(
-        sweep, matcher, PairSchedule(settings.trajectory), settings.quality, progress, images
-    )
-    flags = frame_flags(matches, settings)
-    require_placed(flags, sweep.name)
+        attenuation = estimate_attenuation(curves, matches.texture.spectra(flags == 0))
+        structure = 0.0 if curves.of_tissue else structure_openness(matches.texture)
+        if structure:
+            curves = replace(stretched(curves, np.array(structure)), of_tissue=True)
+        read = attenuation.applied(curves), matcher.patches, matcher.centre_mm, len(sweep)
+        problem = MotionProblem(*read, settings.planes, settings.trajectory)
+        bad = (flags & ~FrameFlag.UNMATCHED) != 0
+        motion = estimate_motion(
+            problem, matches.table, ~bad[matches.table.first] & ~bad[matches.table.second]
+        )
+        flags[motion.unplaced & (flags == 0)] = int(FrameFlag.UNMATCHED)
+        require_placed(flags)
 
-    attenuation = estimate_attenuation(curves, matches.texture.spectra(flags == 0))
-    structure = 0.0 if curves.of_tissue else structure_openness(matches.texture)
-    if structure:
-        curves = replace(stretched(curves, np.array(structure)), of_tissue=True)
-    problem = motion_problem(attenuation.applied(curves), matcher, len(sweep), settings)
-    bad = (flags & ~FrameFlag.UNMATCHED) != 0
-    motion = estimate_motion(problem, matches.table, ~bad[matches.table.first] & ~bad[matches.table.second])
-    flags[motion.unplaced & (flags == 0)] = int(FrameFlag.UNMATCHED)
-    require_placed(flags, sweep.name)
+        sensors = examined_sensors(sweep, motion.poses, settings.sensors.examine)
+        direction, source = settle_direction(
+            sensors.trusted, motion.poses, settings.sensors, sensors.turn_confirmed
+        )
+        motion = motion.mirrored() if direction < 0 else motion
+        sensed = sensed_orientation(sensors.trusted, settings.sensors)
+        subset, used = (None, motion.pairs.used) if sensed is None else consistent_poses(motion, sensed)
+        mismatch = motion.problem.curves.mismatch(settings.curves.same_probe, attenuation.log_length_sigma)
+        short, compression = shortening(matches), compression_sigma(motion, matcher.signal)
+        open_sigma = float(np.linalg.norm([mismatch, short, compression]))
+        shared, covariance = motion.claims(float(np.hypot(open_sigma, structure)))
 
-    sensors = examined_sensors(sweep, motion.poses, settings.sensors.examine)
-    direction, source = settle_direction(
-        sensors.trusted, motion.poses, settings.sensors, sensors.turn_confirmed
-    )
-    motion = motion.mirrored() if direction < 0 else motion
-    mismatch = motion.problem.curves.mismatch(settings.curves.same_probe, attenuation.log_length_sigma)
-    short, compression = shortening(matches), _compression_error(sweep, curves, settings, motion)
-    open_sigma = float(np.linalg.norm([mismatch, short, compression]))
-    shared, covariance = motion.claims(float(np.hypot(open_sigma, structure)))
-    doubts += attenuation.doubts
-    doubts += unrefuted(processing_doubts(structure, short), sweep.name, InsufficientDataError)
-    # What structure leaves open is told by itself.
-    known = motion.claims(open_sigma)[1]
-    doubts += examine_images(sweep, matcher, matches, motion, known, curves, flags == 0)
-    doubts += sensors.doubts
-    doubts += disagreements(sensors.trusted, motion.poses, covariance)
-
-    sensed = sensed_orientation(sensors.trusted, settings.sensors)
-    subset, used = (None, motion.pairs.used) if sensed is None else consistent_poses(motion, sensed)
-    if sink:
-        for pairs in frame_pairs(motion, used, shared.length_sigma):
-            sink(pairs)
-    return Tracked(
-        image=motion.poses,
-        covariance=covariance,
-        subset=subset,
-        rejected_share=float("nan") if subset is None else 1.0 - float(used[motion.pairs.used].mean()),
-        flags=flags,
-        edges=motion.edges,
-        direction=direction,
-        direction_from=source,
-        attenuation=attenuation,
-        coherence=motion.coherence,
-        curves=motion.problem.curves,
-        shared=shared,
-        doubts=doubts,
-        grid=sweep.grid,
-        frame_time_s=sweep.frame_time_s,
-    )
+        doubts += attenuation.doubts
+        doubts += unrefuted(processing_doubts(structure, short), InsufficientDataError)
+        # What structure leaves open is told by itself.
+        doubts += examine_images(matches, motion, motion.claims(open_sigma)[1], curves, flags == 0)
+        doubts += sensors.doubts
+        doubts += disagreements(sensors.trusted, motion.poses, covariance)
+        if sink:
+            sink(frame_pairs(motion, used, shared.length_sigma))
+        return Tracked(
+            image=motion.poses,
+            covariance=covariance,
+            subset=subset,
+            rejected_share=float("nan") if subset is None else 1.0 - float(used[motion.pairs.used].mean()),
+            flags=flags,
+            edges=motion.edges,
+            direction=direction,
+            direction_from=source,
+            attenuation=attenuation,
+            coherence=motion.coherence,
+            curves=motion.problem.curves,
+            shared=shared,
+            doubts=doubts,
+            grid=sweep.grid,
+            frame_time_s=sweep.frame_time_s,
+        )
 
 
 def require_kind(value: Any, kind: type, name: str, made_by: str) -> None:
@@ -310,35 +318,6 @@ def require_kind(value: Any, kind: type, name: str, made_by: str) -> None:
         raise InvalidInputError(f"{name}: expected a {kind.__name__}, as {made_by} gives it, got {got}")
 
 
-def _with_known_range(sweep: Sweep, curves: DecorrelationCurves) -> Sweep:
-    """The sweep with the curves' dynamic range where its own is estimated."""
-    own, known = sweep.signal, curves.key.signal
-    if isinstance(own, BModeSettings) and own.dynamic_range_sigma_db and isinstance(known, BModeSettings):
-        return replace(sweep, signal=replace(known, full_scale=own.full_scale))
-    return sweep
-
-
-def _compression_error(sweep: Sweep, curves: DecorrelationCurves, config: Config, motion: Motion) -> float:
-    """Relative standard deviation of distances by a dynamic range that is estimated.
-
-    One that is wider by its deviation is tried. Curves measured with images compressed alike have its error
-    in them.
-    """
-    signal = sweep.signal
-    if not isinstance(signal, BModeSettings) or curves.origin != "data sheet":
-        return 0.0
-    if not signal.dynamic_range_sigma_db:
-        return 0.0
-    wider = replace(signal, dynamic_range_db=signal.dynamic_range_db + signal.dynamic_range_sigma_db)
-    other = replace(sweep, signal=wider)
-    matcher, schedule = matcher_for(other, curves, config), PairSchedule(config.trajectory)
-    matches = match_sweep(other, matcher, schedule, config.quality)
-    table, bad = matches.table, flag_frames(matches.features, config.quality) != 0
-    read = estimate_motion(motion.problem, table, ~bad[table.first] & ~bad[table.second])
-    spans = [np.ptp(each.poses.apply(sweep.grid.centre_mm)[:, 2]) for each in (motion, read)]
-    return abs(float(np.log(spans[1] / spans[0])))
-
-
 def _curves_beside(sweep: Sweep, same_probe: bool) -> DecorrelationCurves:
     """Read the curves that lie beside a sweep's recording."""
     if sweep.path is None:
@@ -347,43 +326,3 @@ def _curves_beside(sweep: Sweep, same_probe: bool) -> DecorrelationCurves:
     curves = read_curves(path)
     warnings.warn(trust_words(path, curves, same_probe), stacklevel=3)
     return curves
-
-
-def matcher_for(sweep: Sweep, curves: DecorrelationCurves, config: Config) -> FrameMatcher:
-    """Make the matcher of a sweep's frames, none of which is read.
-
-    Raises
-    ------
-    MismatchError
-        If the curves belong to another probe, frequency, sampling, patch size or depth.
-    """
-    matcher = FrameMatcher(sweep, config.intensity, config.patches, config.inplane, config.matching)
-    curves.key.require_same(matcher.key)
-    with naming(sweep.name):
-        matcher.keep_depths(curves.depth_mm)
-    return matcher
-
-
-def motion_problem(
-    curves: DecorrelationCurves, matcher: FrameMatcher, frames: int, config: Config
-) -> MotionProblem:
-    """Gather what correlations are read with."""
-    return MotionProblem(curves, matcher.patches, matcher.centre_mm, frames, config.planes, config.trajectory)
-
-
-def frame_flags(matches: MatchedSweep, config: Config) -> IntArray:
-    """Flags of all frames by what is in them and what they share with others."""
-    flags = flag_frames(matches.features, config.quality)
-    unmatched = matches.table.unmatched(len(matches.features), config.trajectory.least_correlation)
-    flags[unmatched] |= FrameFlag.UNMATCHED
-    return flags
-
-
-def require_placed(flags: IntArray, name: str) -> None:
-    """Raise `InsufficientDataError` if too many frames have a flag."""
-    lost = int((flags != 0).sum())
-    if lost > MOST_LOST * len(flags):
-        raise InsufficientDataError(
-            f"{name}: expected frames with speckle in common, got {lost} of {len(flags)} that cannot "
-            f"be placed: {'; '.join(describe(flags))}"
-        )

@@ -24,6 +24,10 @@ STRUCTURE = np.array([19.0, 0.0, 0.0, 0.0, 0.0, 8.0])
 SCALE_CHANGE_MM, TURN_CHANGE_MM = 2.0, 15.0
 """Travel over which the error of the scale changes, with the tissue, and a hand's tilt and yaw wander."""
 
+HELD = np.array([1.0, 1.0, 1.0, 0.05, 0.05, 0.05])
+"""How far a probe may go between two frames that no pair joins, deviations of (x, y, z, tilt, yaw, roll), mm
+and rad: 25 mm and 70 degrees in a second at 25 frames."""
+
 
 @shown
 @dataclass(frozen=True)

@@ -27,9 +27,6 @@ from speckle3d.correction.curves import (
     curve_basis,
 )
 
-_MOST_EVALUATIONS = 200
-"""Of the optimisation; sweeps need 10 to 20."""
-
 
 class DriftSettings(BaseModel):
     """How drift is corrected."""
@@ -239,7 +236,6 @@ def _solve(
         xtol=tolerance,
         ftol=tolerance,
         gtol=tolerance,
-        max_nfev=_MOST_EVALUATIONS,
     )
 
 

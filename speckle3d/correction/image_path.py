@@ -10,7 +10,7 @@ from scipy.sparse.linalg import splu
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import FloatArray, IntArray
-from speckle3d.core.relative import SCALE_CHANGE_MM, SHARED, STRUCTURE, TURN_CHANGE_MM, RelativePoses
+from speckle3d.core.relative import HELD, SCALE_CHANGE_MM, SHARED, STRUCTURE, TURN_CHANGE_MM, RelativePoses
 from speckle3d.correction.curves import AXES, CorrectedChain
 from speckle3d.correction.scale import ScaleEvidence
 
@@ -21,8 +21,6 @@ SIDEWAYS, SIDEWAYS_BY_SHARE = 0.005, (0.5, 0.1)
 least, and its growth with the share of echoes that stay. Of simulated phantoms and tissue."""
 LEAST_STEP_MM = 0.005
 """A resting probe's corrections spread over its frames as if each moved by so much."""
-UNJOINED = np.array([1.0, 1.0, 1.0, 0.05, 0.05, 0.05])
-"""Standard deviation of a hand's motion between two frames that no pair joins, mm and rad."""
 HAND_TURN_RAD = float(np.deg2rad(1.0))
 """How far a scanning hand tilts and yaws in a second, deviation of a random walk: over tissue images see none
 of it. Three freehand sweeps of the PLUS library turn by 0.4 to 1.6 degrees in a second."""
@@ -149,7 +147,7 @@ def _knot_variances(edges: RelativePoses, knots: IntArray, frames: int) -> Float
     variances = []
     for axis in range(6):
         joined = 1.0 / edges.covariance[:, axis, axis]
-        information = np.concatenate([joined, np.full(frames - 1, UNJOINED[axis] ** -2)])
+        information = np.concatenate([joined, np.full(frames - 1, HELD[axis] ** -2)])
         factor = splu((difference.T @ sparse.diags(information) @ difference).tocsc())
         variances.append((between[1:] * factor.solve(between[1:])).sum(axis=0))
     return np.array(variances)

@@ -13,7 +13,6 @@ from speckle3d.core.sweep import OrientationSensor
 
 TURN_S = 0.3
 """A hand's wobble turns round within this time; over longer ones a gyroscope's bias counts."""
-FEWEST_READINGS = 20
 LEAST_TURN_DEG, SCALE_ERROR = 0.1, 0.05
 """Noise of a turn over `TURN_S`, and the share of it by which gyroscopes and readings honestly differ."""
 LEAST_GAIN = 4.0
@@ -21,8 +20,8 @@ LEAST_GAIN = 4.0
 gain up to 0.1, faulty ones from 5."""
 MOST_BIAS_DEG_S = 3.0
 """Biases of gyroscopes in orientation sensors are below 1 degree/s once they have stood still."""
-TILTED_DEG, UPRIGHT_DEG = 25.0, 10.0
-"""Angle between gravity and the world's z that contradicts a sensor, and that a convention may leave."""
+TILTED_DEG = 25.0
+"""Angle between gravity and the world's z that contradicts a sensor."""
 MIRRORS = {"x": (-1.0, 1.0, 1.0), "y": (1.0, -1.0, 1.0), "z": (1.0, 1.0, -1.0)}
 
 
@@ -45,7 +44,7 @@ def _spread(values: FloatArray) -> FloatArray:
 def doubts_of_gyroscope(sensor: OrientationSensor) -> Iterator[Doubt]:
     """At most one: the convention in which readings turn as the gyroscope, or that they do not."""
     rate, time_s, readings = sensor.gyroscope_rad_s, sensor.readings.time_s, sensor.readings.world_from_sensor
-    if rate is None or len(time_s) < FEWEST_READINGS:
+    if rate is None or len(time_s) < 2:
         return
     pause = np.diff(time_s)
     lag = max(1, round(TURN_S / float(np.median(pause))))
@@ -68,18 +67,17 @@ def doubts_of_gyroscope(sensor: OrientationSensor) -> Iterator[Doubt]:
     upright = [
         (misfit(left) - misfit(difference(other)), name)
         for name, other in conventions(readings)
-        if not _gravity_from_vertical(sensor, other) > UPRIGHT_DEG
+        if not _gravity_from_vertical(sensor, other) > TILTED_DEG
     ]
     gain, name = max(upright, default=(0.0, ""))
-    still = misfit(left) - misfit(turns)
     bias = float(np.linalg.norm(np.median(left, axis=0))) / (lag * float(np.median(pause)))
     contradicted = float(_spread(left).max()) > noise
     # The gyroscope's sign may be the mistaken one.
     if contradicted and gain > max(LEAST_GAIN, misfit(left) - misfit(difference(readings, -1.0))):
         evidence = f"expected turns as its gyroscope's, so they fit better by {gain:.0f} in log likelihood"
         yield Doubt(sensor.label, name, evidence, True)
-    elif contradicted and still > LEAST_GAIN:
-        evidence = f"expected turns as its gyroscope's, no turn fits better by {still:.0f} in log likelihood"
+    elif contradicted:
+        evidence = "expected turns as its gyroscope's, got others that no convention explains"
         yield Doubt(sensor.label, "gyroscope on other axes, or quaternions of another kind", evidence, False)
     elif bias > MOST_BIAS_DEG_S:
         evidence = f"expected turns as its gyroscope's, got {bias:.1f} degrees/s more"
@@ -93,7 +91,7 @@ def doubts_of_gravity(sensor: OrientationSensor) -> Iterator[Doubt]:
     if not degrees > TILTED_DEG:
         return
     mended = [
-        name for name, other in conventions(readings) if _gravity_from_vertical(sensor, other) < UPRIGHT_DEG
+        name for name, other in conventions(readings) if _gravity_from_vertical(sensor, other) < TILTED_DEG
     ]
     suspect = (mended or ["a world whose z is not vertical, or an accelerometer on other axes"])[0]
     evidence = f"expected gravity along the world's z, got it {degrees:.0f} degrees off"

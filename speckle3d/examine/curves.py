@@ -7,20 +7,21 @@ another factor at each depth, since all depths of one image move together.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 import numpy as np
 from scipy.optimize import least_squares
 
 from speckle3d.core.arrays import BoolArray, FloatArray
-from speckle3d.core.curves import DecorrelationCurves, EchoSpectra, SpeckleSize
+from speckle3d.core.curves import DecorrelationCurves, SpeckleSize, curve_widths
 from speckle3d.core.doubts import Doubt
-from speckle3d.core.errors import MismatchError
-from speckle3d.core.sweep import RFSettings, Sweep
-from speckle3d.examine.recording import unrefuted
+from speckle3d.core.errors import MismatchError, Speckle3DError
+from speckle3d.core.sweep import RFSettings
+from speckle3d.matching.intensity import two_way_wavenumber
 from speckle3d.matching.patches import PatchGrid
 from speckle3d.matching.texture import Texture
-from speckle3d.motion.coherence import NOISY_GAIN, RowScales
+from speckle3d.motion.coherence import NOISY_GAIN, ROW_SIGMA, RowScales
 from speckle3d.motion.estimate import Motion
 
 BENT, REFUTED_BEND = 0.12, 0.25
@@ -31,31 +32,72 @@ REFUTED_SIZE = {"lateral_mm": 0.3, "axial_mm": 0.6}
 """Median over depth of the logarithm of speckle sizes over the phantom's, either sign. Simulated: lateral up
 to 0.03 in phantom, 0.10 in tissue, 0.19 to 0.31 at depths wrong by 10 mm; axial 0.08, with attenuation wrong
 by 0.3 dB/cm/MHz 0.17, with a sampling rate wrong by a factor of two 0.69."""
-LEAST_ROWS, ENOUGH_ROWS = 3, 4
-"""Rows of patches from which doubts arise, and from which sizes refute."""
+LEAST_ROWS = 4
+"""Rows of patches from which doubts arise."""
 _LEAST_RISE = 0.04
 """Of the mean frequency over the depth, over the bandwidth: over simulated tissue of 0.5 dB/cm/MHz it falls
 by 0.14 in 4 cm."""
-_ROW_ERROR = 0.03
-"""Of a row's factor, from the curves and tissue."""
+WIDEST_MM = 8.0
+"""Distance over which no beam keeps 0.6 of its correlation: that of an unfocused element 35 mm high, which
+keeps (1 - d / 35)^2 of the echo's. Probes' elements are 2 to 15 mm high, and focused."""
+TILT_FACTOR = 1.4
+"""Of tilt's spread over that of the curves' width, from which it is calculated when curves are measured."""
 
 
-def examine_curves(sweep: Sweep, texture: Texture, motion: Motion, usable: BoolArray) -> tuple[Doubt, ...]:
-    """Hold the curves against a sweep's own speckle and steps.
+def examine_key(curves: DecorrelationCurves, laid: PatchGrid, used: PatchGrid) -> tuple[Doubt, ...]:
+    """Hold curves against what beams can do, and against the patches that were laid and those used.
 
     Raises
     ------
     MismatchError
-        If they are refuted.
+        If the curves are no beam's.
     """
+    return unrefuted((doubt_depths(curves, laid, used), *doubt_widths(curves)), MismatchError)
+
+
+def doubt_depths(curves: DecorrelationCurves, laid: PatchGrid, used: PatchGrid) -> Doubt | None:
+    """Tell that patches were left out because the curves did not measure their depths."""
+    rows, kept = laid.row_depth_mm, used.row_depth_mm
+    if rows.size == kept.size:
+        return None
+    evidence = (
+        f"expected patches at the curves' depths of {curves.depth_mm[0]:.1f} to {curves.depth_mm[-1]:.1f} "
+        f"mm, got {rows[0]:.1f} to {rows[-1]:.1f} mm: {rows.size - kept.size} of {rows.size} rows left out"
+    )
+    return Doubt("curves", "depths", evidence, False)
+
+
+def doubt_widths(curves: DecorrelationCurves) -> Iterator[Doubt]:
+    """Doubt curves that no beam has."""
+    width = curve_widths(curves.distance_mm, curves.correlation)
+    if curves.tilt is not None and isinstance(curves.key.signal, RFSettings):
+        ratio = float(np.median(curves.tilt.spread_mm / (two_way_wavenumber(curves.key.signal) * width**2)))
+        if abs(np.log(ratio)) > np.log(TILT_FACTOR):
+            evidence = f"expected tilt to spread echoes as the curves' width has it, got {ratio:.2f} times it"
+            yield Doubt("curves", "distances changed after the curves were measured", evidence, True)
+    if np.median(width) > WIDEST_MM:
+        evidence = f"expected correlation to fall within {WIDEST_MM:g} mm, got {np.median(width):.3g} mm"
+        yield Doubt("curves", "units", evidence, True)
+
+
+def unrefuted(doubts: Iterable[Doubt | None], error: type[Speckle3DError]) -> tuple[Doubt, ...]:
+    """Return doubts that leave what is doubted usable; raise `error` with the first that does not."""
+    some = tuple(doubt for doubt in doubts if doubt is not None)
+    for doubt in some:
+        if doubt.refuted:
+            raise error(str(doubt))
+    return some
+
+
+def examine_curves(texture: Texture, motion: Motion, usable: BoolArray) -> tuple[Doubt | None, ...]:
+    """Hold the curves against a sweep's own speckle and steps."""
     rows, patches = rows_without_tilt(motion), motion.problem.patches
     gain = np.ones(patches.row_depth_mm.size) if rows is None else np.nan_to_num(rows.gain, nan=1.0)
-    doubts = (
+    return (
         *doubt_size(texture.speckle_size(usable), motion.problem.curves, patches, gain),
         doubt_bend(rows),
-        doubt_sign(texture.spectra(usable), sweep),
+        doubt_sign(texture, usable),
     )
-    return unrefuted(doubts, sweep.name, MismatchError)
 
 
 def rows_without_tilt(motion: Motion) -> RowScales | None:
@@ -76,7 +118,7 @@ def doubt_bend(rows: RowScales | None) -> Doubt | None:
     By the standard deviation of a parabola over depth through rows without noise: a lens or a depth that is
     wrong bends all rows smoothly; rows that stand out alone hold structure.
     """
-    if rows is None or (rows.gain >= NOISY_GAIN).sum() < ENOUGH_ROWS:
+    if rows is None or (rows.gain >= NOISY_GAIN).sum() < LEAST_ROWS:
         return None
     clear = rows.gain >= NOISY_GAIN
     depth, logarithm = rows.depth_mm[clear], rows.logarithm[clear]
@@ -85,7 +127,7 @@ def doubt_bend(rows: RowScales | None) -> Doubt | None:
     def misfit(values: FloatArray) -> FloatArray:
         return np.asarray(design @ values - logarithm)
 
-    fit = least_squares(misfit, np.zeros(3), loss="soft_l1", f_scale=_ROW_ERROR)
+    fit = least_squares(misfit, np.zeros(3), loss="soft_l1", f_scale=ROW_SIGMA)
     size = float(np.std(design @ fit.x))
     if size < BENT:
         return None
@@ -113,7 +155,7 @@ def doubt_size(
     known = curves.at(patches.row_depth_mm).speckle
     if known is None:
         return ()
-    found = []
+    doubts = []
     for name in ("lateral_mm", "axial_mm"):
         # Noise differs from sample to sample, so that speckle under it looks finer.
         fair = np.isfinite(getattr(seen, name)) & (left >= NOISY_GAIN)
@@ -127,19 +169,24 @@ def doubt_size(
                 f"curves' phantom, got {np.median(own):.3f} mm ({100 * off:.0f} % off at "
                 "the median depth)"
             )
-            refuted = bool(off > REFUTED_SIZE[name] and fair.sum() >= ENOUGH_ROWS)
-            found.append(Doubt("curves", "another probe, depth or sampling rate", evidence, refuted))
-    return tuple(found)
+            refuted = bool(off > REFUTED_SIZE[name])
+            doubts.append(Doubt("curves", "another probe, depth or sampling rate", evidence, refuted))
+    return tuple(doubts)
 
 
-def doubt_sign(spectra: EchoSpectra | None, sweep: Sweep) -> Doubt | None:
+def doubt_sign(texture: Texture, usable: BoolArray | None = None) -> Doubt | None:
     """Doubt the sign of Q where the echoes' frequency seems to rise with depth.
 
     Tissue takes more of high frequencies, so it falls; with the other sign it is mirrored at the demodulation
     frequency. Noise, too, draws it to the band's middle, so it is doubted only where it goes away from it.
     """
-    signal = sweep.signal
-    if spectra is None or not isinstance(signal, RFSettings) or not signal.demodulation_frequency_hz:
+    signal, spectra = texture.signal, texture.spectra(usable)
+    if (
+        spectra is None
+        or spectra.depth_mm.size < LEAST_ROWS
+        or not isinstance(signal, RFSettings)
+        or not signal.demodulation_frequency_hz
+    ):
         return None
     low, high = signal.bandwidth_hz
     frequency = spectra.power @ spectra.frequency_hz / spectra.power.sum(axis=1)

@@ -13,7 +13,7 @@ from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.doubts import Doubt
 from speckle3d.core.geometry import relative_poses
 from speckle3d.core.sweep import OrientationSensor, Sweep, Tracker
-from speckle3d.examine.readings import jitter, rigid
+from speckle3d.examine.sensors import jitter, rigid
 
 JOINT_CLAIMS = 3.0
 """Joint standard deviations beyond which two numbers disagree (DESIGN, Disagreement)."""
@@ -22,7 +22,6 @@ UNIT_FACTOR = 1.5
 """Factor within which a path must be such a multiple: units are farther apart, paths by images nearer."""
 BY_IMAGES = {"image", "consistent-subset", "orientation"}
 """Modes that take their length from the images alone."""
-FEWEST_FRAMES = 10
 SMOOTH_FRAMES = 9
 """Frames of which the running median is taken, so that jitter is not taken for motion."""
 LEAST_SIGMA_MM, LEAST_SIGMA_RAD = 0.1, 0.013
@@ -49,7 +48,7 @@ def disagreements(sweep: Sweep, image: RigidTransform, covariance: FloatArray) -
         if sensor is None or sensor.sensor_from_image is None:
             continue
         covered = np.flatnonzero(sensor.covers(sweep.frame_time_s))
-        if covered.size >= FEWEST_FRAMES:
+        if covered.size >= SMOOTH_FRAMES:
             found += _compared(sensor, sweep, image[covered], covariance[covered], covered)
     return tuple(found)
 
@@ -65,8 +64,8 @@ def _compared(
     poses = rigid(sensor.world_from_image(sweep.frame_time_s[covered]))
     by_images, by_sensor = _motion(image, centre), _motion(poses, centre)
     travel = np.abs(by_images[:, 2])
-    noise = jitter(poses, centre)
     unit = unit_of_length(image, sensor, poses) if isinstance(sensor, Tracker) else ""
+    noise = jitter(poses, centre)
     for axis, name in (2, "length"), (0, "x"), (1, "y"), (5, "roll"):
         if axis < 3 and not isinstance(sensor, Tracker):
             continue

@@ -7,6 +7,8 @@ that are equally alike and not equally far apart, and a length that the images l
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from scipy.optimize import isotonic_regression
 from scipy.spatial.transform import RigidTransform
@@ -14,18 +16,17 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.core.doubts import Doubt
-from speckle3d.core.errors import InsufficientDataError
-from speckle3d.core.sweep import Sweep
-from speckle3d.examine.curves import examine_curves
-from speckle3d.examine.readings import runs_of
-from speckle3d.examine.recording import unrefuted
+from speckle3d.core.errors import InsufficientDataError, MismatchError
+from speckle3d.core.relative import HELD
+from speckle3d.core.sweep import RFSettings
+from speckle3d.examine.curves import examine_curves, unrefuted
+from speckle3d.examine.sensors import runs_of
 from speckle3d.matching.frames import MatchedSweep
-from speckle3d.matching.matcher import FrameMatcher
+from speckle3d.matching.quality import FrameFeatures
 from speckle3d.matching.table import CorrelationTable
-from speckle3d.matching.texture import standing_share
+from speckle3d.matching.texture import Texture
 from speckle3d.motion.estimate import Motion
 from speckle3d.motion.planes import LEAST_CORRELATION
-from speckle3d.motion.trajectory import HELD_MM
 
 IMAGES = "images"
 """What all doubts of this module are about."""
@@ -36,14 +37,17 @@ OPEN_SHARE = 0.5
 """Standard error over length from which a length is refused; from half of it, it is flagged. Good sweeps
 claim up to 0.06, those with noise of half the signal's power 0.15."""
 
-MOST_FRAMES = 16
-"""Frames in which standing echoes are looked for: a hundred pairs of 8 mm, held at once. In these
-clutter of 4 % of the power reads as 0.025 to 0.027, sweeps without as up to 0.004."""
+MOST_CLIPPED = 0.2
+"""Of the share at which a frame is saturated, in the median frame: with 0.6 a simulated B-mode sweep read
+5 % longer than with none."""
+NOISE_QUANTILE, LEAST_ECHO = 0.2, 0.05
+"""Of the spectrum's power, what is noise at all frequencies; and the share that is echo at least."""
+
 ECHO_LIMITS = (0.01, 0.1), (0.15, 1 / 2)
 """From which clutter is flagged, by the mean patch, and refused, by the median one: share of its power, and
 share of patches lost. Simulated phantoms read 4 % long at 0.006, 8 % at 0.025, six standard errors wrong at
-0.09. A quarter of the patches lost is made good by the adaptation to coherent echoes,
-half not."""
+0.09; clutter of 4 % of the power reads as 0.025, none as up to 0.004. A quarter of the patches lost is made
+good by the adaptation to coherent echoes, half not."""
 INTENSITY_LIMITS = (0.1, 1 / 3), (0.25, 2 / 3)
 """The same for images without phase, where layers along the sweep count, too: bone and spine have 0.01 to
 0.05 and lose 0.14 to 0.21 of their patches. A quarter of the intensity's variation is half of the echo's
@@ -66,17 +70,66 @@ WINDOW = 8
 no more. A quarter of a window on comes the next."""
 LEAST_COMPARED = 6
 """Pairs that a window needs."""
-FOLD_TOLD, FOLD_PATCHES = 8, 24
-"""Patches from which a fold is told, and from which it is refused: a median over fewer scatters too much."""
+FOLD_PATCHES = 8
+"""Patches from which a fold is told: a median over fewer scatters too much."""
 FOLD_FLAGGED, FOLD_REFUSED = 0.25, 0.40
 """Mean departure over mean distance in the worst window. Of 64 small sweeps of 6 to 21 patches, those right
 to three standard errors have up to 0.18, two at three of them 0.23 and 0.24, and three that are a quarter to
 a half too short 0.41 and more; whole images have up to 0.05, with noise of a tenth of the power 0.14."""
 
 
+def examine_echoes(matches: MatchedSweep) -> tuple[Doubt, ...]:
+    """Hold a sweep's samples against the band, the sampling rate and the gain that are claimed of them.
+
+    Raises
+    ------
+    MismatchError
+        If the echoes are not of that band.
+    """
+    return unrefuted((doubt_band(matches.texture), doubt_gain(matches.features)), MismatchError)
+
+
+def doubt_band(texture: Texture) -> Doubt | None:
+    """Doubt a sampling rate or a band that the echoes contradict.
+
+    Tissue takes high frequencies away and adds none, so most of the echo above the noise cannot lie above the
+    band; below it lies what attenuation or a harmonic leaves, which is no contradiction.
+    """
+    signal, spectrum = texture.signal, texture.sample_spectrum()
+    if spectrum is None or not isinstance(signal, RFSettings):
+        return None
+    low, high = signal.bandwidth_hz
+    # Mains, gain control and steps between samples are below.
+    frequency, power = (values[spectrum[0] >= low / 4] for values in spectrum)
+    echo = np.maximum(power - 2 * np.quantile(power, NOISE_QUANTILE), 0.0)
+    if echo.sum() <= LEAST_ECHO * power.sum():
+        return None
+    middle = float(np.interp(0.5, np.cumsum(echo) / echo.sum(), frequency))
+    inside = float(echo[(frequency >= low) & (frequency <= high)].sum() / echo.sum())
+    if middle <= high and (middle >= low or inside > LEAST_ECHO):
+        return None
+    evidence = (
+        f"expected echoes of {low / 1e6:.3g} to {high / 1e6:.3g} MHz, got {100 * inside:.0f} % of their "
+        f"power there and half of it {'above' if middle > high else 'below'} {middle / 1e6:.3g} MHz"
+    )
+    return Doubt(IMAGES, "sampling rate or band", evidence, middle > high)
+
+
+def doubt_gain(features: Sequence[FrameFeatures]) -> Doubt | None:
+    """Doubt the gain of images in which bright speckle is cut off.
+
+    What is cut off decorrelates otherwise than in the phantom's images.
+    """
+    share = float(np.median([frame.clipped for frame in features]))
+    if share <= MOST_CLIPPED:
+        return None
+    evidence = (
+        f"expected hardly a sample cut off at full scale, got {share:.0%} of what makes frames saturated"
+    )
+    return Doubt(IMAGES, "gain", evidence, False)
+
+
 def examine_images(
-    sweep: Sweep,
-    matcher: FrameMatcher,
     matches: MatchedSweep,
     motion: Motion,
     covariance: FloatArray,
@@ -101,27 +154,26 @@ def examine_images(
         If so much stands still that distances mean nothing, the images do not determine the length, or they
         cannot be those of one probe that moves.
     """
-    pairs, inside = motion.pairs, matcher.patches.inside
-    z_mm = motion.path[:, 0]
-    far = far_apart(z_mm, usable, curves)
-    share = standing_share(sweep, matcher, far) if len(far) else np.full(inside.size, np.nan)
+    pairs, problem, texture, z_mm = motion.pairs, motion.problem, matches.texture, motion.path[:, 0]
+    inside, frames = problem.patches.inside, texture.frames
+    far = far_apart(z_mm, frames[usable[frames]], curves)
+    share = texture.standing_share(far) if len(far) else np.full(inside.size, np.nan)
     share[~inside | (matches.left_out > 0.5)] = np.nan
-    doubts = unrefuted(
-        [
-            shadowed(matches.left_out[inside]),
-            interleaved(matches.table, len(sweep), motion.problem.trajectory.least_correlation),
-            standing(share, len(far), float(np.median(curves.cells)), matcher.of_echo),
-        ],
-        sweep.name,
-        InsufficientDataError,
+    images = (
+        shadowed(matches.left_out[inside]),
+        interleaved(matches.table, problem.frames, problem.trajectory.least_correlation),
+        standing(share, len(far), float(np.median(curves.cells)), problem.at_patches.of_echo),
     )
-    doubts += examine_curves(sweep, matches.texture, motion, usable)
     path = (
         undetermined(z_mm, np.sqrt(covariance[:, 2, 2]), float(curves.distance_mm[-1])),
         severed(pairs.first, pairs.second, usable),
-        folded(matches.table, motion.poses, matcher.patches.centre_mm, usable),
+        folded(matches.table, motion.poses, problem.patches.centre_mm, usable),
     )
-    return doubts + unrefuted(path, sweep.name, InsufficientDataError)
+    return (
+        *unrefuted(images, InsufficientDataError),
+        *unrefuted(examine_curves(texture, motion, usable), MismatchError),
+        *unrefuted(path, InsufficientDataError),
+    )
 
 
 def shadowed(left_out: FloatArray) -> Doubt | None:
@@ -180,19 +232,17 @@ def interleaved(table: CorrelationTable, frames: int, least_correlation: float) 
     return Doubt(IMAGES, "sweeps interleaved, or frames out of order", evidence, True)
 
 
-def far_apart(position_mm: FloatArray, usable: BoolArray, curves: DecorrelationCurves) -> IntArray:
-    """Pairs beyond the reach of speckle of `MOST_FRAMES` frames evenly along the way, shape (m, 2).
+def far_apart(position_mm: FloatArray, frames: IntArray, curves: DecorrelationCurves) -> IntArray:
+    """Pairs of some frames that are beyond the reach of speckle, shape (m, 2).
 
     Parameters
     ----------
     position_mm : ndarray, shape (n,)
-    usable : ndarray of bool, shape (n,)
+        Of all frames.
     """
-    left, frames = np.median(curves.correlation, axis=0), np.flatnonzero(usable)
+    left = np.median(curves.correlation, axis=0)
     apart_mm = float(curves.distance_mm[np.argmax(left <= max(LEAST_CORRELATION, left[-1]))])
-    way = np.append(0.0, np.cumsum(np.abs(np.diff(position_mm[frames]))))
-    chosen = frames[np.unique(np.searchsorted(way, np.linspace(0.0, way[-1], MOST_FRAMES)))]
-    pairs = chosen[np.column_stack(np.triu_indices(chosen.size, 1))]
+    pairs = frames[np.column_stack(np.triu_indices(frames.size, 1))]
     return np.asarray(pairs[np.abs(np.diff(position_mm[pairs], axis=1))[:, 0] >= apart_mm])
 
 
@@ -255,7 +305,7 @@ def folded(
     rows = np.flatnonzero((table.median > low) & (table.median < high))
     rows = rows[usable[table.first[rows]] & usable[table.second[rows]]]
     rows = rows[np.argsort(-table.median[rows], kind="stable")]
-    if rows.size < LEAST_COMPARED or len(patch_centre_mm) < FOLD_TOLD:
+    if rows.size < LEAST_COMPARED or len(patch_centre_mm) < FOLD_PATCHES:
         return None
     second = table.second[rows]
     apart = _distance(poses[table.first[rows]].inv() * poses[second], patch_centre_mm)
@@ -274,9 +324,8 @@ def folded(
         f"expected frames equally alike to be equally far apart, got distances {worst:.0%} off what the "
         f"sweep's other pairs have, about frame {at + WINDOW // 2}"
     )
-    refuted = worst > FOLD_REFUSED and len(patch_centre_mm) >= FOLD_PATCHES
     where = (at, min(at + WINDOW, len(poses)) - 1)
-    return Doubt(IMAGES, "direction lost, noise or clutter", evidence, refuted, (where,))
+    return Doubt(IMAGES, "direction lost, noise or clutter", evidence, worst > FOLD_REFUSED, (where,))
 
 
 def severed(first: IntArray, second: IntArray, usable: BoolArray) -> Doubt | None:
@@ -298,7 +347,7 @@ def severed(first: IntArray, second: IntArray, usable: BoolArray) -> Doubt | Non
         return None
     evidence = (
         f"expected speckle that joins all frames, got none at {len(cuts)} places, the first across frame "
-        f"{cuts[0]}: what was travelled there is a guess within {HELD_MM:g} mm"
+        f"{cuts[0]}: what was travelled there is a guess within {HELD[2]:g} mm"
     )
     where = tuple((k, k) for k in cuts)
     return Doubt(IMAGES, "too fast, lifted, or frames lost", evidence, False, where)

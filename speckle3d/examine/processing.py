@@ -50,7 +50,7 @@ def structure_openness(texture: Texture) -> float:
 
     Structure only stays alike for longer: the curves' width lies between once and twice this above speckle's.
     """
-    return max(0.0, float(np.log(STRUCTURE_BALANCE / max(texture.balance(), LEAST_BALANCE))))
+    return float(np.log(max(1.0, STRUCTURE_BALANCE / max(texture.balance(), LEAST_BALANCE))))
 
 
 def processing_doubts(structure: float, short: float) -> tuple[Doubt, ...]:

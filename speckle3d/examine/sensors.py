@@ -7,29 +7,25 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from typing import Any, TypeVar
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform
+from scipy.ndimage import median_filter
+from scipy.spatial.transform import RigidTransform, Rotation
 
-from speckle3d.core.arrays import FloatArray
+from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.doubts import Doubt
 from speckle3d.core.errors import MismatchError
+from speckle3d.core.geometry import nearest_rotation
+from speckle3d.core.leastsquares import robust_sigma
 from speckle3d.core.sweep import OrientationSensor, Sweep, Tracker
 from speckle3d.examine.conventions import doubts_of_gravity, doubts_of_gyroscope
-from speckle3d.examine.readings import (
-    Sensor,
-    frames_at,
-    jitter,
-    rigid,
-    runs_of,
-    slips,
-    spikes,
-    standstill,
-    without,
-)
+from speckle3d.motion.direction import LEAST_FRAMES
 
-REPEATED_S, LONGEST_STILL_S = 0.15, 0.5
-"""Loggers repeat a reading until the next; beyond the second time, unchanged readings are told."""
+Sensor = TypeVar("Sensor", OrientationSensor, Tracker)
+
+LONGEST_STILL_S = 0.5
+"""Beyond which unchanged readings are told: loggers repeat one until the next."""
 MOST_STILL = 0.2
 """Share of the sweep over which readings that do not change at all refute a sensor."""
 MOVED_MM = 0.5
@@ -38,6 +34,16 @@ SHAKING, SCRAMBLED = 1.5, 10.0
 """Jitter of a step, mm and degrees, that is told, and that refutes; of sensors in use below 0.5 and 0.3."""
 MOST_SPIKES = 0.3
 """Share of readings; with more, there is no stream that spikes stand out of."""
+_WINDOW = 9
+"""Readings of which the median is taken: up to four spikes in a row do not move it."""
+_SPIKE_SIGMA = 10.0
+_SPIKE = float(np.deg2rad(5.0)), 3.0
+"""Turn, rad, and distance, mm, that no hand goes and comes back between readings: at 50 Hz it would take 220
+rad/s^2 and 7 m/s^2."""
+_SLIP = float(np.deg2rad(300.0)), 250.0
+"""Rates, rad/s and mm/s, of no scan, from one reading to the next."""
+_STILL = 1e-9
+"""Readings closer than this are the same: noise moves the last digits of any sensor that is read."""
 
 
 @dataclass(frozen=True)
@@ -164,22 +170,114 @@ def _frozen(sensor: OrientationSensor | Tracker, sweep: Sweep, image: RigidTrans
     still, whole = float(np.ptp(time_s[during])), float(np.ptp(time_s))
     path_mm = image[during].apply(sweep.grid.centre_mm)
     moved = float(np.linalg.norm(path_mm - path_mm[0], axis=1).max())
-    refuted = still > max(REPEATED_S, MOST_STILL * whole)
-    if moved > MOVED_MM and (refuted or still > LONGEST_STILL_S):
+    if moved > MOVED_MM and still > LONGEST_STILL_S:
         evidence = f"expected readings that change, got the same one for {still:.2f} of {whole:.2f} s"
-        yield Doubt(sensor.label, "frozen", evidence, refuted, runs_of(np.flatnonzero(during)))
+        where = runs_of(np.flatnonzero(during))
+        yield Doubt(sensor.label, "frozen", evidence, still > MOST_STILL * whole, where)
 
 
 ROLL_EXPLAINED = 0.6
 """Share of the variance of the images' roll that a sensor must have in common with it to confirm it."""
-FEWEST_FRAMES = 20
 
 
 def _roll_agrees(sensor: OrientationSensor, sweep: Sweep, image: RigidTransform) -> bool:
     """Whether roll, which images know well, is the sensor's."""
     covered = np.flatnonzero(sensor.covers(sweep.frame_time_s))
-    if sensor.sensor_from_image is None or covered.size < FEWEST_FRAMES:
+    if sensor.sensor_from_image is None or covered.size < LEAST_FRAMES:
         return False
     turned = sensor.world_from_image(sweep.frame_time_s[covered]), image[covered].rotation
     sensed, seen = ((turns[0].inv() * turns).as_rotvec()[:, 2] for turns in turned)
     return bool(np.var(sensed - seen) < (1.0 - ROLL_EXPLAINED) * np.var(seen))
+
+
+def rigid(samples: RigidTransform | Rotation) -> RigidTransform:
+    """Readings as rigid transforms; an orientation sensor's are all at the origin."""
+    return samples if isinstance(samples, RigidTransform) else RigidTransform.from_rotation(samples)
+
+
+def _steps(poses: RigidTransform, others: RigidTransform) -> FloatArray:
+    """Turn, rad, and distance, mm, from poses to others, shape (2, n)."""
+    moved = np.linalg.norm(others.translation - poses.translation, axis=1)
+    return np.stack([(poses.rotation.inv() * others.rotation).magnitude(), moved])
+
+
+def spikes(sensor: OrientationSensor | Tracker) -> BoolArray:
+    """Which readings lie far off the median of those around them, shape (m,)."""
+    poses = rigid(sensor.readings.world_from_sensor)
+    if len(poses) < _WINDOW:
+        return np.zeros(len(poses), dtype=bool)
+    place = median_filter(poses.translation, (_WINDOW, 1), mode="mirror")
+    matrix = median_filter(poses.rotation.as_matrix(), (_WINDOW, 1, 1), mode="mirror")
+    turn = Rotation.from_matrix(nearest_rotation(matrix))
+    off = _steps(RigidTransform.from_components(place, turn), poses)
+    limits = [max(most, _SPIKE_SIGMA * robust_sigma(size)) for most, size in zip(_SPIKE, off, strict=True)]
+    return np.asarray((off > np.array(limits)[:, None]).any(axis=0))
+
+
+def slips(sensor: OrientationSensor | Tracker) -> IntArray:
+    """Readings that go on elsewhere than those before them were, faster than any hand, shape (places,)."""
+    poses = rigid(sensor.readings.world_from_sensor)
+    if len(poses) < _WINDOW:
+        return np.zeros(0, dtype=np.int64)
+    rate = _steps(poses[:-1], poses[1:]) / np.diff(sensor.readings.time_s)
+    limit = np.maximum(_SLIP, _SPIKE_SIGMA * np.median(rate, axis=1))
+    return np.flatnonzero((rate > limit[:, None]).any(axis=0)) + 1
+
+
+def frames_at(
+    sensor: OrientationSensor | Tracker, readings: IntArray, frame_time_s: FloatArray
+) -> tuple[tuple[int, int], ...]:
+    """Frames nearest to some readings; none for those before the first frame or after the last."""
+    time_s = sensor.readings.time_s[readings] + sensor.time_offset_s
+    time_s = time_s[(time_s >= frame_time_s[0]) & (time_s <= frame_time_s[-1])]
+    middle = (frame_time_s[:-1] + frame_time_s[1:]) / 2
+    return runs_of(np.searchsorted(middle, time_s))
+
+
+def without(sensor: Sensor, left_out: BoolArray) -> Sensor:
+    """The sensor less some of its readings, and what was measured with them."""
+    keep = ~left_out
+    readings = sensor.readings
+    less = replace(readings, time_s=readings.time_s[keep], world_from_sensor=readings.world_from_sensor[keep])
+    kept: dict[str, Any] = {
+        name: value[keep] for name, value in vars(sensor).items() if isinstance(value, np.ndarray)
+    }
+    return replace(sensor, readings=less, **kept)
+
+
+def jitter(poses: RigidTransform, at_mm: FloatArray) -> tuple[float, float]:
+    """Standard deviation of the place of a point, mm, and of the turn, rad, of poses but for slow motion."""
+    if len(poses) < 3:
+        return 0.0, 0.0
+    turns = (poses.rotation.mean().inv() * poses.rotation).as_rotvec()
+    # A second difference of white noise varies six times as much.
+    second = (np.diff(values, 2, axis=0) / np.sqrt(6.0) for values in (poses.apply(at_mm), turns))
+    place, turn = (max(robust_sigma(column) for column in each.T) for each in second)
+    return place, turn
+
+
+def standstill(sensor: OrientationSensor | Tracker) -> tuple[float, float]:
+    """Begin and end of the longest time over which the readings are all the same, s; empty without one."""
+    poses, time_s = rigid(sensor.readings.world_from_sensor), sensor.readings.time_s
+    still = (_steps(poses[:-1], poses[1:]) < _STILL).all(axis=0) if len(poses) > 1 else np.zeros(0, bool)
+    runs = runs_of(np.flatnonzero(still))
+    spans = [(float(time_s[first]), float(time_s[last + 1])) for first, last in runs]
+    return max(spans, key=lambda span: span[1] - span[0], default=(float(time_s[0]),) * 2)
+
+
+def runs_of(frames: IntArray) -> tuple[tuple[int, int], ...]:
+    """First and last of every run of consecutive frames.
+
+    Parameters
+    ----------
+    frames : ndarray of int
+        In any order; any number of times each.
+
+    Examples
+    --------
+    >>> runs_of(np.array([7, 3, 4, 4]))
+    ((3, 4), (7, 7))
+    """
+    ordered = np.unique(frames)
+    runs = np.split(ordered, np.flatnonzero(np.diff(ordered) > 1) + 1)
+    return tuple((int(run[0]), int(run[-1])) for run in runs if run.size)

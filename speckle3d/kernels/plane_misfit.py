@@ -69,7 +69,6 @@ class FitRules(NamedTuple):
     huber: float
     outlying: float
     crossing_evidence: float
-    well_fitted: float
     rounds: int
 
 

@@ -136,8 +136,6 @@ def fit_planes(
                 fitted.cost[e] = cost
                 for k in range(3):
                     fitted.coefficients[e, k] = plane[k]
-            if not rules.sensed and misfit < rules.well_fitted * size:
-                break
         information = fitted.information[e]
         for k in range(3):
             for j in range(3):

@@ -20,10 +20,8 @@ class PathRules(NamedTuple):
     turning_cost: float
     trend_mm: float
     same_mm: float
-    same_slope: float
     apart_mm: float
     apart_slope: float
-    apart_cost: float
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
@@ -142,7 +140,7 @@ def follow_paths(
                 off = abs(candidates[n, 0] - paths[h, other, 0])
                 turned = abs(candidates[n, 1] - paths[h, other, 1])
                 if off < rules.apart_mm and turned < rules.apart_slope:
-                    total[n] += rules.apart_cost
+                    total[n] += rules.cap
             if not moving and candidates[n, 0] < 0.0:
                 # The overall sign is open: of two mirror images one is enough.
                 total[n] = np.inf
@@ -155,11 +153,10 @@ def follow_paths(
             _refine(place, paths[h][earlier], moves, weight, rules.cap)
             same = False
             for g in range(size):
-                off, turned = abs(places[g, 0] - place[0]), abs(places[g, 1] - place[1])
+                off = abs(places[g, 0] - place[0])
                 for e in range(pairs):
                     off = max(off, abs(paths[parent[g], earlier[e], 0] - paths[h, earlier[e], 0]))
-                    turned = max(turned, abs(paths[parent[g], earlier[e], 1] - paths[h, earlier[e], 1]))
-                same = same or (off < rules.same_mm and turned < rules.same_slope)
+                same = same or off < rules.same_mm
             if not same:
                 places[size], parent[size], new_cost[size] = place, h, total[n]
                 step = place[0] - paths[h, earlier[latest], 0]

@@ -29,16 +29,16 @@ from speckle3d.core.relative import RelativePoses
 from speckle3d.core.sweep import BModeSettings, Sweep
 from speckle3d.core.threads import on_one_thread
 from speckle3d.examine.processing import structure_openness
-from speckle3d.matching.frames import FrameByFrame, ImageSink, ready_frame
+from speckle3d.matching.frames import FrameByFrame, ImageSink
+from speckle3d.matching.matcher import FrameMatcher
 from speckle3d.matching.quality import DrawnOver, FrameFeatures, FrameFlag, flag_frames
 from speckle3d.matching.schedule import PairSchedule
 from speckle3d.matching.table import CorrelationTable
 from speckle3d.matching.texture import FRAMES, Texture
 from speckle3d.motion.estimate import Motion, alike_pairs, elevation_of, estimate_motion, strangers
-from speckle3d.motion.planes import pair_planes
+from speckle3d.motion.planes import MotionProblem, pair_planes
 from speckle3d.motion.signs import likeliest_path, on_path
 from speckle3d.motion.trajectory import edges_of, solve_trajectory
-from speckle3d.pipeline import matcher_for, motion_problem
 
 ANEW = 4
 """Frames up to which everything is estimated anew with each."""
@@ -121,14 +121,15 @@ class LiveTracker:
         images: ImageSink | None = None,
     ) -> None:
         self.images = images
-        self._config = config or Config()
-        matcher = matcher_for(example, curves, self._config)
+        self._config = c = config or Config()
+        matcher = FrameMatcher(example, c.intensity, c.patches, c.inplane, c.matching, c.quality, curves)
         self.image_grid = matcher.grid
         self._example, self._matcher = example, matcher
         self._drawn, self._clear = DrawnOver(matcher.patches), np.ones(len(matcher.patches), dtype=bool)
         self._matched = FrameByFrame(matcher, PairSchedule(self._config.trajectory))
-        self._problem = motion_problem(curves, matcher, 1, self._config)
-        self._texture = Texture(example.signal, matcher)
+        read = curves, matcher.patches, matcher.centre_mm, 1
+        self._problem = MotionProblem(*read, c.planes, c.trajectory)
+        self._texture = Texture(matcher)
         self._features: list[FrameFeatures] = []
         self._tables: list[CorrelationTable] = []
         self._flags = np.zeros(0, dtype=np.int64)
@@ -199,13 +200,13 @@ class LiveTracker:
         if self._failure is not None:
             raise self._failure
         number = len(self._tables)
-        ready = ready_frame(frame, self._example, self._matcher, self._config.quality)
+        ready = self._matcher.ready(frame)
         if self.images:
             self.images(number, ready.echo.intensity)
         if isinstance(self._example.signal, BModeSettings):
             self._drawn.keep(frame)
             if number % EVERY == 0 and number < EVERY * FRAMES:
-                self._texture.keep(number, ready.echo, ready.features.usable)
+                self._texture.keep(number, frame, ready)
         table = self._matched.advance(number, ready.frame)
         with self._lock:
             self._keep(ready.features, table)

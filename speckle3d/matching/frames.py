@@ -4,23 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray
+from speckle3d.core.arrays import Float32Array, FloatArray, IntArray
 from speckle3d.core.sweep import BModeSettings, Sweep, read_frame
 from speckle3d.core.threads import ahead
 from speckle3d.kernels.inplane import Frame
-from speckle3d.matching.matcher import Echo, FrameMatcher, compose, inverse
-from speckle3d.matching.quality import DrawnOver, FrameFeatures, QualitySettings, inspect_frame
+from speckle3d.matching.matcher import FrameMatcher, ReadyFrame, compose, inverse
+from speckle3d.matching.quality import DrawnOver, FrameFeatures, FrameFlag, QualitySettings, flag_frames
 from speckle3d.matching.schedule import KnownSchedule, PairSchedule
 from speckle3d.matching.table import CorrelationTable
 from speckle3d.matching.texture import FRAMES, Texture, spread_frames
 
-SEARCHED = 3
-"""References against which the in-plane motion of a frame is searched, if it resembles none before."""
 ImageSink = Callable[[int, Float32Array], None]
 """Called with each frame's number and intensity image (vector, sample), in order."""
 
@@ -37,8 +35,6 @@ class MatchedSweep:
         Of every frame.
     texture : Texture
         Of some frames.
-    drawn : ndarray of bool, shape (p,)
-        Patches that something is drawn on.
     left_out : ndarray, shape (p,)
         Share of the frames in which each patch in the region holds no echo that could be matched: shadow,
         noise, no contact, or something drawn on the image.
@@ -47,33 +43,19 @@ class MatchedSweep:
     table: CorrelationTable
     features: Sequence[FrameFeatures]
     texture: Texture
-    drawn: BoolArray
     left_out: FloatArray
 
-
-class ReadyFrame(NamedTuple):
-    """What is made of a frame on the way to matching it."""
-
-    echo: Echo
-    features: FrameFeatures
-    frame: Frame
-
-
-def ready_frame(
-    samples: npt.NDArray[Any], sweep: Sweep, matcher: FrameMatcher, quality: QualitySettings
-) -> ReadyFrame:
-    """Make a frame, as read, ready to be matched; on any thread."""
-    echo = matcher.echo(samples)
-    is_bmode = isinstance(sweep.signal, BModeSettings)
-    features = inspect_frame(samples, echo.intensity, matcher.patches, is_bmode, quality)
-    return ReadyFrame(echo, features, matcher.prepare(echo, features.usable))
+    def flags(self, quality: QualitySettings, least_correlation: float) -> IntArray:
+        """Flags of all frames by what is in them and what they share with others."""
+        flags = flag_frames(self.features, quality)
+        flags[self.table.unmatched(len(self.features), least_correlation)] |= FrameFlag.UNMATCHED
+        return flags
 
 
 def match_sweep(
     sweep: Sweep,
     matcher: FrameMatcher,
     schedule: PairSchedule | KnownSchedule,
-    quality: QualitySettings,
     progress: Callable[[int, int], None] | None = None,
     images: ImageSink | None = None,
     textures: int = FRAMES,
@@ -90,20 +72,20 @@ def match_sweep(
         Frames whose texture is measured.
     """
     matched = FrameByFrame(matcher, schedule)
-    texture, chosen = Texture(sweep.signal, matcher), spread_frames(len(sweep), textures)
+    texture, chosen = Texture(matcher), spread_frames(len(sweep), textures)
     drawn, is_bmode = DrawnOver(matcher.patches), isinstance(sweep.signal, BModeSettings)
 
-    def make(number: int) -> ReadyFrame:
+    def make(number: int) -> tuple[npt.NDArray[Any], ReadyFrame]:
         samples = read_frame(sweep.frames, number)
-        ready = ready_frame(samples, sweep, matcher, quality)
-        if is_bmode:
-            drawn.keep(samples)
+        ready = matcher.ready(samples)
         if number in chosen:
-            texture.keep(number, ready.echo, ready.features.usable)
-        return ready
+            texture.keep(number, samples, ready)
+        return samples, ready
 
     features, tables = [], []
-    for number, ready in enumerate(ahead(make, range(len(sweep)))):
+    for number, (samples, ready) in enumerate(ahead(make, range(len(sweep)))):
+        if is_bmode:
+            drawn.keep(samples)
         if images:
             images(number, ready.echo.intensity)
         features.append(ready.features)
@@ -112,7 +94,7 @@ def match_sweep(
             progress(number + 1, len(sweep))
     over = drawn.patches
     left_out = matcher.patches.inside - np.mean([f.usable & ~over for f in features], axis=0)
-    return MatchedSweep(CorrelationTable.joined(tables).among(~over), features, texture, over, left_out)
+    return MatchedSweep(CorrelationTable.joined(tables).among(~over), features, texture, left_out)
 
 
 class FrameByFrame:
@@ -139,18 +121,17 @@ class FrameByFrame:
         return table
 
     def _pairs(self, number: int, frame: Frame) -> CorrelationTable:
-        """Match a frame with its references, from a start found against the first that it resembles."""
+        """Match a frame with its references, from a start found against the first of them."""
         references, least = self._schedule.references(number), self._schedule.least_correlation
-        table = CorrelationTable.empty(len(self._matcher.patches))
         self._motion[number] = self._motion.get(number - 1, np.zeros(3))
-        fixed = {first: self._frames[first] for first in sorted(references)}
-        for anchor in references[:SEARCHED]:
-            motion = compose(self._motion[anchor], self._matcher.search(fixed[anchor], frame))
-            starts = [compose(inverse(self._motion[first]), motion) for first in fixed]
-            table = self._matcher.match(fixed, number, frame, starts)
-            if table.median.max() >= least:
-                row = sorted(references).index(anchor)
-                close = table.median[row] >= least
-                self._motion[number] = compose(self._motion[anchor], table.inplane[row]) if close else motion
-                break
+        if not references:
+            return self._matcher.match({}, number, frame, [])
+        anchor, fixed = references[0], {first: self._frames[first] for first in sorted(references)}
+        motion = compose(self._motion[anchor], self._matcher.search(fixed[anchor], frame))
+        starts = [compose(inverse(self._motion[first]), motion) for first in fixed]
+        table = self._matcher.match(fixed, number, frame, starts)
+        if table.median.max() >= least:
+            row = sorted(references).index(anchor)
+            close = table.median[row] >= least
+            self._motion[number] = compose(self._motion[anchor], table.inplane[row]) if close else motion
         return table

@@ -9,7 +9,7 @@ I/Q, may have been sampled more coarsely than that, and then the rate rises.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -19,7 +19,7 @@ from scipy import fft
 from speckle3d.core.arrays import Complex64Array, Float32Array, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.grid import ImageGrid
-from speckle3d.core.sweep import BModeSettings, RFSettings, Sweep
+from speckle3d.core.sweep import BModeSettings, RFSettings
 from speckle3d.kernels.box_means import box_means, squared_magnitude
 
 _RATE_OVER_BAND = 100 / 27
@@ -31,9 +31,6 @@ third of 66.7 MHz for echoes of 5 to 10 MHz."""
 
 _RATIO_TOLERANCE = 1e-4
 """Of the rate; 4 um at 40 mm."""
-
-_LEAST_MEAN = 1e-9
-"""Of the largest local mean, under which none is divided by."""
 
 
 class IntensitySettings(BaseModel):
@@ -51,21 +48,22 @@ class IntensitySettings(BaseModel):
     )
 
 
+class Echo(NamedTuple):
+    """One frame's intensity, shape (vector, sample), and the analytic signal it comes from, if known."""
+
+    intensity: Float32Array
+    analytic: Complex64Array | None
+
+
 @dataclass(frozen=True)
 class _Resampling:
-    """Fourier bins of the band, and where they go in the inverse transform of another length.
-
-    Real rows, of even length, are transformed as half as many complex numbers: in half the time. With Z the
-    spectrum of the even samples plus i times the odd ones, that of all is
-    ``weights[k] Z[k] + mirrored[k] conj(Z[-k])``.
-    """
+    """Fourier bins of the band, and where they go in the inverse transform of another length."""
 
     length: int
     out_length: int
     bins: IntArray
     destination: IntArray
-    weights: Complex64Array
-    mirrored: Complex64Array
+    weights: Float32Array
 
 
 class IntensityExtractor:
@@ -91,11 +89,6 @@ class IntensityExtractor:
             samples = int((grid.samples - 1) / step) + 1
             self.grid = replace(grid, samples=samples, sample_spacing_mm=grid.sample_spacing_mm * step)
 
-    @classmethod
-    def for_sweep(cls, sweep: Sweep, settings: IntensitySettings | None = None) -> IntensityExtractor:
-        """Plan for the frames of `sweep`."""
-        return cls(sweep.signal, sweep.grid, settings)
-
     def analytic(self, frame: npt.NDArray[Any]) -> Complex64Array:
         """Band-passed analytic signal about the band's centre, resampled in depth.
 
@@ -111,32 +104,32 @@ class IntensityExtractor:
         Raises
         ------
         InvalidInputError
-            If the frame has another shape, is complex where it should be real or the other way round, or the
-            sweep holds B-mode images.
+            If the frame has another shape, or the sweep holds B-mode images.
         """
-        if self._plan is None or not isinstance(self.signal, RFSettings):
+        plan, are_complex = self._plan, np.iscomplexobj(frame)
+        if plan is None:
             raise InvalidInputError("expected RF frames, got B-mode images: there is no phase to recover")
         self._require_shape(frame)
-        if np.iscomplexobj(frame) != self.signal.are_complex:
-            kind = "complex" if self.signal.are_complex else "real"
-            raise InvalidInputError(f"expected {kind} samples, got {frame.dtype}")
-        plan = self._plan
-        padded = np.zeros((len(frame), plan.length), "c8" if self.signal.are_complex else "f4")
+        padded = np.zeros((len(frame), plan.length), "c8" if are_complex else "f4")
         padded[:, : frame.shape[1]] = frame
-        spectrum = fft.fft(padded.view(np.complex64), axis=1, overwrite_x=True)
-        chosen = spectrum.take(plan.bins, axis=1, mode="wrap") * plan.weights
-        if not self.signal.are_complex:
-            chosen += spectrum.take(-plan.bins, axis=1, mode="wrap").conj() * plan.mirrored
+        spectrum = (fft.fft if are_complex else fft.rfft)(padded, axis=1, overwrite_x=True)
         band = np.zeros((len(frame), plan.out_length), np.complex64)
-        band[:, plan.destination] = chosen
+        band[:, plan.destination] = spectrum.take(plan.bins, axis=1) * plan.weights
         return np.ascontiguousarray(fft.ifft(band, axis=1, overwrite_x=True)[:, : self.grid.samples])
 
-    def intensity(self, frame: npt.NDArray[Any]) -> Float32Array:
-        """Echo intensity, shape (vector, grid.samples), arbitrary units, from RF or B-mode grey levels."""
+    def echo(self, frame: npt.NDArray[Any]) -> Echo:
+        """Intensity, shape (vector, grid.samples), arbitrary units, from RF or B-mode grey levels."""
         if isinstance(self.signal, BModeSettings):
             self._require_shape(frame)
-            return _decompress(frame, self.signal)
-        return intensity_of(self.analytic(frame))
+            return Echo(_decompress(frame, self.signal), None)
+        analytic = self.analytic(frame)
+        intensity = np.empty(analytic.shape, np.float32)
+        squared_magnitude(analytic, intensity)
+        return Echo(intensity, analytic)
+
+    def intensity(self, frame: npt.NDArray[Any]) -> Float32Array:
+        """Intensity alone."""
+        return self.echo(frame).intensity
 
     def gain(self, intensity: Float32Array) -> Float32Array:
         """One over the local mean of intensity, of its shape; ones if nothing is to be equalised.
@@ -150,19 +143,12 @@ class IntensityExtractor:
         window = [2 * int(self.settings.equalise_mm / 2 / side) + 1 for side in sides]
         mean = np.empty_like(intensity)
         box_means(intensity, window[0], window[1], mean)
-        np.maximum(mean, _LEAST_MEAN * mean.max() + np.finfo(np.float32).tiny, out=mean)
+        np.maximum(mean, np.finfo(np.float32).tiny, out=mean)
         return np.reciprocal(mean, out=mean)
 
     def _require_shape(self, frame: npt.NDArray[Any]) -> None:
         if frame.shape != self._frame_shape:
             raise InvalidInputError(f"expected a frame of shape {self._frame_shape}, got {frame.shape}")
-
-
-def intensity_of(analytic: Complex64Array) -> Float32Array:
-    """Squared magnitude."""
-    intensity = np.empty(analytic.shape, np.float32)
-    squared_magnitude(analytic, intensity)
-    return intensity
 
 
 def two_way_wavenumber(signal: RFSettings) -> float:
@@ -183,10 +169,8 @@ def _plan_resampling(signal: RFSettings, samples: int, edge_fraction: float) -> 
     destination = (np.arange(bins.size) - bins.size // 2) % out_length
     # Over the lengths' ratio for the inverse transform; the analytic signal is twice the positive half of a
     # real signal's spectrum.
-    scale = out_length / length * weights[bins]
-    turn = 0.0 if signal.are_complex else 1j * np.exp(-2j * np.pi * bins / length)
-    factors = ((scale * factor).astype(np.complex64) for factor in (1.0 - turn, 1.0 + turn))
-    return _Resampling(length, out_length, bins, destination, *factors)
+    scale = (1.0 if signal.are_complex else 2.0) * out_length / length * weights[bins]
+    return _Resampling(length, out_length, bins, destination, scale.astype(np.float32))
 
 
 def _transform_lengths(samples: int, ratio: float) -> tuple[int, int]:

@@ -7,6 +7,7 @@ patch's own maximum over lags biases the correlation upward and distances short.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -14,21 +15,16 @@ import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
 from scipy import fft
 
-from speckle3d.core.arrays import BoolArray, Complex64Array, Float32Array, FloatArray
-from speckle3d.core.curves import CurveKey
-from speckle3d.core.grid import FanLines
+from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray
+from speckle3d.core.curves import CurveKey, DecorrelationCurves
 from speckle3d.core.region import Region
-from speckle3d.core.sweep import RFSettings, Sweep
+from speckle3d.core.sweep import BModeSettings, RFSettings, Sweep
 from speckle3d.core.threads import in_parallel
 from speckle3d.kernels.box_means import amplify
 from speckle3d.kernels.inplane import Frame, Geometry, Matches, match_pair
-from speckle3d.matching.intensity import (
-    IntensityExtractor,
-    IntensitySettings,
-    intensity_of,
-    two_way_wavenumber,
-)
+from speckle3d.matching.intensity import Echo, IntensityExtractor, IntensitySettings, two_way_wavenumber
 from speckle3d.matching.patches import PatchSettings, lay_patches
+from speckle3d.matching.quality import FrameFeatures, QualitySettings, inspect_frame
 from speckle3d.matching.table import CorrelationTable
 
 _POOLED_BELOW_MM = 0.05
@@ -59,20 +55,32 @@ class InPlaneSettings(BaseModel):
     )
 
 
-class Echo(NamedTuple):
-    """One frame's intensity, shape (vector, sample), and the analytic signal it comes from, if known."""
+class ReadyFrame(NamedTuple):
+    """What is made of a frame on the way to matching it."""
 
-    intensity: Float32Array
-    analytic: Complex64Array | None
+    echo: Echo
+    features: FrameFeatures
+    frame: Frame
 
 
 class FrameMatcher:
     """Prepares the frames of one sweep and matches pairs of them.
 
+    Parameters
+    ----------
+    curves : DecorrelationCurves, optional
+        To whose depths the patches are kept, and whose dynamic range is taken where the sweep's is estimated.
+
     Attributes
     ----------
+    signal : RFSettings or BModeSettings
     laid, patches : PatchGrid
         All that fit on the image, and those that are matched.
+
+    Raises
+    ------
+    MismatchError
+        If the curves belong to another probe, frequency, sampling, patch size or depth.
     """
 
     def __init__(
@@ -82,24 +90,30 @@ class FrameMatcher:
         patches: PatchSettings,
         inplane: InPlaneSettings,
         matching: MatchingSettings | None = None,
+        quality: QualitySettings | None = None,
+        curves: DecorrelationCurves | None = None,
     ) -> None:
-        self.extractor = IntensityExtractor.for_sweep(sweep, intensity)
+        signal, known = sweep.signal, None if curves is None else curves.key.signal
+        if isinstance(signal, BModeSettings) and isinstance(known, BModeSettings):
+            signal = replace(known, full_scale=signal.full_scale) if signal.dynamic_range_sigma_db else signal
+        self.signal = signal
+        self.extractor = IntensityExtractor(signal, sweep.grid, intensity)
         self.grid = self.extractor.grid
         self.centre_mm = sweep.grid.centre_mm
         self.laid = lay_patches(self.grid, patches)
         self.patches = self.laid
-        self._least_overlap = inplane.least_overlap
+        self._quality, self._least_overlap = quality, inplane.least_overlap
         self._mask = Region(patches.region).mask(self.grid) if patches.region else None
         spacing, sides = self.laid.spacing_mm, np.array([self.grid.vectors, self.grid.samples])
         self._pool = np.array([1, 2 if spacing[1] < _POOLED_BELOW_MM else 1])
         self._reach = np.minimum(np.ceil(inplane.search_mm / (spacing * self._pool)), sides // self._pool - 1)
         self._reach = self._reach.astype(np.int64)
         self._lengths = [fft.next_fast_len(int(n), True) for n in sides // self._pool + self._reach]
-        rf = sweep.signal if isinstance(sweep.signal, RFSettings) else None
+        rf = signal if isinstance(signal, RFSettings) else None
         self.of_echo = rf is not None and (matching or MatchingSettings()).correlate == "echo"
-        self._wavenumber = two_way_wavenumber(rf) if rf is not None else 0.0
+        self._wavenumber, fan = two_way_wavenumber(rf) if rf is not None else 0.0, sweep.grid.fan
         self.key = CurveKey(
-            sweep.signal,
+            signal,
             self.grid.vector_pitch_mm,
             patches.width_mm,
             patches.height_mm,
@@ -107,19 +121,28 @@ class FrameMatcher:
             "echo" if self.of_echo else "intensity",
             intensity.edge_fraction,
             sweep.probe,
-            **_lines_of(sweep.grid.fan),
+            "parallel" if fan is None else "fan",
+            0.0 if fan is None else fan.radius_mm,
+            0.0 if fan is None else fan.step_rad,
         )
+        if curves is not None:
+            curves.key.require_same(self.key)
+            self.patches = self.laid.between(curves.depth_mm)
 
     def keep_depths(self, depth_mm: FloatArray) -> None:
         """Leave out the patches beyond the first and the last of some depths; see `PatchGrid.between`."""
         self.patches = self.laid.between(depth_mm)
 
+    def ready(self, samples: npt.NDArray[Any]) -> ReadyFrame:
+        """Make a frame, as read, ready to be matched; on any thread."""
+        echo, is_bmode = self.echo(samples), isinstance(self.signal, BModeSettings)
+        features = inspect_frame(samples, echo.intensity, self.patches, is_bmode, self._quality)
+        return ReadyFrame(echo, features, self.prepare(echo, features.usable))
+
     def echo(self, frame: npt.NDArray[Any]) -> Echo:
         """Echo of a frame as read."""
-        if not self.of_echo:
-            return Echo(self.extractor.intensity(frame), None)
-        analytic = self.extractor.analytic(frame)
-        return Echo(intensity_of(analytic), analytic)
+        echo = self.extractor.echo(frame)
+        return echo if self.of_echo else Echo(echo.intensity, None)
 
     def equalised(self, echo: Echo) -> tuple[Float32Array, Float32Array]:
         """Intensity and, where there is phase, echo over their local mean; see `Frame`."""
@@ -208,10 +231,3 @@ def inverse(motion: FloatArray) -> FloatArray:
     """In-plane motion the other way round."""
     place = -np.exp(-1j * motion[2]) * complex(*motion[:2])
     return np.array([place.real, place.imag, -motion[2]])
-
-
-def _lines_of(fan: FanLines | None) -> dict[str, Any]:
-    """How vectors lie, as a `CurveKey` has it."""
-    if fan is None:
-        return {"lines": "parallel"}
-    return {"lines": "fan", "array_radius_mm": fan.radius_mm, "line_step_rad": fan.step_rad}

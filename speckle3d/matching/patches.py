@@ -80,10 +80,10 @@ class PatchGrid:
         by_column = values.reshape(*values.shape[:-1], -1, self.row_depth_mm.size)
         return np.asarray(by_column.swapaxes(-1, -2))
 
-    def tiles(self, image: npt.NDArray[Any], step: int = 1) -> npt.NDArray[Any]:
-        """Every patch of an image, shape (..., vector, sample), each `step`-th sample: (p, ..., v, s)."""
+    def tiles(self, image: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        """Every patch of an image, shape (..., vector, sample): (p, ..., v, s)."""
         wide, high = self.size
-        return np.stack([image[..., v : v + wide, s : s + high : step] for v, s in self.first])
+        return np.stack([image[..., v : v + wide, s : s + high] for v, s in self.first])
 
     def between(self, depth_mm: FloatArray) -> PatchGrid:
         """Keep the rows whose centres lie between the first and the last of some depths, or half a patch off.

@@ -15,7 +15,6 @@ References
 from __future__ import annotations
 
 import enum
-import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -26,23 +25,23 @@ import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
 
 from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from speckle3d.core.errors import InsufficientDataError
 from speckle3d.kernels.patch_statistics import patch_statistics
 from speckle3d.matching.patches import PatchGrid
 
 _CONSTANT = 1e-4
 """Contrast of a patch up to which it is a constant, but for rounding. A step of grey in one pixel is 1e-3."""
 
-_NOISY = 1 / 3
-"""Share of patches with noise alone, in a frame without speckle, from which it is said to be lifted. Noise of
-an amplifier is in all patches that hold no echo; only the name of the flag hangs on it."""
-
-_DRAWN_SHARE, _DRAWN_OVER_SPECKLE, _DRAWN_FRAMES = 0.01, 10.0, 8
+_DRAWN_SHARE, _DRAWN_OVER_SPECKLE = 0.01, 10.0
 """Share of a patch's pixels that no frame changes, from which something is drawn on it, also over that of the
-median patch, and frames that must have been seen. Speckle that goes on by a quarter of a millimetre in all
-has up to 0.02 of such pixels, by more none."""
+median patch. Speckle that goes on by a quarter of a millimetre in all has up to 0.02 of such pixels, by more
+none."""
 
 _SAMPLES = 40
 """Samples in depth of which a patch's statistics are taken at least, where it has more: speckle has four."""
+
+MOST_LOST = 0.3
+"""Share of frames that may not be placed; with more, lengths are mostly guesses."""
 
 _LISTED = 8
 """Frames named in a line of `describe`."""
@@ -146,7 +145,7 @@ def inspect_frame(
         On the grid of the intensity images.
     """
     s = settings or QualitySettings()
-    inside, statistics = patches.inside, np.empty((len(patches), 5))
+    inside, statistics, clipped = patches.inside, np.empty((len(patches), 5)), _clipped(frame, is_bmode, s)
     step = max(1, int(patches.size[1]) // _SAMPLES)
     patch_statistics(intensity, patches.first, patches.size, step, statistics)
     mean, contrast, alike, across, along = statistics.T
@@ -167,9 +166,7 @@ def inspect_frame(
         patch_statistics(np.asarray(frame, dtype=np.float32), patches.first, patches.size, 4 * step, grey)
         with np.errstate(divide="ignore", invalid="ignore"):  # Black patches have none.
             spread = np.log(grey[:, 0] * grey[:, 1])
-    return FrameFeatures(
-        mean, _clipped(frame, is_bmode, s), share(together & fine), share(~together), spread, usable
-    )
+    return FrameFeatures(mean, clipped, share(together & fine), share(~together), spread, usable)
 
 
 def _clipped(frame: npt.NDArray[Any], is_bmode: bool, settings: QualitySettings) -> float:
@@ -196,21 +193,17 @@ class DrawnOver:
 
     def __init__(self, patches: PatchGrid) -> None:
         self._patches = patches
-        self._lock = threading.Lock()
-        self._frames = 0
         self._extremes: tuple[npt.NDArray[Any], npt.NDArray[Any]] | None = None
 
     def keep(self, frame: npt.NDArray[Any]) -> None:
-        """Look at one frame of grey levels, on any thread."""
-        with self._lock:
-            self._frames += 1
-            darkest, brightest = self._extremes or (frame, frame)
-            self._extremes = np.minimum(darkest, frame), np.maximum(brightest, frame)
+        """Look at one frame of grey levels."""
+        darkest, brightest = self._extremes or (frame, frame)
+        self._extremes = np.minimum(darkest, frame), np.maximum(brightest, frame)
 
     @property
     def patches(self) -> BoolArray:
         """Which patches something is drawn on, shape (p,)."""
-        if self._extremes is None or self._frames < _DRAWN_FRAMES:
+        if self._extremes is None:
             return np.zeros(len(self._patches), dtype=bool)
         darkest, brightest = self._extremes
         share = self._patches.tiles((darkest == brightest) & (darkest > 0)).mean(axis=(1, 2))
@@ -239,8 +232,19 @@ def flag_frames(features: Sequence[FrameFeatures], settings: QualitySettings | N
         if frame.clipped >= 1:
             flags[k] |= FrameFlag.SATURATED
         if frame.speckle_share < s.speckle_share:
-            flags[k] |= FrameFlag.LIFTED if frame.noise_share > _NOISY else FrameFlag.NO_SPECKLE
+            # Noise of an amplifier is in most patches, if none holds an echo.
+            flags[k] |= FrameFlag.LIFTED if frame.noise_share > 1 / 2 else FrameFlag.NO_SPECKLE
     return flags
+
+
+def require_placed(flags: IntArray) -> None:
+    """Raise `InsufficientDataError` if too many frames have a flag."""
+    lost = int((flags != 0).sum())
+    if lost > MOST_LOST * len(flags):
+        raise InsufficientDataError(
+            f"expected frames with speckle in common, got {lost} of {len(flags)} that cannot be placed: "
+            f"{'; '.join(describe(flags))}"
+        )
 
 
 def describe(flags: npt.ArrayLike) -> list[str]:

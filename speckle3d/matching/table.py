@@ -36,12 +36,6 @@ class CorrelationTable:
     inplane: FloatArray
     inplane_covariance: FloatArray
 
-    @classmethod
-    def empty(cls, patches: int) -> CorrelationTable:
-        """No pairs of frames with so many patches."""
-        frames, shapes = np.zeros(0, np.int64), ((0, 3), (0, 3, 3))
-        return cls(frames, frames, np.zeros((0, patches), np.float32), *map(np.zeros, shapes))
-
     def __len__(self) -> int:
         return int(self.first.size)
 

@@ -40,19 +40,16 @@ UNKNOWN_SIGMA = 0.3 / np.sqrt(3.0)
 dB/cm/MHz of each other, taken as evenly spread."""
 LENGTH_PER_UNIT = 0.18
 """Change of the logarithm of length per dB/cm/MHz: 1.6 to 2 % for 0.1 on simulated sweeps."""
-MODEL_SIGMA = 0.025
-"""Error of the difference beside its posterior's, dB/cm/MHz: of seventeen sweeps of two simulators."""
 ROW_SIGMA = 0.1
 """Error of a row's exponent beside its fit's: rows of simulated phantoms of 8 mm."""
 STRUCTURE_EXPONENT = 0.5
 """Mean of n in rows with structure: a line's, 1, times half of the power. 0.3 to 1 move the difference by at
 most 0.01 on average over fourteen sweeps of tissue."""
 NOISE_WEIGHT = 0.03
-"""Power over the largest at which a frequency has half its weight, -15 dB; 0 to 0.3 make no difference."""
+"""Power over the largest at which a frequency has half its weight, -15 dB: without, one sweep in fifty is
+14 % off."""
 LARGEST = 1.5
 """Largest difference that is looked for, dB/cm/MHz."""
-LEAST_FREQUENCIES = 6
-"""In the band, that a row's three numbers are fitted to: patches of 3 mm have 20 in 5 MHz."""
 WIDENING = 1.3
 """Power of the echo's wavelength with which curves widen, mean over depth: 1.22 to 1.32 by diffraction for
 the probes of two simulators, 1 in front of the focus and 1.5 far behind it."""
@@ -116,7 +113,8 @@ def estimate_attenuation(curves: DecorrelationCurves, spectra: EchoSpectra | Non
         return unknown
     low, high = signal.bandwidth_hz
     inside = (spectra.frequency_hz >= low) & (spectra.frequency_hz <= high)
-    if inside.sum() < LEAST_FREQUENCIES:
+    # Three numbers are fitted to each row.
+    if inside.sum() <= 3:
         return unknown
     frequency_mhz = 1e-6 * spectra.frequency_hz[inside]
     phantom = curves.spectrum.at(spectra.depth_mm, 1e6 * frequency_mhz)
@@ -127,7 +125,6 @@ def estimate_attenuation(curves: DecorrelationCurves, spectra: EchoSpectra | Non
     beta, error, shift, gain = _difference(exponent, sigma, per_unit)
     if gain > OTHER_BAND:
         return replace(unknown, doubts=(_other_band(shift, middle),))
-    error = float(np.hypot(error, MODEL_SIGMA))
     attenuated = _attenuated(phantom, spectra.depth_mm, frequency_mhz, beta)
     square = [(each @ frequency_mhz**2) / each.sum(axis=1) for each in (phantom, attenuated)]
     return Attenuation(beta, error, spectra.depth_mm, WIDENING / 2.0 * np.log(square[0] / square[1]))

@@ -47,9 +47,6 @@ LEAST_GAIN = 0.5
 """Part of the correlation that noise leaves from which a patch counts for the scale: with less it is noise
 for the most part. Sweeps without such patches do not depend on it; halved, it moves the length over tissue by
 2 % where attenuation leaves noise at depth, and by 3.5 % under a shadow."""
-LEAST_BINS = 4
-"""Distances at which a patch must have been seen to tell its own scale, gain and structure: as many as these
-and the structure's power are."""
 UNADAPTED_SIGMA = 0.15
 """Relative error of distances by a phantom's curves where no patch tells its own scale, as in two frames:
 tissue reads 5 to 25 % short with them."""
@@ -218,7 +215,8 @@ def _binned(
     amplitude = np.sqrt(np.clip((curves.amplitude**2 - floor) / (1 - floor), 0.0, 1.0))
     floor, cells = np.tile(floor, (pieces, 1)), np.tile(curves.cells, pieces)[:, None]
     variance = correlation_variance(np.clip(mean, 0.0, 0.995), cells, curves.of_echo) + INTERPOLATION**2
-    determined = (count > 0).sum(axis=1) >= LEAST_BINS
+    # Scale, gain, share and power are four numbers.
+    determined = (count > 0).sum(axis=1) >= 4
     binned = _Binned(
         by_distance / some,
         (mean - floor) / (1 - floor),

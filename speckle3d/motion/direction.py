@@ -10,12 +10,12 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.sweep import OrientationSensor, Sweep, Tracker, image_orientation
 
-_LEAST_CORRELATION, _LEAST_DEVIATIONS = 0.5, 2.5
-"""Correlation of turns that tells the direction, in itself and over what chance gives."""
+LEAST_DEVIATIONS = 2.5
+"""Product of turns that tells the direction, over what chance gives."""
+SAME_CORRELATION = 0.95
+"""Correlation at which turns are one motion's, however few of them there are."""
 LEAST_FRAMES = 20
 """Frames with readings from which turns are compared."""
-_SAME_CORRELATION, _ALIKE_SIZE = 0.95, 1.5
-"""Correlation, and ratio of sizes, at which turns are one motion's, however few of them there are."""
 
 
 class SensorSettings(BaseModel):
@@ -99,8 +99,8 @@ def _same_way(one: RigidTransform, other: RigidTransform, centre_mm: FloatArray)
 def same_turns(sensed: FloatArray, seen: FloatArray) -> int | None:
     """Whether two records of turns go the same way (1) or opposite ways (-1); None if chance may tell so.
 
-    Told are a correlation that chance does not give records as slow as these, and one near one between turns
-    of one size, as the same motion gives.
+    Told are a product that chance does not give records as slow as these, and the near correlation that the
+    same motion gives.
 
     Parameters
     ----------
@@ -116,16 +116,10 @@ def same_turns(sensed: FloatArray, seen: FloatArray) -> int | None:
     n = len(sensed)
     trend = np.vander(np.linspace(-1, 1, n), 3)
     ours, theirs = (v - trend @ np.linalg.lstsq(trend, v, rcond=None)[0] for v in (sensed, seen))
-    powers = float(np.sum(ours**2)), float(np.sum(theirs**2))
-    if not min(powers) > 0:
-        return None
     product = float(np.sum(ours * theirs))
-    correlation = abs(product) / np.sqrt(powers[0] * powers[1])
     # Variance of the sum of products of independent series with these autocovariances (Bartlett).
     columns = zip(ours.T, theirs.T, strict=True)
     by_lag = sum(np.correlate(a, a, "full") * np.correlate(b, b, "full") for a, b in columns)
     by_chance = np.sqrt(max(float((1.0 - np.abs(np.arange(1 - n, n)) / n) @ by_lag) / n, 0.0))
-    is_significant = correlation >= _LEAST_CORRELATION and abs(product) >= _LEAST_DEVIATIONS * by_chance
-    of_one_size = _ALIKE_SIZE**-2 <= powers[0] / powers[1] <= _ALIKE_SIZE**2
-    same = correlation >= _SAME_CORRELATION and of_one_size
-    return int(np.sign(product)) if is_significant or same else None
+    same = abs(product) > SAME_CORRELATION * np.linalg.norm(ours) * np.linalg.norm(theirs)
+    return int(np.sign(product)) if same or abs(product) > LEAST_DEVIATIONS * by_chance else None

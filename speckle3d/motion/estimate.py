@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -35,8 +34,6 @@ LENS_ROUNDS = 4
 """Fits of a data sheet's lens: a path read with a wrong lens bends the rows otherwise than the right one."""
 ENOUGH_PAIRS = 3
 """Pairs to earlier frames from which a frame needs none that tells less."""
-PAIRS_AT_ONCE = 1024
-"""Pairs whose distances are held at once."""
 
 
 @dataclass(frozen=True)
@@ -237,24 +234,19 @@ def elevation_of(poses: RigidTransform, centre_mm: FloatArray) -> FloatArray:
     return np.column_stack([poses.apply(centre_mm)[:, 2], poses.rotation.as_matrix()[:, 2, :2]])
 
 
-def frame_pairs(motion: Motion, used: BoolArray, length_sigma: float) -> Iterator[FramePairs]:
-    """Yield the pairs for the reconstruction file, some at a time; deviations include that of the scale."""
-    pairs, edges, problem = motion.pairs, motion.edges, motion.problem
+def frame_pairs(motion: Motion, used: BoolArray, length_sigma: float) -> FramePairs:
+    """Pairs as the reconstruction file holds them; deviations include that of the scale."""
+    pairs, edges, problem, coherence = motion.pairs, motion.edges, motion.problem, motion.coherence
     centre = RigidTransform.from_translation(problem.centre_mm)
-    for start in range(0, max(len(pairs), 1), PAIRS_AT_ONCE):
-        some = slice(start, start + PAIRS_AT_ONCE)
-        models, correlation = (
-            motion.coherence.models(pairs.first[some]),
-            motion.table.correlation[pairs.row[some]],
-        )
-        distance, sigma = (motion.coherence.scale * v for v in patch_distances(problem, correlation, models))
-        yield FramePairs(
-            first=edges.first[some],
-            second=edges.second[some],
-            first_from_second=(centre * edges.poses[some] * centre.inv()).as_matrix(),
-            covariance=edges.covariance[some],
-            distance_mm=distance.astype(np.float32),
-            sigma_mm=np.hypot(sigma, length_sigma * distance).astype(np.float32),
-            used=used[some],
-            patch_centre_mm=problem.patches.centre_mm,
-        )
+    correlation, models = motion.table.correlation[pairs.row], coherence.models(pairs.first)
+    distance, sigma = (coherence.scale * v for v in patch_distances(problem, correlation, models))
+    return FramePairs(
+        first=edges.first,
+        second=edges.second,
+        first_from_second=(centre * edges.poses * centre.inv()).as_matrix(),
+        covariance=edges.covariance,
+        distance_mm=distance.astype(np.float32),
+        sigma_mm=np.hypot(sigma, length_sigma * distance).astype(np.float32),
+        used=used,
+        patch_centre_mm=problem.patches.centre_mm,
+    )

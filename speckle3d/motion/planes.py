@@ -35,23 +35,18 @@ WELL_FALLEN = 0.1
 CROSSING_EVIDENCE = 6.0
 """Gain in twice the log-likelihood (a BIC) for which frames are taken to cross inside the image."""
 OUTLYING = 9.0
-"""Squared deviations at which a patch's misfit is capped. Where frames cross, correlation is known to a few
-thousandths; one patch that lost it there would outvote all others."""
+"""Squared deviations at which the misfit of a patch, or of a pair on a path, is capped: it may be wrong.
+Where frames cross, correlation is known to a few thousandths; one patch that lost it would outvote all."""
 LOOSE_SLOPE = 0.05
 """Standard deviation of the slopes' prior, 3 degrees between frames that share speckle: keeps fits finite."""
 SENSED_SLOPE = 5e-4
 """Standard deviation of slopes between near frames from a smoothed orientation sensor: 0.03 degrees."""
-WELL_FITTED = 0.9
-"""Squared deviations per patch below which no other hypothesis can do better by enough to matter."""
 LEAST_SIGMA_MM = 1e-3
 """Of a patch's distance where the curve is flat: a hundredth of what it is known to elsewhere."""
 ROUNDS = 12
-LEAST_PATCHES = 6
 NEAR_MM = 0.15
 """Least distance at which fits start: correlation is flat at zero, and a fit from there takes distance for
-tilt."""
-GRAIN = 32
-"""Pairs that are worth another thread's while."""
+tilt. Nearer frames may turn as if they were this far apart: a hand trembles in place."""
 
 
 class PlaneSettings(BaseModel):
@@ -225,7 +220,7 @@ def pair_planes(
     -------
     PairPlanes
     ndarray of bool, shape (e,)
-        Pairs whose patches determine a plane: not if fewer than six can take part, or if the image's centre
+        Pairs whose patches determine a plane: not if three or fewer can take part, or if the image's centre
         comes to lie farther away than the curves were measured, or might.
     """
     correlation = table.correlation[rows]
@@ -233,7 +228,7 @@ def pair_planes(
     least = models.gain * (models.share + (1 - models.share) * end) ** 2
     used = np.isfinite(correlation) & ((end == 0.0) | (correlation > least))
     used = used if subset is None else used & subset
-    used &= (used.sum(axis=1) >= LEAST_PATCHES)[:, None]
+    used &= (used.sum(axis=1) > 3)[:, None]
     if start_mm is None:
         start = problem.typical_distance(np.sqrt(np.maximum(table.median[rows], 0.0)))
     else:
@@ -243,9 +238,7 @@ def pair_planes(
     side = np.ones(rows.size, dtype=bool) if either_side is None else either_side
     settings = problem.planes
     slope_sd = SENSED_SLOPE if sensed else LOOSE_SLOPE
-    rules = FitRules(
-        sensed, slope_sd, LOOSE_SLOPE, settings.huber, OUTLYING, CROSSING_EVIDENCE, WELL_FITTED, ROUNDS
-    )
+    rules = FitRules(sensed, slope_sd, LOOSE_SLOPE, settings.huber, OUTLYING, CROSSING_EVIDENCE, ROUNDS)
     lost = _lost(problem, table.inplane[rows, :2])
     fitted = FittedPlanes(
         np.full((rows.size, 3), np.nan), np.tile(np.eye(3), (rows.size, 1, 1)), np.zeros(rows.size)
@@ -267,7 +260,7 @@ def pair_planes(
             FittedPlanes(*(array[some] for array in fitted)),
         )
 
-    in_parallel(work, rows.size, GRAIN)
+    in_parallel(work, rows.size)
     coefficients, information, cost = fitted
     scatter = np.maximum(1.0, cost / np.maximum(used.sum(axis=1) - 3, 1))
     covariance = np.linalg.inv(information) * scatter[:, None, None]

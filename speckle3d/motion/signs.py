@@ -13,7 +13,7 @@ import numpy as np
 
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.kernels.signs import PathRules, follow_paths
-from speckle3d.motion.planes import PairPlanes
+from speckle3d.motion.planes import OUTLYING, PairPlanes
 
 HYPOTHESES = 8
 """Paths that are followed; 4 move lengths by at most 0.06 %."""
@@ -26,17 +26,13 @@ TREND_MM = 0.3
 """Travel over which a direction is remembered: a few frames of a hand-held sweep."""
 TURNING_COST = 2.0
 """Squared deviations by which the planes must speak for turning back: hands turn back rarely."""
-CAP = 9.0
-"""Squared deviations beyond which a pair disagrees altogether: it may be wrong."""
 PLACED = 2.0
 """Variance of an offset between frames over a pair's own: the earlier frame was placed by such pairs, too."""
-SAME_MM, SAME_SLOPE = 0.05, 0.005
+SAME_MM = 0.05
 """Paths that end this close to each other at all frames still of use are one."""
 APART_SLOPE = 0.01
-"""Frames that turn more than this against each other may differ although their centres meet."""
-APART_COST = 4.0
-"""Squared deviations for a frame placed where it would resemble one that it does not resemble: less than
-`CAP`, because tissue that moved or a lost contact do that, too."""
+"""Frames that turn more than this against each other may differ although their centres meet. Such as turn
+less and do not resemble each other are a pair that disagrees altogether."""
 
 
 class Strangers(NamedTuple):
@@ -86,14 +82,12 @@ def likeliest_path(
         HYPOTHESES,
         relative_error,
         PLACED,
-        CAP,
+        OUTLYING,
         TURNING_COST,
         TREND_MM,
         SAME_MM,
-        SAME_SLOPE,
         strangers.apart_mm,
         APART_SLOPE,
-        APART_COST,
     )
     path, every = np.zeros((frames, 2)), np.arange(frames + 1)
     if known is not None:

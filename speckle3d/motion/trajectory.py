@@ -14,15 +14,13 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.geometry import rotation_from_fixed_angles, skew
 from speckle3d.core.leastsquares import huber_weights
-from speckle3d.core.relative import RelativePoses
+from speckle3d.core.relative import HELD, RelativePoses
 from speckle3d.matching.table import CorrelationTable
 from speckle3d.motion.planes import PairPlanes
 
 SETTLED = 1e-4
 """Largest step, mm or rad, after which no further round is made."""
 ROUNDS = 6
-HELD_MM, HELD_RAD = 1.0, 0.05
-"""How far a probe may go between two frames: 25 mm and 70 degrees in a second at 25 frames."""
 KNOWN_FRAMES = 40
 """Frames whose covariance is computed; those of the others are interpolated."""
 INPLANE_FLOOR = (1e-6, 1e-6, 1e-9)
@@ -135,12 +133,11 @@ def _with_loose_edges(pairs: RelativePoses, frames: int) -> RelativePoses:
     """Join frames that no pair joins to others by edges that say no more than that a probe does not jump."""
     lone = np.flatnonzero(unjoined(pairs.second, frames))
     after = lone[lone + 1 < frames]
-    loose = np.diag(np.repeat([HELD_MM, HELD_RAD], 3) ** 2)
     return RelativePoses(
         np.concatenate([pairs.first, lone - 1, after]),
         np.concatenate([pairs.second, lone, after + 1]),
         RigidTransform.concatenate([pairs.poses, RigidTransform.identity(lone.size + after.size)]),
-        np.concatenate([pairs.covariance, np.tile(loose, (lone.size + after.size, 1, 1))]),
+        np.concatenate([pairs.covariance, np.tile(np.diag(HELD**2), (lone.size + after.size, 1, 1))]),
     )
 
 

@@ -73,7 +73,7 @@ class GreyImages:
             raise InvalidInputError(f"dynamic_range_db: expected a value above zero, got {dynamic_range_db}")
         bmode = sweep.signal if isinstance(sweep.signal, BModeSettings) else None
         self._sweep, self._levels, self._outside = sweep, levels, outside
-        self._extractor = IntensityExtractor.for_sweep(sweep, settings)
+        self._extractor = IntensityExtractor(sweep.signal, sweep.grid, settings)
         source = sweep.grid if levels == "stored" else self._extractor.grid
         self._convert = ScanConversion(source) if source.fan is not None else None
         self.grid: ImageGrid = self._convert.grid if self._convert else source

@@ -10,11 +10,7 @@ from speckle3d.core.curves import SpeckleSize, TiltResponse
 from speckle3d.core.doubts import Doubt
 from speckle3d.core.errors import MismatchError
 from speckle3d.core.grid import ImageGrid
-from speckle3d.examine.curves import (
-    doubt_bend,
-    doubt_size,
-)
-from speckle3d.examine.recording import doubt_depths, doubt_widths, unrefuted
+from speckle3d.examine.curves import doubt_bend, doubt_depths, doubt_size, doubt_widths, unrefuted
 from speckle3d.matching.intensity import two_way_wavenumber
 from speckle3d.matching.patches import lay_patches
 from speckle3d.motion.coherence import RowScales
@@ -28,9 +24,9 @@ CLEAR = np.ones(ROWS.size)
 
 def test_the_first_refuted_doubt_is_raised_and_the_others_are_returned():
     fair, bad = Doubt("curves", "units", "seen", False), Doubt("curves", "clock", "never", True)
-    assert unrefuted([fair], "s", MismatchError) == (fair,)
-    with pytest.raises(MismatchError, match=r"^s: curves: never \(suspect: clock\)$"):
-        unrefuted([fair, bad], "s", MismatchError)
+    assert unrefuted([fair], MismatchError) == (fair,)
+    with pytest.raises(MismatchError, match="suspect: clock"):
+        unrefuted([fair, bad], MismatchError)
 
 
 def test_rows_left_out_are_told_with_the_depths_expected_and_got():

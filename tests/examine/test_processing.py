@@ -11,8 +11,9 @@ from speckle3d.core.errors import InsufficientDataError
 from speckle3d.examine.processing import shortening, structure_openness
 from speckle3d.io.load import load_sweep
 from speckle3d.matching.frames import match_sweep
+from speckle3d.matching.matcher import FrameMatcher
 from speckle3d.matching.schedule import PairSchedule
-from speckle3d.pipeline import matcher_for, track
+from speckle3d.pipeline import track
 from speckle3d.sheet_curves import ProbeSheet, data_sheet_curves
 from speckle3d.simulation.receiver import received
 
@@ -47,9 +48,9 @@ def averaged(sweep, count):
 
 
 def matched(sweep):
-    config = Config()
-    matcher = matcher_for(sweep, data_sheet_curves(SHEET, sweep), config)
-    return match_sweep(sweep, matcher, PairSchedule(config.trajectory), config.quality)
+    c, curves = Config(), data_sheet_curves(SHEET, sweep)
+    matcher = FrameMatcher(sweep, c.intensity, c.patches, c.inplane, c.matching, c.quality, curves)
+    return match_sweep(sweep, matcher, PairSchedule(c.trajectory))
 
 
 def test_frames_of_one_moment_each_are_not_doubted(grey):

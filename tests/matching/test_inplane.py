@@ -10,13 +10,8 @@ import speckle
 
 from speckle3d.core.grid import ImageGrid
 from speckle3d.core.sweep import BModeSettings, Sweep
-from speckle3d.matching.intensity import IntensitySettings, two_way_wavenumber
-from speckle3d.matching.matcher import (
-    Echo,
-    FrameMatcher,
-    InPlaneSettings,
-    MatchingSettings,
-)
+from speckle3d.matching.intensity import Echo, IntensitySettings, two_way_wavenumber
+from speckle3d.matching.matcher import FrameMatcher, InPlaneSettings, MatchingSettings
 from speckle3d.matching.patches import PatchSettings
 
 GRID = speckle.GRID

@@ -96,17 +96,12 @@ def test_i_and_q_give_what_their_rf_gives(middle_hz, every):
     np.testing.assert_allclose(got[:, :shared], expected[:, :shared], atol=3e-3 * expected.max())
 
 
-def test_frames_of_another_shape_or_kind_and_phase_of_grey_levels_are_refused():
+def test_frames_of_another_shape_and_phase_of_grey_levels_are_refused():
     bmode = IntensityExtractor(BModeSettings(60.0), ImageGrid(6, 18, 0.1, 0.1))
-    baseband = replace(RF, sampling_rate_hz=8e6, demodulation_frequency_hz=7.5e6)
-    for refused in (
-        lambda: extractor().intensity(np.zeros((6, 1799), np.float32)),
-        lambda: extractor(baseband).intensity(noise(1800)),
-        lambda: extractor().intensity(noise(1800).astype(np.complex64)),
-        lambda: bmode.analytic(np.zeros((6, 18), np.uint8)),
-    ):
-        with pytest.raises(InvalidInputError):
-            refused()
+    with pytest.raises(InvalidInputError):
+        extractor().intensity(np.zeros((6, 1799), np.float32))
+    with pytest.raises(InvalidInputError):
+        bmode.analytic(np.zeros((6, 18), np.uint8))
 
 
 @settings(deadline=None, max_examples=50)

@@ -15,7 +15,6 @@ from speckle3d.matching.frames import match_sweep
 from speckle3d.matching.intensity import IntensitySettings
 from speckle3d.matching.matcher import FrameMatcher, InPlaneSettings
 from speckle3d.matching.patches import PatchSettings
-from speckle3d.matching.quality import QualitySettings
 from speckle3d.matching.schedule import KnownSchedule
 from speckle3d.motion.phantom import CurveSettings, fit_curves
 from speckle3d.phantom_curves import known_positions, phantom_pairs, phantom_samples
@@ -50,7 +49,7 @@ def matcher_of(sweep):
 def samples_of(sweep, settings, progress=None):
     matcher, poses = matcher_of(sweep), known_positions(sweep)
     pairs = phantom_pairs(sweep, poses, settings)
-    matches = match_sweep(sweep, matcher, KnownSchedule(pairs), QualitySettings(), progress)
+    matches = match_sweep(sweep, matcher, KnownSchedule(pairs), progress)
     return phantom_samples(poses, matcher.patches, matches.table, pairs)
 
 

@@ -127,11 +127,11 @@ def test_patches_without_correlation_outside_the_subset_or_beyond_the_curves_tak
     assert fit(short, correlations((0.9, 0.0, 0.0), None)) is None
 
 
-def test_fewer_than_six_patches_make_no_plane():
+def test_three_patches_make_no_plane():
     rho = np.full(len(AT), np.nan)
-    rho[:5] = 0.8
+    rho[:3] = 0.8
     assert fit(problem(), rho) is None
-    rho[5] = 0.8
+    rho[3] = 0.8
     assert fit(problem(), rho) is not None
 
 

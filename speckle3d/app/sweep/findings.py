@@ -58,7 +58,7 @@ class FrameFindings:
 
     @cached_property
     def _looks(self) -> tuple[IntensityExtractor, PatchGrid]:
-        extractor = IntensityExtractor.for_sweep(self._sweep, self._config.intensity)
+        extractor = IntensityExtractor(self._sweep.signal, self._sweep.grid, self._config.intensity)
         return extractor, lay_patches(extractor.grid, self._config.patches)
 
     def _inspect(self, frame: int) -> FrameFeatures:

@@ -19,7 +19,7 @@ def part(sweep):
 def matched(part):
     c = Config()
     matcher = FrameMatcher(part, c.intensity, c.patches, c.inplane, c.matching)
-    return matcher, match_sweep(part, matcher, PairSchedule(c.trajectory), c.quality).table
+    return matcher, match_sweep(part, matcher, PairSchedule(c.trajectory)).table
 
 
 def test_correlations_computed_anew_are_those_that_the_pipeline_reads(part, matched):

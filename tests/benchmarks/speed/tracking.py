@@ -55,7 +55,7 @@ def ratio(row):
 
 def transforms_per_second(sweep, runs):
     """Frames whose samples go to the band's spectrum and back in a second on one core, and nothing else."""
-    plan = IntensityExtractor.for_sweep(sweep)._plan
+    plan = IntensityExtractor(sweep.signal, sweep.grid)._plan
     frame = np.asarray(sweep.frames[0], dtype=np.float32)
     band = np.zeros((frame.shape[0], plan.out_length), dtype=np.complex64)
 
