@@ -25,7 +25,7 @@ from speckle3d.core.progress import Progress
 from speckle3d.core.reconstruction import FramePairs, SharedErrors
 from speckle3d.core.relative import RelativePoses
 from speckle3d.core.shown import shown
-from speckle3d.core.sweep import Sweep
+from speckle3d.core.sweep import BModeSettings, Sweep
 from speckle3d.examine.curves import examine_key, unrefuted
 from speckle3d.examine.disagreements import disagreements
 from speckle3d.examine.images import examine_echoes, examine_images
@@ -34,13 +34,12 @@ from speckle3d.examine.sensors import examined_sensors
 from speckle3d.io.curves import curves_beside, read_curves, trust_words
 from speckle3d.matching.frames import ImageSink, match_sweep
 from speckle3d.matching.matcher import FrameMatcher
-from speckle3d.matching.quality import FrameFlag, require_placed
+from speckle3d.matching.quality import FrameFlag, flag_frames, require_placed
 from speckle3d.matching.schedule import PairSchedule
 from speckle3d.motion.attenuation import Attenuation, estimate_attenuation
 from speckle3d.motion.coherence import Coherence
-from speckle3d.motion.compression import compression_sigma
 from speckle3d.motion.direction import sensed_orientation, settle_direction
-from speckle3d.motion.estimate import estimate_motion, frame_pairs
+from speckle3d.motion.estimate import Motion, estimate_motion, frame_pairs
 from speckle3d.motion.lens import stretched
 from speckle3d.motion.planes import MotionProblem
 from speckle3d.motion.subset import consistent_poses
@@ -264,7 +263,7 @@ def track(
         sensed = sensed_orientation(sensors.trusted, settings.sensors)
         subset, used = (None, motion.pairs.used) if sensed is None else consistent_poses(motion, sensed)
         mismatch = motion.problem.curves.mismatch(settings.curves.same_probe, attenuation.log_length_sigma)
-        short, compression = shortening(matches), compression_sigma(motion, matcher.signal)
+        short, compression = shortening(matches), _compression_error(sweep, curves, settings, motion)
         open_sigma = float(np.linalg.norm([mismatch, short, compression]))
         shared, covariance = motion.claims(float(np.hypot(open_sigma, structure)))
 
@@ -316,6 +315,31 @@ def require_kind(value: Any, kind: type, name: str, made_by: str) -> None:
     if not isinstance(value, kind):
         got = type(value).__name__
         raise InvalidInputError(f"{name}: expected a {kind.__name__}, as {made_by} gives it, got {got}")
+
+
+def _compression_error(sweep: Sweep, curves: DecorrelationCurves, config: Config, motion: Motion) -> float:
+    """Relative standard deviation of distances by a dynamic range that is estimated.
+
+    One that is wider by its deviation is tried: what it does to fully developed speckle's correlation, a
+    tenth of what comes out, can be calculated, what it does to structure and to black and white cannot.
+    Curves measured with images compressed alike have its error in them.
+    """
+    signal = sweep.signal
+    if not isinstance(signal, BModeSettings) or curves.origin != "data sheet":
+        return 0.0
+    if not signal.dynamic_range_sigma_db:
+        return 0.0
+    range_db = signal.dynamic_range_db + signal.dynamic_range_sigma_db
+    wider = replace(signal, dynamic_range_db=range_db, dynamic_range_sigma_db=0.0)
+    c = config
+    matcher = FrameMatcher(
+        replace(sweep, signal=wider), c.intensity, c.patches, c.inplane, c.matching, c.quality, curves
+    )
+    matches = match_sweep(sweep, matcher, PairSchedule(config.trajectory))
+    table, bad = matches.table, flag_frames(matches.features, config.quality) != 0
+    read = estimate_motion(motion.problem, table, ~bad[table.first] & ~bad[table.second])
+    spans = [np.ptp(each.path[:, 0]) for each in (motion, read)]
+    return abs(float(np.log(spans[1] / spans[0])))
 
 
 def _curves_beside(sweep: Sweep, same_probe: bool) -> DecorrelationCurves:

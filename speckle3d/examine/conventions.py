@@ -20,7 +20,7 @@ LEAST_GAIN = 4.0
 gain up to 0.1, faulty ones from 5."""
 MOST_BIAS_DEG_S = 3.0
 """Biases of gyroscopes in orientation sensors are below 1 degree/s once they have stood still."""
-TILTED_DEG = 25.0
+TILTED_DEG = 10.0
 """Angle between gravity and the world's z that contradicts a sensor."""
 MIRRORS = {"x": (-1.0, 1.0, 1.0), "y": (1.0, -1.0, 1.0), "z": (1.0, 1.0, -1.0)}
 

@@ -69,7 +69,7 @@ class Texture:
 
     def __init__(self, matcher: FrameMatcher) -> None:
         self.signal, self._patches = matcher.signal, matcher.patches
-        self._edge_fraction = matcher.key.edge_fraction
+        self._edge_fraction, self._of_echo = matcher.key.edge_fraction, matcher.of_echo
         self._looks: dict[int, _Look] = {}
 
     def keep(self, number: int, samples: npt.NDArray[Any], ready: ReadyFrame) -> None:
@@ -132,9 +132,9 @@ class Texture:
         RF and I/Q of one sweep have the same: both are band-passed and resampled alike before they are
         matched. Every patch counts the same, however bright.
         """
-        rows = self._rows("power", usable)
-        if not isinstance(self.signal, RFSettings):
+        if not (self._of_echo and isinstance(self.signal, RFSettings)):
             return None
+        rows = self._rows("power", usable)
         seen = np.isfinite(rows).any(axis=(0, 1, 3))
         if not seen.any():
             return None
