@@ -23,7 +23,7 @@ from speckle3d.matching.matcher import FrameMatcher
 from speckle3d.matching.patches import PatchGrid
 from speckle3d.matching.schedule import KnownSchedule
 from speckle3d.matching.table import CorrelationTable
-from speckle3d.matching.texture import PHANTOM_FRAMES, mean_spectra
+from speckle3d.matching.texture import mean_spectra
 from speckle3d.motion.phantom import CurveSettings, PhantomSamples, fit_curves
 
 SMOOTHED_FRAMES = 8
@@ -77,7 +77,6 @@ def calibrate_curves(
             matcher,
             KnownSchedule(pairs),
             after(progress, before, total),
-            textures=PHANTOM_FRAMES,
         )
         samples.append(phantom_samples(poses, matcher.patches, matches.table, pairs))
         sizes.append((matcher.patches.row_depth_mm, matches.texture.speckle_size()))

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from scipy.ndimage import median_filter
@@ -21,8 +21,6 @@ from speckle3d.core.leastsquares import robust_sigma
 from speckle3d.core.sweep import OrientationSensor, Sweep, Tracker
 from speckle3d.examine.conventions import doubts_of_gravity, doubts_of_gyroscope
 from speckle3d.motion.direction import LEAST_FRAMES
-
-Sensor = TypeVar("Sensor", OrientationSensor, Tracker)
 
 LONGEST_STILL_S = 0.5
 """Beyond which unchanged readings are told: loggers repeat one until the next."""
@@ -79,7 +77,10 @@ def examined_sensors(sweep: Sweep, image: RigidTransform, examine: bool = True) 
     left = believed(cleaned, doubts)
     for sensor in (left.tracker, left.orientation):
         if sensor is not None:
-            doubts += tuple(_doubts_of(sensor, sweep, image))
+            odd = (*_frozen(sensor, sweep, image), *_shaking(sensor))
+            if not odd and isinstance(sensor, OrientationSensor):
+                odd = (*doubts_of_gyroscope(sensor), *doubts_of_gravity(sensor))
+            doubts += odd
     trusted = believed(left, doubts)
     sensor, doubted = trusted.orientation, {doubt.about for doubt in doubts}
     confirmed = sensor is not None and (
@@ -89,38 +90,24 @@ def examined_sensors(sweep: Sweep, image: RigidTransform, examine: bool = True) 
     return ExaminedSensors(trusted, confirmed, doubts)
 
 
-def _doubts_of(sensor: OrientationSensor | Tracker, sweep: Sweep, image: RigidTransform) -> list[Doubt]:
-    """What is odd about one sensor, most telling first."""
-    found = [*_frozen(sensor, sweep, image), *_shaking(sensor)]
-    if not found and isinstance(sensor, OrientationSensor):
-        found += [*doubts_of_gyroscope(sensor), *doubts_of_gravity(sensor)]
-    return found
-
-
 def cleaned_readings(sweep: Sweep) -> tuple[Sweep, tuple[Doubt, ...]]:
     """Leave out single wild readings, and count them and jumps."""
     doubts: list[Doubt] = []
     for name in ("tracker", "orientation"):
         sensor = getattr(sweep, name)
-        if sensor is not None:
-            sweep = replace(sweep, **{name: _cleaned(sensor, sweep.frame_time_s, doubts)})
+        wild = np.zeros(0, dtype=bool) if sensor is None else spikes(sensor)
+        share = f"{int(wild.sum())} of {wild.size} readings jump away from those around them and back"
+        scrambled = wild.sum() > MOST_SPIKES * wild.size
+        if scrambled:
+            doubts.append(Doubt(sensor.label, "scrambled values", f"expected a path, but {share}", True))
+        elif wild.any():
+            where = frames_at(sensor, np.flatnonzero(wild), sweep.frame_time_s)
+            doubts.append(Doubt(sensor.label, "spikes", f"{share}, and are left out", False, where))
+            sensor = without(sensor, wild)
+            sweep = replace(sweep, **{name: sensor})
+        if sensor is not None and not scrambled:
+            doubts += _slips(sensor, sweep.frame_time_s)
     return sweep, tuple(doubts)
-
-
-def _cleaned(sensor: Sensor, frame_time_s: FloatArray, doubts: list[Doubt]) -> Sensor:
-    wild = spikes(sensor)
-    if not wild.any():
-        doubts += _slips(sensor, frame_time_s)
-        return sensor
-    share = f"{int(wild.sum())} of {wild.size} readings jump away from those around them and back"
-    if wild.mean() > MOST_SPIKES:
-        doubts.append(Doubt(sensor.label, "scrambled values", f"expected a path, but {share}", True))
-        return sensor
-    where = frames_at(sensor, np.flatnonzero(wild), frame_time_s)
-    steady = without(sensor, wild)
-    doubts.append(Doubt(sensor.label, "spikes", f"{share}, and are left out", False, where))
-    doubts += _slips(steady, frame_time_s)
-    return steady
 
 
 def believed(sweep: Sweep, doubts: Iterable[Doubt]) -> Sweep:
@@ -152,28 +139,36 @@ def _shaking(sensor: OrientationSensor | Tracker) -> Iterator[Doubt]:
 
 
 def _slips(sensor: OrientationSensor | Tracker, frame_time_s: FloatArray) -> Iterator[Doubt]:
-    """Readings that go on elsewhere: a sensor that slipped, or a tracker that found itself anew."""
-    found = slips(sensor)
-    if found.size:
-        evidence = f"expected a path that a hand can follow, got {found.size} jumps in it"
-        where = frames_at(sensor, found, frame_time_s)
+    """Readings that go on elsewhere, faster than any hand: it slipped, or a tracker found itself anew."""
+    poses = rigid(sensor.readings.world_from_sensor)
+    if len(poses) < 2:
+        return
+    rate = _steps(poses[:-1], poses[1:]) / np.diff(sensor.readings.time_s)
+    limit = np.maximum(_SLIP, _SPIKE_SIGMA * np.median(rate, axis=1))
+    jumps = np.flatnonzero((rate > limit[:, None]).any(axis=0)) + 1
+    if jumps.size:
+        evidence = f"expected a path that a hand can follow, got {jumps.size} jumps in it"
+        where = frames_at(sensor, jumps, frame_time_s)
         yield Doubt(sensor.label, "slip, or readings lost and found elsewhere", evidence, False, where)
 
 
 def _frozen(sensor: OrientationSensor | Tracker, sweep: Sweep, image: RigidTransform) -> Iterator[Doubt]:
     """Readings that are all the same while the images move."""
-    begin, end = standstill(sensor)
+    poses, read_s = rigid(sensor.readings.world_from_sensor), sensor.readings.time_s
+    still = (_steps(poses[:-1], poses[1:]) < _STILL).all(axis=0)
+    runs = [(read_s[first], read_s[last + 1]) for first, last in runs_of(np.flatnonzero(still))]
+    begin, end = max(runs, key=np.ptp, default=(0.0, -1.0))
     time_s = sweep.frame_time_s - sensor.time_offset_s
     during = (time_s >= begin) & (time_s <= end)
     if during.sum() < 2:
         return
-    still, whole = float(np.ptp(time_s[during])), float(np.ptp(time_s))
+    same_s, whole_s = float(np.ptp(time_s[during])), float(np.ptp(time_s))
     path_mm = image[during].apply(sweep.grid.centre_mm)
     moved = float(np.linalg.norm(path_mm - path_mm[0], axis=1).max())
-    if moved > MOVED_MM and still > LONGEST_STILL_S:
-        evidence = f"expected readings that change, got the same one for {still:.2f} of {whole:.2f} s"
+    if moved > MOVED_MM and same_s > LONGEST_STILL_S:
+        evidence = f"expected readings that change, got the same one for {same_s:.2f} of {whole_s:.2f} s"
         where = runs_of(np.flatnonzero(during))
-        yield Doubt(sensor.label, "frozen", evidence, still > MOST_STILL * whole, where)
+        yield Doubt(sensor.label, "frozen", evidence, same_s > MOST_STILL * whole_s, where)
 
 
 ROLL_EXPLAINED = 0.6
@@ -204,24 +199,12 @@ def _steps(poses: RigidTransform, others: RigidTransform) -> FloatArray:
 def spikes(sensor: OrientationSensor | Tracker) -> BoolArray:
     """Which readings lie far off the median of those around them, shape (m,)."""
     poses = rigid(sensor.readings.world_from_sensor)
-    if len(poses) < _WINDOW:
-        return np.zeros(len(poses), dtype=bool)
     place = median_filter(poses.translation, (_WINDOW, 1), mode="mirror")
     matrix = median_filter(poses.rotation.as_matrix(), (_WINDOW, 1, 1), mode="mirror")
     turn = Rotation.from_matrix(nearest_rotation(matrix))
     off = _steps(RigidTransform.from_components(place, turn), poses)
     limits = [max(most, _SPIKE_SIGMA * robust_sigma(size)) for most, size in zip(_SPIKE, off, strict=True)]
     return np.asarray((off > np.array(limits)[:, None]).any(axis=0))
-
-
-def slips(sensor: OrientationSensor | Tracker) -> IntArray:
-    """Readings that go on elsewhere than those before them were, faster than any hand, shape (places,)."""
-    poses = rigid(sensor.readings.world_from_sensor)
-    if len(poses) < _WINDOW:
-        return np.zeros(0, dtype=np.int64)
-    rate = _steps(poses[:-1], poses[1:]) / np.diff(sensor.readings.time_s)
-    limit = np.maximum(_SLIP, _SPIKE_SIGMA * np.median(rate, axis=1))
-    return np.flatnonzero((rate > limit[:, None]).any(axis=0)) + 1
 
 
 def frames_at(
@@ -234,15 +217,12 @@ def frames_at(
     return runs_of(np.searchsorted(middle, time_s))
 
 
-def without(sensor: Sensor, left_out: BoolArray) -> Sensor:
+def without(sensor: Any, left_out: BoolArray) -> Any:
     """The sensor less some of its readings, and what was measured with them."""
-    keep = ~left_out
-    readings = sensor.readings
+    keep, readings = ~left_out, sensor.readings
     less = replace(readings, time_s=readings.time_s[keep], world_from_sensor=readings.world_from_sensor[keep])
-    kept: dict[str, Any] = {
-        name: value[keep] for name, value in vars(sensor).items() if isinstance(value, np.ndarray)
-    }
-    return replace(sensor, readings=less, **kept)
+    others = {name: value[keep] for name, value in vars(sensor).items() if isinstance(value, np.ndarray)}
+    return replace(sensor, readings=less, **others)
 
 
 def jitter(poses: RigidTransform, at_mm: FloatArray) -> tuple[float, float]:
@@ -254,15 +234,6 @@ def jitter(poses: RigidTransform, at_mm: FloatArray) -> tuple[float, float]:
     second = (np.diff(values, 2, axis=0) / np.sqrt(6.0) for values in (poses.apply(at_mm), turns))
     place, turn = (max(robust_sigma(column) for column in each.T) for each in second)
     return place, turn
-
-
-def standstill(sensor: OrientationSensor | Tracker) -> tuple[float, float]:
-    """Begin and end of the longest time over which the readings are all the same, s; empty without one."""
-    poses, time_s = rigid(sensor.readings.world_from_sensor), sensor.readings.time_s
-    still = (_steps(poses[:-1], poses[1:]) < _STILL).all(axis=0) if len(poses) > 1 else np.zeros(0, bool)
-    runs = runs_of(np.flatnonzero(still))
-    spans = [(float(time_s[first]), float(time_s[last + 1])) for first, last in runs]
-    return max(spans, key=lambda span: span[1] - span[0], default=(float(time_s[0]),) * 2)
 
 
 def runs_of(frames: IntArray) -> tuple[tuple[int, int], ...]:

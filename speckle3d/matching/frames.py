@@ -58,7 +58,6 @@ def match_sweep(
     schedule: PairSchedule | KnownSchedule,
     progress: Callable[[int, int], None] | None = None,
     images: ImageSink | None = None,
-    textures: int = FRAMES,
 ) -> MatchedSweep:
     """Match every frame of a sweep with the earlier ones that the schedule wants.
 
@@ -68,11 +67,9 @@ def match_sweep(
         Called with frames done and frames in all.
     images : callable, optional
         Called with every intensity image.
-    textures : int
-        Frames whose texture is measured.
     """
     matched = FrameByFrame(matcher, schedule)
-    texture, chosen = Texture(matcher), spread_frames(len(sweep), textures)
+    texture, chosen = Texture(matcher), spread_frames(len(sweep), FRAMES)
     drawn, is_bmode = DrawnOver(matcher.patches), isinstance(sweep.signal, BModeSettings)
 
     def make(number: int) -> tuple[npt.NDArray[Any], ReadyFrame]:

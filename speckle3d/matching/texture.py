@@ -22,8 +22,6 @@ from speckle3d.matching.matcher import FrameMatcher, ReadyFrame
 FRAMES = 16
 """Frames looked at, evenly spread over the sweep: one in each 0.5 mm of 8 mm; nearer ones see the same
 speckle."""
-PHANTOM_FRAMES = 48
-"""The same of a phantom's sweep, whose texture serves many others."""
 CONTRAST = (0.75, 1.15)
 """Standard deviation over mean of intensity in patches that count: 1 for speckle, scattered by its 50 to 90
 cells. Coherent structure is above; its patches look coarser than speckle."""
