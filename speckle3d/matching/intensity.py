@@ -112,7 +112,8 @@ class IntensityExtractor:
         self._require_shape(frame)
         padded = np.zeros((len(frame), plan.length), "c8" if are_complex else "f4")
         padded[:, : frame.shape[1]] = frame
-        spectrum = (fft.fft if are_complex else fft.rfft)(padded, axis=1, overwrite_x=True)
+        transform: Any = fft.fft if are_complex else fft.rfft
+        spectrum = transform(padded, axis=1, overwrite_x=True)
         band = np.zeros((len(frame), plan.out_length), np.complex64)
         band[:, plan.destination] = spectrum.take(plan.bins, axis=1) * plan.weights
         return np.ascontiguousarray(fft.ifft(band, axis=1, overwrite_x=True)[:, : self.grid.samples])

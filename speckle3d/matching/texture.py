@@ -89,8 +89,8 @@ class Texture:
             some = intensity[usable, :, ::4].reshape(int(usable.sum()), -1)
             level = np.log(np.percentile(some, [10, 50, 90], axis=1))
         size = _sizes(intensity, patches.spacing_mm)
-        measured = (np.where(usable, values, np.nan) for values in (size, power))
-        self._looks[number] = _Look(*measured, level, sampled, _unit_echoes(equalised))
+        size, power = (np.where(usable, values, np.nan) for values in (size, power))
+        self._looks[number] = _Look(size, power, level, sampled, _unit_echoes(equalised))
 
     @property
     def frames(self) -> IntArray:
