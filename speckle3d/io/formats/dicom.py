@@ -112,7 +112,7 @@ def open_dicom(path: Path, settings: ImportSettings) -> Recording:
         for _ in header.iterall():  # elements are read from their bytes when first asked for
             pass
     machine = " ".join(str(header[name].value) for name in _MACHINE if name in header)
-    rows: list[Row] = [("scanner", printable(machine), ""), ("transfer syntax", printable(syntax), "")]
+    rows: list[Row] = [("scanner", printable(machine) or "not named", ""), ("transfer syntax", printable(syntax), "")]
     return Recording.of(path, settings, rows, lambda: _recording(path, settings, header, rows))
 
 
@@ -214,19 +214,17 @@ def _clock(header: Any, count: int) -> tuple[FloatArray | None, Value, tuple[str
         steps = np.ravel(np.asarray(header.get("FrameTimeVector") or [], dtype=float))
         numbers = {name: float(header.get(name) or 0.0) for name in _RATES}
     said = [
-        (name, 1e3 / number if name == "FrameTime" else number)
+        (1e3 / number if name == "FrameTime" else number, name)
         for name, number in numbers.items()
         if 0 < number < np.inf
     ]
-    others = [f"{name} says {other:.4g}" for name, other in said[1:2] if differs(said[0][1], other)]
-    rate = Value(said[0][1], ", ".join([said[0][0], *others])) if said else Value()
-    if not steps.size:
-        return None, rate, ()
+    others = [f"{name} says {rate:.4g}" for rate, name in said[1:2] if differs(said[0][0], rate)]
+    rate = Value(said[0][0], ", ".join([said[0][1], *others])) if said else Value()
     steps = steps[int(steps.size == count) :]  # the first of as many as there are frames is 0
-    if steps.size != count - 1 or not np.isfinite(steps).all():
-        words = f"FrameTimeVector: {steps.size} steps for {count} frames, or some that are no numbers"
-        return None, rate, (f"{words}: not used",)
-    return np.cumsum([0.0, *steps]) / 1e3, rate, ()
+    if steps.size == count - 1 and np.isfinite(steps).all():
+        return np.cumsum([0.0, *steps]) / 1e3, rate, ()
+    words = f"FrameTimeVector: {steps.size} steps for {count} frames, or some that are no numbers: not used"
+    return None, rate, (words,) if steps.size else ()
 
 
 def _numbers(item: Any, *names: str) -> list[float]:

@@ -206,30 +206,24 @@ def _axes(text: str, node: Any) -> tuple[dict[str, int], list[str]]:
     """Lengths of axes by their names, and the names in the file's order; - for axes of length 1."""
     names = [name.strip() for name in text.split(",")]
     sizes = [*node.shape[::-1], *(1,) * (len(names) - node.ndim)]  # MATLAB leaves out last ones of length 1
-    lengths = {"frame": 1} | dict(zip(names, sizes, strict=False))
+    axes = list(zip(names, sizes, strict=False))
     plain = sorted(name for name in names if name != "-")
-    is_flat = all(size == 1 for name, size in zip(names, sizes, strict=False) if name == "-")
-    if (
-        plain not in (["frame", "sample", "vector"], ["sample", "vector"])
-        or not is_flat
-        or len(names) < len(sizes)
-    ):
+    is_named = plain in (["frame", "sample", "vector"], ["sample", "vector"])
+    if not is_named or len(sizes) > len(names) or any(name == "-" and size > 1 for name, size in axes):
         raise InvalidInputError(
             f"axes: expected sample, vector, frame once each, and - for axes of length 1, of {_size(node)}, "
             f"got {printable(text) or 'none'}"
         )
-    return lengths, names[: node.ndim][::-1]
+    return {"frame": 1} | dict(axes), names[: node.ndim][::-1]
 
 
 def _frames(
     path: Path, nodes: list[Any], names: list[str], shape: tuple[int, int, int], data: tuple[str, ...]
 ) -> Frames:
-    dtype: Any = np.complex64
-    if data == ("bmode",):
-        dtype = np.uint8
-    elif data == ("rf",):
-        dtype = np.int16 if nodes[0].dtype in (np.int8, np.uint8, np.int16) else np.float32
-    grid = Grid(shape[1:], across="sample" in names[: names.index("vector")] if "vector" in names else False)
+    is_short = nodes[0].dtype in (np.int8, np.uint8, np.int16)
+    dtypes: dict[str, Any] = {"bmode": np.uint8, "rf": np.int16 if is_short else np.float32}
+    dtype = dtypes.get(data[0], np.complex64)
+    grid = Grid(shape[1:], [name for name in names if name in ("vector", "sample")][-1] == "vector")
     turn = _Greys(grid) if data == ("bmode",) else grid
     axis = names.index("frame") if "frame" in names else None
     if isinstance(nodes[0], h5py.Dataset):

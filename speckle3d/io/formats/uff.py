@@ -77,7 +77,15 @@ def _objects(file: h5py.File) -> dict[str, str]:
 def _recording(
     path: Path, settings: ImportSettings, file: h5py.File, objects: dict[str, str], rows: list[Row]
 ) -> Recording:
-    name = _chosen(objects, path, settings)
+    asked = settings.arrays.get("data")
+    names = [one for one, kind in objects.items() if kind == _BEAMFORMED and asked in (None, one)]
+    if len(names) != 1:
+        got = ", ".join(names or objects.values()) or "none"
+        raise InvalidInputError(
+            f"expected one {_BEAMFORMED}, got {got}: say which by arrays = {{ data = NAME }} in "
+            f"{path.name}.toml beside it, or beamform channels by USTB's das on a {_LINEAR}"
+        )
+    name = names[0]
     group, data = require_group(file, name), f"{name}/data"
     lines, samples, values = _scan(group, f"in {name}/scan")
     is_complex = isinstance(find_member(file, data), h5py.Group)
@@ -119,32 +127,15 @@ def _require_phase(
     frames: FileFrames, values: dict[str, Value], settings: ImportSettings, modulation_hz: float
 ) -> None:
     """Refuse a modulation frequency that contradicts how the phase of the data turns."""
-    carried = modulation_hz or values.get("centre_frequency_hz", Value()).value
+    carried_hz = modulation_hz or values.get("centre_frequency_hz", Value()).value or 0.0
     rate_hz = rate_by_spacing(values["row_spacing_mm"], settings, values).value
-    shift_hz = demodulation_of(frames, carried, rate_hz) if carried else None
-    if shift_hz is not None and bool(shift_hz) != bool(modulation_hz):
-        says = f"shifted down by {carried:g} Hz" if shift_hz else f"still carrying {carried:g} Hz"
+    shift_hz = demodulation_of(frames, carried_hz, rate_hz) if carried_hz else None
+    if shift_hz is not None and shift_hz != modulation_hz:
         raise InvalidInputError(
-            f"modulation_frequency: expected that of data {says}, as their phase tells, got "
-            f"{modulation_hz:g}: give --demodulation-frequency-hz, 0 where it is still carried"
+            f"modulation_frequency: expected {shift_hz:g} Hz, as the phase of the data tells (they "
+            f"{'are shifted down by' if shift_hz else 'still carry'} {carried_hz:g}), got {modulation_hz:g}: "
+            "give --demodulation-frequency-hz, 0 where it is still carried"
         )
-
-
-def _chosen(objects: dict[str, str], path: Path, settings: ImportSettings) -> str:
-    """Name of the beamformed data to read."""
-    names = [name for name, kind in objects.items() if kind == _BEAMFORMED]
-    asked = settings.arrays.get("data", names[0] if len(names) == 1 else None)
-    if asked in names:
-        return asked
-    if names:
-        raise InvalidInputError(
-            f"expected one {_BEAMFORMED}, got {', '.join(names)}: say which by arrays = "
-            f'{{ data = "{names[0]}" }} in {path.name}.toml beside it'
-        )
-    got = ", ".join(sorted({*objects.values()}))
-    raise InvalidInputError(
-        f"expected {_BEAMFORMED}, got {got}: beamform channels by USTB's das on a {_LINEAR}"
-    )
 
 
 def _scan(group: h5py.Group, said: str) -> tuple[int, int, dict[str, Value]]:

@@ -101,10 +101,10 @@ def _recording(path: Path, settings: ImportSettings, file: h5py.File, rows: list
     if not arrays:
         raise InvalidInputError(f"expected {' or '.join(_READ)}, got {rows[0][1]}")
     name, kind, home = arrays[0]
-    if names := [other for other, same, _ in arrays[1:] if same == kind]:
+    if any(same == kind for _, same, _ in arrays[1:]):
         raise InvalidInputError(
-            f"expected one track, got {name}, {', '.join(names)}: say which by arrays = "
-            f'{{ data = "{name}" }} in {path.name}.toml beside it'
+            f"expected one track, got {rows[0][1]}: say which by arrays = {{ data = NAME }} in "
+            f"{path.name}.toml beside it"
         )
     rows.append(("read", name, ""))
     group, scan = find_member(file, name), f"{home}scan"
