@@ -84,23 +84,20 @@ def read_points(path: PathLike, wire_names: Sequence[str] = ()) -> PickedPoints:
     rows, wires = list[list[float]](), list[int]()
     for where, cell in table(path, _COLUMNS):
         rows.append([numbers(cell[name], 1, f"{where}: {name}")[0] for name in _COLUMNS])
-        frame = rows[-1][0]
-        if frame < 0 or frame % 1:
+        if rows[-1][0] < 0 or rows[-1][0] % 1:
             raise InvalidInputError(f"{where}: frame: expected a whole number from 0, got {cell['frame']}")
-        if (word := cell.get(_WIRE)) is None:
-            continue
-        if word not in numbered:
+        word = cell.get(_WIRE)
+        if word is not None and word not in numbered:
             known = ", ".join(wire_names) or "no wire"
             raise InvalidInputError(f"{where}: wire: expected {known} or its number, got {word!r}")
-        if any(
-            other[0] == frame and wire == numbered[word] for other, wire in zip(rows, wires, strict=False)
-        ):
-            raise InvalidInputError(f"{where}: expected a wire once in a frame, got {word} again")
-        wires.append(numbered[word])
+        wires += [] if word is None else [numbered[word]]
     if not rows:
         raise InvalidInputError(f"{path}: expected points below the heading, got none")
-    places = np.array(rows)
-    return PickedPoints(places[:, 0].astype(int), places[:, 1:], np.array(wires) if wires else None)
+    places, wire = np.array(rows), np.array(wires) if wires else None
+    points = PickedPoints(places[:, 0].astype(int), places[:, 1:], wire)
+    if wire is not None and len(np.unique([points.frame, wire], axis=1).T) < len(points):
+        raise InvalidInputError(f"{path}: expected a wire once in a frame, got one again")
+    return points
 
 
 def write_points(path: PathLike, points: PickedPoints, wire_names: Sequence[str] = ()) -> None:
@@ -110,21 +107,13 @@ def write_points(path: PathLike, points: PickedPoints, wire_names: Sequence[str]
     ------
     FileError
         If the file cannot be written.
-    InvalidInputError
-        If a name cannot be written.
     """
-    for name in wire_names:
-        if name != name.strip() or not name or set(name) & set(",#\r\n"):
-            raise InvalidInputError(f"wire: expected a name without comma, hash or line break, got {name!r}")
-    named = _COLUMNS if points.wire is None else (*_COLUMNS, _WIRE)
-    lines = [",".join(named)]
-    for i, (frame, (column, row)) in enumerate(zip(points.frame, points.pixels, strict=True)):
-        line = f"{frame},{column:.3f},{row:.3f}"
-        if points.wire is not None:
-            line += f",{wire_names[points.wire[i]] if wire_names else points.wire[i]}"
-        lines.append(line)
+    columns = [points.frame.astype(str), *np.char.mod("%.3f", points.pixels.T)]
+    if points.wire is not None:
+        columns.append(np.array(wire_names)[points.wire] if wire_names else points.wire.astype(str))
+    rows = [(*_COLUMNS, _WIRE)[: len(columns)], *zip(*columns, strict=True)]
     with atomic_path(path) as part:
-        part.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        part.write_text("".join(f"{','.join(row)}\n" for row in rows), encoding="utf-8")
 
 
 WORLD = ("x_mm", "y_mm", "z_mm")

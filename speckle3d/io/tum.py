@@ -65,25 +65,24 @@ def read_tum(path: PathLike, length_unit: LengthUnit | None = None) -> TimedPose
     """
     lines = [text for _, text in text_lines(path)]
     comments = {word for text in lines if text.startswith("#") for word in text.split()}
-    said = next((unit for unit in _MM_PER_UNIT if f"x_{unit}" in comments), None)
-    rows = [_eight(text) for text in lines if not text.startswith("#")]
-    table = np.array(rows).reshape(-1, _COLUMNS)
+    said = next((unit for unit in _MM_PER_UNIT if f"x_{unit}" in comments), length_unit or "m")
+    table = np.array([_eight(text) for text in lines if not text.startswith("#")]).reshape(-1, _COLUMNS)
     finite = np.isfinite(table).all(axis=1)
     if 2 * np.count_nonzero(finite) <= len(table):
         got = f"{np.count_nonzero(finite)} of {len(table)}"
         raise InvalidInputError(f"{path}: expected lines of eight finite numbers, got {got}")
-    if length_unit is not None and said is not None and said != length_unit:
+    if said != (length_unit or said):
         raise InvalidInputError(f"{path}: expected lengths in {length_unit}, got a file that says {said}")
     sound = np.abs(np.linalg.norm(table[:, 4:], axis=1) - 1.0) <= _UNIT_TOLERANCE
     words = np.where(finite, np.where(sound, "", "without a unit quaternion"), "that are not eight numbers")
-    kept, notes = usable(f"{path}: poses", table[:, 0], words.tolist())
-    if not kept.size:
+    rows, notes = usable(f"{path}: poses", table[:, 0], words.tolist())
+    if not rows.size:
         raise InvalidInputError(f"{path}: expected poses with a time and a unit quaternion, got none")
     for note in notes:
         warnings.warn(note, stacklevel=2)
-    places_mm = table[kept, 1:4] * _MM_PER_UNIT[length_unit or said or "m"]
-    poses = RigidTransform.from_components(places_mm, Rotation.from_quat(table[kept, 4:]))
-    return TimedPoses(table[kept, 0].copy(), poses)
+    time_s, places, turns = np.split(table[rows], [1, 4], axis=1)
+    poses = RigidTransform.from_components(_MM_PER_UNIT[said] * places, Rotation.from_quat(turns))
+    return TimedPoses(time_s[:, 0], poses)
 
 
 def is_tum(path: PathLike) -> bool:

@@ -112,7 +112,10 @@ def open_dicom(path: Path, settings: ImportSettings) -> Recording:
         for _ in header.iterall():  # elements are read from their bytes when first asked for
             pass
     machine = " ".join(str(header[name].value) for name in _MACHINE if name in header)
-    rows: list[Row] = [("scanner", printable(machine) or "not named", ""), ("transfer syntax", printable(syntax), "")]
+    rows: list[Row] = [
+        ("scanner", printable(machine) or "not named", ""),
+        ("transfer syntax", printable(syntax), ""),
+    ]
     return Recording.of(path, settings, rows, lambda: _recording(path, settings, header, rows))
 
 
