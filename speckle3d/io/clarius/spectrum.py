@@ -1,15 +1,16 @@
 """The band of echoes, measured in a recording whose files do not give it.
 
-Neighbouring lines see much of the same echoes but not the same noise: the mean of their cross-spectra, by
-Welch's method, of lines scaled to the same power at all depths, is that of the echoes alone, whatever the
-noise's. The band is where it is above a quarter of its highest (-6 dB), about the transmit frequency. It is
-the band of the echoes at all depths together, lower than the probe's in tissue that attenuates. On simulated
-RF and I/Q the edges move by 0.1 MHz from 40 to 0 dB over noise.
+Neighbouring lines see much of the same echoes but not the same noise: the mean of their cross-spectra, of
+lines scaled to the same power at all depths, is that of the echoes alone, whatever the noise's. The band is
+where it is above a quarter of its highest (-6 dB), about the transmit frequency. It is the band of the echoes
+at all depths together, lower than the probe's in tissue that attenuates. On simulated RF and I/Q the edges
+move by 0.1 MHz from 40 to 0 dB over noise.
 """
 
 from __future__ import annotations
 
 import numpy as np
+from scipy.ndimage import uniform_filter1d
 
 from speckle3d.core.sweep import Frames
 
@@ -20,7 +21,7 @@ _STEP_HZ = 0.1e6
 """Edges are rounded: they are known no better, and are to be typed where other recordings need the same."""
 
 _CLEAR = 10.0
-"""Least height of the band, in standard deviations of the mean cross-spectrum of as many spectra of noise
+"""Least share of the power that neighbouring lines have in common, in standard deviations of that of noise
 alone: a quarter of it, where the edges are, is then 2.5 of them."""
 
 
@@ -38,31 +39,23 @@ def band_hz(
     shift_hz : float, optional
         Frequency that I/Q were shifted down by; None for RF.
     """
-    length = max(2 ** round(np.log2(sampling_rate_hz / _RESOLUTION_HZ)), 16)
     count, vectors, samples = frames.shape
-    if vectors < 2 or samples < length:
-        return None
-    chosen = sorted({0, count // 2, count - 1})
-    shared, power = np.zeros(length), np.zeros(length)
+    width = max(round(_RESOLUTION_HZ * samples / sampling_rate_hz), 1)
+    shared, power, chosen = np.zeros(samples), np.zeros(samples), {0, count // 2, count - 1}
     for i in chosen:
-        lines = frames[i] - (frames[i].mean(axis=1, keepdims=True) if shift_hz is None else 0.0)
-        pieces = np.lib.stride_tricks.sliding_window_view(lines, length, axis=1)[:, :: length // 2]
-        level = np.sqrt(np.mean(np.abs(pieces) ** 2, axis=(0, 2), keepdims=True))
-        spectra = np.fft.fftshift(np.fft.fft(pieces / (level + (level == 0)) * np.hanning(length)), axes=-1)
-        shared += (spectra[:-1].conj() * spectra[1:]).real.mean(axis=(0, 1))
-        power += (np.abs(spectra) ** 2).mean(axis=(0, 1))
-    frequency = np.fft.fftshift(np.fft.fftfreq(length, 1 / sampling_rate_hz)) + (shift_hz or 0.0)
-    near = np.flatnonzero((frequency > 0.5 * transmit_hz) & (frequency < 2 * transmit_hz))
-    if not near.size:
+        lines = 1.0 * frames[i]
+        level = np.sqrt(uniform_filter1d(np.mean(np.abs(lines) ** 2, axis=0), samples // width))
+        spectra = np.fft.fft(lines / (level + (level == 0)))
+        shared += (spectra[:-1].conj() * spectra[1:]).real.sum(axis=0)
+        power += (np.abs(spectra) ** 2).sum(axis=0)
+    frequency = np.fft.fftshift(np.fft.fftfreq(samples, 1 / sampling_rate_hz)) + (shift_hz or 0.0)
+    shared, power = (uniform_filter1d(np.fft.fftshift(one), width, mode="wrap") for one in (shared, power))
+    near = (frequency > 0.5 * transmit_hz) & (frequency < 2 * transmit_hz)
+    top = int(np.argmax(np.where(near, shared, -np.inf)))
+    outside = np.flatnonzero(shared < shared[top] / 4)
+    sides = outside[outside < top][-1:], outside[outside > top][:1]
+    least = _CLEAR / np.sqrt(max(len(chosen) * (vectors - 1) * width, 1)) * power[top]
+    if not near[top] or not all(side.size for side in sides) or shared[top] <= least:
         return None
-    top = int(near[np.argmax(shared[near])])
-    level = shared[top] / 4
-    left, right = np.flatnonzero(shared[:top] < level), np.flatnonzero(shared[top:] < level) + top
-    if shared[top] <= _CLEAR / np.sqrt(pieces[1:, :, 0].size * len(chosen)) * power[top] or not (
-        left.size and right.size
-    ):
-        return None
-    rise, fall = slice(left[-1], left[-1] + 2), slice(right[0], right[0] - 2, -1)
-    edges = (np.interp(level, shared[edge], frequency[edge]) for edge in (rise, fall))
-    low, high = (_STEP_HZ * round(float(edge) / _STEP_HZ) for edge in edges)
+    low, high = (_STEP_HZ * round(float(frequency[side[0]]) / _STEP_HZ) for side in sides)
     return (low, high) if low > 0 else None
