@@ -34,9 +34,8 @@ _MOST_ALIKE, _MOST_TIMES = 3, 3
 """Poses in a row that are the same to the last digit: a tracker's noise alone changes them, and 2 of 5,000 at
 hand are alike. Of a tracker slower than the images, runs are regular: three times their median is odd."""
 
-_LEAST_OF_WIDTH, _LONGEST_MM = 1 / 200, 3000.0
-"""Length of a path as a share of the image's width, below which it is in metres or stands still; and the
-longest a hand's may be. In the wrong unit it is a thousandth, or a thousand times."""
+_LEAST_OF_WIDTH = 1 / 200
+"""Length of a path as a share of the image's width, below which it is in metres or stands still."""
 
 
 def rising(times: FloatArray) -> IntArray:
@@ -146,8 +145,6 @@ def checked_path(sweep: Sweep, chain: str) -> tuple[Sweep, list[str]]:
             f"poses: the path spans {extent:.3g} mm and the image is {width:.4g} mm wide: the probe stood "
             "still, or the poses are in metres"
         )
-    elif extent > _LONGEST_MM:
-        notes.append(f"poses: the path spans {extent:.3g} mm: are they in micrometres?")
     matched = (
         f"poses of {chain}, mm: {len(readings)} poses, {len(sweep)} images, {np.count_nonzero(covered)} "
         "matched" + (f", {between} of them between two poses" if between else "")

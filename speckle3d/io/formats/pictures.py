@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from speckle3d.core.errors import FileError, InvalidInputError
+from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.extras import extra_module
 from speckle3d.core.images import ImageFrames
 from speckle3d.io.hdf5 import reading
@@ -55,21 +55,18 @@ class Video:
     """Frames of a video, by imageio; those in order are read fastest."""
 
     def __init__(self, path: Path) -> None:
-        self._path, self._iio = path, extra_module("imageio.v3", "video", "a video")
-        self._next, self._frames = 0, iter(list[npt.NDArray[Any]]())
+        iio = extra_module("imageio.v3", "video", "a video")
+        self._path = path
         with reading(path, Exception):  # of whichever plugin imageio takes
-            first, self.rate_hz = self[0], self._iio.immeta(path, exclude_applied=False).get("fps")
-            count = sum(1 for _ in self._iio.imiter(path))
+            count = sum(1 for _ in iio.imiter(path))
+            self.rate_hz = iio.immeta(path, exclude_applied=False).get("fps")
+            self._file = iio.imopen(path, "r")
+        first = self[0]
         self.shape, self.dtype = (count, *first.shape), first.dtype
 
     def __getitem__(self, index: int) -> npt.NDArray[Any]:
-        if index < self._next or not self._next:
-            self._next, self._frames = 0, iter(self._iio.imiter(self._path))
-        for frame in self._frames:
-            self._next += 1
-            if self._next > index:
-                return np.asarray(frame)
-        raise FileError(f"{self._path}: frame {index}: expected it in the video, got its end")
+        with reading(f"{self._path}: frame {index}", Exception):
+            return np.asarray(self._file.read(index=index))
 
 
 def _pictures(folder: Path) -> list[Path]:

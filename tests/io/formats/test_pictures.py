@@ -38,10 +38,9 @@ def test_an_array_file_is_read(tmp_path):
     sweep = load_sweep(tmp_path / "grey.npy", ImportSettings(**PIXELS, frame_rate_hz=20))
     np.testing.assert_array_equal(frames_of(sweep), GREY.transpose(0, 2, 1))
     np.save(tmp_path / "rf.npy", GREY.astype(np.int16))
-    given = ImportSettings(
-        vector_pitch_mm=0.3, sampling_rate_hz=40e6, centre_frequency_hz=5e6, bandwidth_hz=(3e6, 7e6),
-        frame_rate_hz=20,
-    )  # fmt: skip
+    names = ("sampling_rate_hz", "centre_frequency_hz", "bandwidth_hz")
+    echoes = {name: getattr(RF, name) for name in names}
+    given = ImportSettings(vector_pitch_mm=0.3, frame_rate_hz=20, **echoes)
     assert load_sweep(tmp_path / "rf.npy", given).signal == RF
 
 

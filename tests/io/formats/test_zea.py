@@ -17,21 +17,13 @@ from format_examples import (
 from scipy.spatial.transform import Rotation
 from sweep_examples import frames_of, sizes_of
 
-from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.grid import ImageGrid
 from speckle3d.core.sweep import BModeSettings, RFSettings
 from speckle3d.io.import_settings import ImportSettings, MissingSettingsError
 from speckle3d.io.load import load_sweep, open_recording
 
 GIVEN = ImportSettings(bandwidth_hz=(4.5e6, 7e6), frame_rate_hz=20.0)
-GREY = ImportSettings(dynamic_range_db=60.0, frame_rate_hz=20.0)
-VALUES, PLACES = "data/beamformed_data/values", "data/beamformed_data/coordinates"
-
-
-def require_grid(grid):
-    """The examples' grid, in what single precision keeps of a length in metres."""
-    expected = ImageGrid(VECTORS, SAMPLES, PITCH_MM, SPACING_MM, FIRST_MM)
-    assert sizes_of(grid) == pytest.approx(sizes_of(expected), rel=1e-6)
+PLACES = "data/beamformed_data/coordinates"
 
 
 def test_rf_with_coordinates(tmp_path):
@@ -40,7 +32,8 @@ def test_rf_with_coordinates(tmp_path):
     scan = {"time_to_next_transmit": between, "bandwidth_percent": 50}
     sweep = load_sweep(write_zea(tmp_path / "a.hdf5", rf(), scan=scan))
     np.testing.assert_array_equal(frames_of(sweep), np.delete(rf(), 2, axis=0))
-    require_grid(sweep.grid)
+    expected = ImageGrid(VECTORS, SAMPLES, PITCH_MM, SPACING_MM, FIRST_MM)
+    assert sizes_of(sweep.grid) == pytest.approx(sizes_of(expected), rel=1e-6)  # single precision of metres
     rate = sweep.signal.sampling_rate_hz
     assert rate == pytest.approx(1480e3 / (2 * SPACING_MM), rel=1e-6)
     assert sweep.signal == RFSettings(rate, 1480.0, 6e6, (4.5e6, 7.5e6))
@@ -64,21 +57,17 @@ def test_coordinates_on_a_polar_grid_are_the_lines_of_a_fan(tmp_path, radius_mm)
     np.testing.assert_allclose(sweep.grid.angle_rad([0, VECTORS - 1]), [-0.3, 0.2], atol=1e-5)
 
 
-@pytest.mark.parametrize(("carried", "middle"), [(0.0, 6e6), (6e6, 0.0)])
+@pytest.mark.parametrize(("carried", "middle"), [(0.0, 6e6), (6e6, 0.0), (None, None)])
 def test_iq_that_carry_their_frequency_or_do_not_are_told_by_their_phase(tmp_path, carried, middle):
-    frames = carrying(carried)
-    sweep = load_sweep(write_zea(tmp_path / "a.hdf5", frames), GIVEN)
-    np.testing.assert_array_equal(frames_of(sweep), frames)
-    assert sweep.signal.demodulation_frequency_hz == middle
-
-
-def test_iq_of_the_other_sign_are_refused_and_noise_is_asked_about(tmp_path):
-    with pytest.raises(InvalidInputError, match="Q has the other sign"):
-        load_sweep(write_zea(tmp_path / "a.hdf5", np.conj(carrying(6e6))), GIVEN)
-    path = write_zea(tmp_path / "b.hdf5", iq())
-    with pytest.raises(MissingSettingsError) as caught:
-        load_sweep(path, GIVEN)
-    assert caught.value.settings == ("demodulation_frequency_hz",)
+    frames = iq() if carried is None else carrying(carried)  # noise tells nothing
+    recording = open_recording(write_zea(tmp_path / "a.hdf5", frames), GIVEN)
+    if middle is None:
+        with pytest.raises(MissingSettingsError) as caught:
+            _ = recording.sweep
+        assert caught.value.settings == ("demodulation_frequency_hz",)
+        return
+    np.testing.assert_array_equal(frames_of(recording.sweep), frames)
+    assert recording.sweep.signal.demodulation_frequency_hz == middle
 
 
 @pytest.mark.parametrize("decibels", [False, True])
@@ -100,10 +89,7 @@ def test_probe_poses_are_the_tracker(tmp_path, kind):
     """As zea 0.1.8 writes them: of the transducer's tip, in metres, y elevational and z axial."""
     places = np.array([[0.0, 1e-4 * i, 0.0] for i in range(10)])
     turns = Rotation.from_rotvec(0.01 * np.arange(10)[:, None] * [0.0, 0.0, 1.0])
-    rotation = {
-        "quaternion_wxyz": turns.as_quat(scalar_first=True),
-        "euler_xyz": turns.as_euler("xyz"),
-    }[kind]
+    rotation = turns.as_euler("xyz") if kind == "euler_xyz" else turns.as_quat(scalar_first=True)
     path = write_zea(
         tmp_path / "a.h5", grey(), "image", scan={"time_to_next_transmit": np.full((4, 2), 0.05)}
     )
