@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Generator
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from speckle3d.io.hdf5 import SIGNATURE, file_format, one_line, open_hdf5, sha25
 from speckle3d.io.import_settings import ImportSettings, settings_file, settings_for
 from speckle3d.io.metaimage import READER as _IMAGES
 from speckle3d.io.readers import Reader, find_reader, first_bytes, readers
-from speckle3d.io.recordings import Recording
+from speckle3d.io.recordings import Recording, Row
 
 IMAGE = _IMAGES.format
 """Kind of MetaImage and NRRD files."""
@@ -83,12 +84,29 @@ def recording_of(reader: Reader, path: Path, settings: ImportSettings) -> Record
         )
     try:
         with naming(str(path)):
-            made = reader.read(path, settings)
+            made = _read(reader, path, settings)
     except Speckle3DError:
         raise
     except (OSError, RuntimeError) as error:  # h5py's, of damage where nothing else is asked for
         raise FileError(f"{path}: cannot be read: {one_line(error)}") from error
     return made if isinstance(made, Recording) else Recording(path, settings, ready=made)
+
+
+def _read(reader: Reader, path: Path, settings: ImportSettings) -> Sweep | Recording:
+    """What a reader makes; where it cannot, the facts that it told before, and why."""
+    made = reader.read(path, settings)
+    if not isinstance(made, Generator):
+        return made
+    rows = list[Row]()
+    try:
+        while True:
+            rows.append(next(made))
+    except StopIteration as end:
+        return replace(end.value, rows=tuple(rows))
+    except (InvalidInputError, FileError) as error:
+        if not rows:
+            raise
+        return Recording(path, settings, fault=error, rows=tuple(rows))
 
 
 def load_landmarks(path: PathLike) -> Landmarks | None:

@@ -36,7 +36,7 @@ from speckle3d.io.plus.transforms import (
 from speckle3d.io.plus.write import own_values
 from speckle3d.io.pose_paths import timed_poses, usable
 from speckle3d.io.readers import Reader
-from speckle3d.io.recordings import Recording, Value, differs, rate_of
+from speckle3d.io.recordings import Facts, Recording, Value, differs, rate_of
 
 _DEVICE = "the device set"
 _CARRIER = ("demodulation_frequency_hz", "centre_frequency_hz", "sampling_rate_hz")
@@ -80,7 +80,7 @@ def lacking_poses(path: PathLike) -> str:
     return f"{', '.join(names)}: name the sensor's with --transform" if names else "none"
 
 
-def open_sequence(path: Path, settings: ImportSettings) -> Recording:
+def open_sequence(path: Path, settings: ImportSettings) -> Facts:
     """Read what a header says of its images and poses; the frames stay on disk.
 
     Frames are turned so that vectors run from the unmarked to the marked side and samples away from the
@@ -97,16 +97,14 @@ def open_sequence(path: Path, settings: ImportSettings) -> Recording:
     kind, orientation = (
         word if name in header.fields else f"{word} (assumed)" for name, word in kinds.items()
     )
-    rows = [
-        ("container", header.container, ""),
-        ("size", _shown(header.size), ""),
-        ("image type", kind, ""),
-        ("image orientation", orientation, ""),
-        ("transforms", ", ".join(names_of(header)) or "none", ""),
-    ]
+    yield "container", header.container, ""
+    yield "size", _shown(header.size), ""
+    yield "image type", kind, ""
+    yield "image orientation", orientation, ""
+    yield "transforms", ", ".join(names_of(header)) or "none", ""
     if settings.plus_config is not None:
-        rows.append(("device set", settings.plus_config, ""))
-    return Recording.of(path, settings, rows, lambda: _recording(header, settings, device, layout))
+        yield "device set", settings.plus_config, ""
+    return _recording(header, settings, device, layout)
 
 
 def _recording(

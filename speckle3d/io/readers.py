@@ -22,7 +22,7 @@ from speckle3d.core.files import PathLike, open_regular
 from speckle3d.core.sweep import Sweep
 from speckle3d.io.hdf5 import SIGNATURE, open_hdf5, reading
 from speckle3d.io.import_settings import ImportSettings
-from speckle3d.io.recordings import Recording
+from speckle3d.io.recordings import Facts, Recording
 from speckle3d.io.recordings import Row as Row
 
 GROUP = "speckle3d.readers"
@@ -48,7 +48,8 @@ class Reader:
         none for a folder. It raises nothing.
     read : callable
         The sweep of a recording, with `ImportSettings` for what it does not say; or a `Recording`, which
-        makes the sweep, describes itself, also where it is none, and tells what was assumed or left out.
+        makes the sweep, describes itself and tells what was assumed or left out. A generator yields rows of
+        facts before it returns a `Recording`: they are told also where there is none.
     companions : callable
         Other files that the sweep's content depends on.
     takes_settings : bool
@@ -59,7 +60,7 @@ class Reader:
 
     format: str
     claims: Callable[[Path, bytes], bool] | None
-    read: Callable[[Path, ImportSettings], Sweep | Recording]
+    read: Callable[[Path, ImportSettings], Sweep | Recording | Facts]
     companions: Callable[[Path], Sequence[Path]] = lambda _: ()
     takes_settings: bool = True
     claims_hdf5: Callable[[h5py.File], bool] | None = None

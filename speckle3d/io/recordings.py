@@ -8,12 +8,12 @@ at once. Readers fill a `Recording`; it makes the sweep, describes itself and te
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Mapping
+from collections.abc import Generator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -133,14 +133,6 @@ class Recording:
     remarks: tuple[str, ...] = ()
     fault: InvalidInputError | FileError | None = None
     ready: Sweep | None = None
-
-    @classmethod
-    def of(cls, path: Path, settings: ImportSettings, rows: list[Row], make: Callable[[], Self]) -> Self:
-        """What a reader makes, after rows of facts; where it cannot, those facts and why."""
-        try:
-            return replace(make(), rows=tuple(rows))
-        except (InvalidInputError, FileError) as error:
-            return cls(path, settings, fault=error, rows=tuple(rows))
 
     @property
     def sweep(self) -> Sweep:
@@ -297,6 +289,10 @@ class Recording:
             name=printable(self.name or self.path.name.split(".")[0]),
             probe=self.probe or self.settings.probe or "",
         )
+
+
+Facts: TypeAlias = Generator[Row, None, Recording]
+"""What a reader's generator is: it yields rows of facts and returns the recording."""
 
 
 def rate_by_spacing(spacing: Value, settings: ImportSettings, values: Mapping[str, Value]) -> Value:

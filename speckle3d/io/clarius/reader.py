@@ -35,13 +35,13 @@ from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import FileError, InvalidInputError, naming
 from speckle3d.core.printable import printable
 from speckle3d.io.clarius.imu import SensorSamples, read_samples
-from speckle3d.io.clarius.package import Files, find_files
+from speckle3d.io.clarius.package import find_files
 from speckle3d.io.clarius.raw import open_raw
 from speckle3d.io.clarius.sidecars import Description, parsed
 from speckle3d.io.clarius.spectrum import band_hz
 from speckle3d.io.frames import FileFrames
 from speckle3d.io.import_settings import SPEED_OF_SOUND_M_S, ImportSettings
-from speckle3d.io.recordings import Recording, Row, Value, step_of
+from speckle3d.io.recordings import Facts, Recording, Value, step_of
 from speckle3d.io.toml import validated
 
 FORMAT = "Clarius raw package"
@@ -63,59 +63,35 @@ _SAID = (
 _OWN = "its yml"
 
 
-def open_package(path: Path, settings: ImportSettings) -> Recording:
+def open_package(path: Path, settings: ImportSettings) -> Facts:
     """Read a package: RF is preferred, else I/Q, else the envelope. Times are of the scanner's clock."""
     files = find_files(path)
-    rows: list[Row] = [("recording", printable(files.name) or "without a name", "")]
+    yield "recording", printable(files.name) or "without a name", ""
     sensor, remarks = None, list[str]()
     if "imu" in files.yml:
         try:
             sensor = read_samples(files.yml["imu"])
-            rows += sensor.rows
+            yield from sensor.rows
             remarks += sensor.remarks
         except (InvalidInputError, FileError) as error:
             remarks.append(f"the sensor is left out: {error}")
-    return Recording.of(path, settings, rows, lambda: _recording(files, settings, sensor, remarks, rows))
-
-
-def sensor_of(path: Path) -> SensorSamples:
-    """Read the sensor's samples of a package.
-
-    Raises
-    ------
-    InvalidInputError
-        If the package has no sensor, or its samples make no sense.
-    """
-    if (member := find_files(path).yml.get("imu")) is None:
-        raise InvalidInputError(f"{path}: expected the sensor's samples (_imu.yml), got none")
-    return read_samples(member)
-
-
-def package_files(path: Path) -> Sequence[Path]:
-    """Other files on disk that the sweep's content depends on."""
-    files = find_files(path)
-    return sorted({member.path for member in (*files.raw.values(), *files.yml.values())} - {path})
-
-
-def _recording(
-    files: Files, settings: ImportSettings, sensor: SensorSamples | None, remarks: list[str], rows: list[Row]
-) -> Recording:
-    """What a package holds, as a recording."""
     fields = {kind: parsed(one.text(), one.where) for kind, one in files.yml.items() if kind != "imu"}
     for kind, one in fields.items():
-        rows += [(f"{kind}: {name}", printable(str(one[name])[:60]), "") for name in _SAID if one.get(name)]
+        yield from (
+            (f"{kind}: {name}", printable(str(one[name])[:60]), "") for name in _SAID if one.get(name)
+        )
     if not files.raw or not files.raw.keys() <= fields.keys():
         names = ", ".join(member.name for member in (*files.raw.values(), *files.yml.values()))
         raise InvalidInputError(f"expected raw files with a yml of each, got {names}")
     described = {kind: validated(fields[kind], files.yml[kind].where, Description) for kind in files.raw}
     kind = min(files.raw, key=lambda kind: _ORDER.index(described[kind].kind))
-    rows.append(("sweep is made from", kind, ""))
+    yield "sweep is made from", kind, ""
     said = described[kind]
     file = open_raw(files.raw[kind], said)
     with naming(files.yml[kind].where):
         elements = _elements(said)
         per_line = step_of(elements, "lines (packets of a Doppler mode are no image): rx element")
-    rows.append(("first line at element", f"{elements[0]:g}, taken as the image's left", ""))
+    yield "first line at element", f"{elements[0]:g}, taken as the image's left", ""
 
     rate_hz = settings.sampling_rate_hz or said.rate_hz
     speed_m_s = settings.speed_of_sound_m_s or said.speed_m_s or SPEED_OF_SOUND_M_S
@@ -170,7 +146,7 @@ def _recording(
             f"--bandwidth-hz {band[0]:.4g} {band[1]:.4g}"
         )
     return Recording(
-        files.path,
+        path,
         settings,
         frames,
         values,
@@ -178,11 +154,30 @@ def _recording(
         orientation=None if sensor is None else sensor.orientation,
         # In one spelling, so that curves and calibrations of a probe are found to be of it.
         probe=f"Clarius {_model(probe)}" if _model(probe) in ELEMENT_PITCH_MM else probe,
-        name=files.name or files.path.stem,
+        name=files.name or path.stem,
         asked=dict.fromkeys(("vector_pitch_mm", "column_pitch_mm"), "element_pitch_mm" if probe else "probe"),
         assumptions=() if spreading else ("parallel lines of a linear array",),
         remarks=tuple(remarks),
     )
+
+
+def sensor_of(path: Path) -> SensorSamples:
+    """Read the sensor's samples of a package.
+
+    Raises
+    ------
+    InvalidInputError
+        If the package has no sensor, or its samples make no sense.
+    """
+    if (member := find_files(path).yml.get("imu")) is None:
+        raise InvalidInputError(f"{path}: expected the sensor's samples (_imu.yml), got none")
+    return read_samples(member)
+
+
+def package_files(path: Path) -> Sequence[Path]:
+    """Other files on disk that the sweep's content depends on."""
+    files = find_files(path)
+    return sorted({member.path for member in (*files.raw.values(), *files.yml.values())} - {path})
 
 
 def _elements(said: Description) -> FloatArray:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import warnings
 from bisect import bisect
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,7 +27,7 @@ from speckle3d.io.frames import FileFrames, ReadFrame
 from speckle3d.io.hdf5 import reading
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.readers import Reader
-from speckle3d.io.recordings import Recording, Row, Value, differs
+from speckle3d.io.recordings import Facts, Recording, Row, Value, differs
 
 FORMAT = "DICOM"
 
@@ -103,7 +103,7 @@ class DicomFile:
         return False
 
 
-def open_dicom(path: Path, settings: ImportSettings) -> Recording:
+def open_dicom(path: Path, settings: ImportSettings) -> Facts:
     """Read grey images of eight bits; they stay in the file until they are asked for."""
     pydicom = extra_module("pydicom", "dicom", f"{path}: DICOM")
     with _reading(str(path)), open_regular(path) as stream:
@@ -112,14 +112,8 @@ def open_dicom(path: Path, settings: ImportSettings) -> Recording:
         for _ in header.iterall():  # elements are read from their bytes when first asked for
             pass
     machine = " ".join(str(header[name].value) for name in _MACHINE if name in header)
-    rows: list[Row] = [
-        ("scanner", printable(machine) or "not named", ""),
-        ("transfer syntax", printable(syntax), ""),
-    ]
-    return Recording.of(path, settings, rows, lambda: _recording(path, settings, header, rows))
-
-
-def _recording(path: Path, settings: ImportSettings, header: Any, rows: list[Row]) -> Recording:
+    yield "scanner", printable(machine) or "not named", ""
+    yield "transfer syntax", printable(syntax), ""
     for name, expected in _EXPECTED.items():
         if (got := header.get(name)) not in expected:
             listed = " or ".join(map(str, expected))
@@ -127,10 +121,10 @@ def _recording(path: Path, settings: ImportSettings, header: Any, rows: list[Row
     count = int(_numbers(header, "NumberOfFrames")[0]) if "NumberOfFrames" in header else 1
     if count < 2:
         raise InvalidInputError("NumberOfFrames: expected several frames, got a single image")
-    part, values = _place(header, rows)
+    part, values = yield from _place(header)
     kind, is_lossy = header.PhotometricInterpretation, header.get("LossyImageCompression") == "01"
     if is_lossy:
-        rows.append(("pixels", "packed with loss, which smooths speckle", ""))
+        yield "pixels", "packed with loss, which smooths speckle", ""
     spread = _LOSSY_SPREAD if is_lossy or "YBR" in kind else 0
     source = DicomFile(path, part, kind == "MONOCHROME1", spread)
     first = source.read(0)  # what cannot be decoded at all, and colour, is told at once
@@ -152,11 +146,11 @@ def _reading(where: str) -> Iterator[None]:
         yield
 
 
-def _place(header: Any, rows: list[Row]) -> tuple[tuple[slice, slice], dict[str, Value]]:
+def _place(header: Any) -> Generator[Row, None, tuple[tuple[slice, slice], dict[str, Value]]]:
     """Rows and columns of the image to take, and the size of its pixels; facts tell of it."""
     regions = header.get("SequenceOfUltrasoundRegions") or ()
     if not regions:
-        rows.append(("region read", "the whole image, taken for Cartesian tissue: the file names none", ""))
+        yield "region read", "the whole image, taken for Cartesian tissue: the file names none", ""
         spacing = _numbers(header, "PixelSpacing") if header.get("PixelSpacing") else []
         sizes = zip(("row_spacing_mm", "column_pitch_mm"), spacing, strict=False)
         return (slice(None), slice(None)), {name: Value(mm or None, "PixelSpacing") for name, mm in sizes}
@@ -191,13 +185,13 @@ def _place(header: Any, rows: list[Row]) -> tuple[tuple[slice, slice], dict[str,
     # The first row taken is the region's last where y falls.
     for depth_cm in _along(region, "Y", y_cm, np.array([bottom - top if y_cm < 0 else 0])):
         values["first_sample_depth_mm"] = Value(10.0 * depth_cm, "ReferencePixelY0 and its physical value")
-    rows.append(("region read", words[i], ""))
-    rows += [("region left out", other, "") for k, other in enumerate(words) if k != i]
+    yield "region read", words[i], ""
+    yield from (("region left out", other, "") for k, other in enumerate(words) if k != i)
     if x_step < 0:
-        rows.append(("columns", "run against the file's x (PhysicalDeltaX below 0): left as shown", ""))
+        yield "columns", "run against the file's x (PhysicalDeltaX below 0): left as shown", ""
     depths = slice(top, bottom + 1)
     if y_cm < 0:
-        rows.append(("rows", "turned over: the file's y falls (PhysicalDeltaY below 0)", ""))
+        yield "rows", "turned over: the file's y falls (PhysicalDeltaY below 0)", ""
         depths = slice(bottom, top - 1 if top else None, -1)
     return (depths, slice(left, right + 1)), values
 

@@ -40,7 +40,7 @@ from speckle3d.io.frames import HDF5Slices
 from speckle3d.io.hdf5 import SIGNATURE, find_member, open_hdf5, reading
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.readers import Reader, first_bytes
-from speckle3d.io.recordings import Recording, Row, Value, step_of
+from speckle3d.io.recordings import Facts, Recording, Value, step_of
 
 FORMAT = "MATLAB"
 USER_BLOCK = 512
@@ -62,12 +62,39 @@ def _claims(_: Path, start: bytes) -> bool:
     return start.startswith(b"MATLAB") and (_is_new(start) or start[126:128] in (b"IM", b"MI"))
 
 
-def open_matlab(path: Path, settings: ImportSettings) -> Recording:
+def open_matlab(path: Path, settings: ImportSettings) -> Facts:
     """Read the arrays that a mapping names; without one, list the arrays and what to write."""
     variables: Any = open_hdf5(path) if _is_new(first_bytes(path)) else _loaded(path)
     listed = sorted(_arrays(variables), key=lambda one: -int(np.prod(one[1].shape)))[:_MOST_SHOWN]
-    rows: list[Row] = [(f"array {printable(name)}", _size(node), _kind(node)) for name, node in listed]
-    return Recording.of(path, settings, rows, lambda: _recording(path, variables, settings, rows))
+    shown = [(printable(name), _size(node), _kind(node)) for name, node in listed]
+    yield from ((f"array {name}", size, kind) for name, size, kind in shown)
+    arrays, where = settings.arrays, f"{path}: arrays"
+    if unknown := sorted({*arrays} - {*_ROLES, *_POSITIONS, *ImportSettings.model_fields, "axes"}):
+        raise InvalidInputError(f"{where}: expected {', '.join(sorted(_ROLES))}, axes, got {unknown[0]}")
+    data = next((data for data in _DATA if {*data} == _ROLES & {*arrays}), None)
+    if data is None:
+        held = ", ".join(map(" ".join, shown))
+        raise InvalidInputError(
+            f"{path}: expected to be told which array is what: write rf (or iq, or i and q, or bmode) = "
+            f'"NAME" and axes = "sample, vector, frame" below [arrays] in {path.name}.toml beside it; there '
+            f"are {held or 'none'}"
+        )
+    with naming(where):
+        nodes = [_array(variables, arrays[role]) for role in data]
+        if len({node.shape for node in nodes}) > 1:
+            raise InvalidInputError(f"expected arrays of one size, got {' and '.join(map(_size, nodes))}")
+        if _kind(nodes[0]).startswith("complex") != (data == ("iq",)):
+            raise InvalidInputError(f"{data[0]}: expected complex numbers as iq alone, got {_kind(nodes[0])}")
+        lengths, names = _axes(arrays.get("axes", ""), nodes[0])
+        shape = lengths["frame"], lengths["vector"], lengths["sample"]
+        values, times = _numbers(variables, arrays, shape)
+    frames = _frames(path, nodes, names, shape, data)
+    for role in data:
+        yield "read", f"{role}: {arrays[role]} {_size(nodes[0])}", _kind(nodes[0])
+    yield "axes", arrays["axes"], ""
+    if isinstance(frames, np.ndarray):
+        yield "frames", "held in memory: MATLAB 7.3 files are read one by one", ""
+    return Recording(path, settings, frames, values, time_s=times)
 
 
 def _loaded(path: Path) -> dict[str, Any]:
@@ -171,35 +198,6 @@ class _Greys:
         if not np.isin(frame, np.arange(256)).all():
             raise InvalidInputError("bmode: expected grey levels, whole numbers from 0 to 255, got others")
         return frame.astype(np.uint8)
-
-
-def _recording(path: Path, variables: Any, settings: ImportSettings, rows: list[Row]) -> Recording:
-    arrays, where = settings.arrays, f"{path}: arrays"
-    if unknown := sorted({*arrays} - {*_ROLES, *_POSITIONS, *ImportSettings.model_fields, "axes"}):
-        raise InvalidInputError(f"{where}: expected {', '.join(sorted(_ROLES))}, axes, got {unknown[0]}")
-    data = next((data for data in _DATA if {*data} == _ROLES & {*arrays}), None)
-    if data is None:
-        listed = ", ".join(f"{name.removeprefix('array ')} {size} {kind}" for name, size, kind in rows)
-        raise InvalidInputError(
-            f"{path}: expected to be told which array is what: write rf (or iq, or i and q, or bmode) = "
-            f'"NAME" and axes = "sample, vector, frame" below [arrays] in {path.name}.toml beside it; there '
-            f"are {listed or 'none'}"
-        )
-    with naming(where):
-        nodes = [_array(variables, arrays[role]) for role in data]
-        if len({node.shape for node in nodes}) > 1:
-            raise InvalidInputError(f"expected arrays of one size, got {' and '.join(map(_size, nodes))}")
-        if _kind(nodes[0]).startswith("complex") != (data == ("iq",)):
-            raise InvalidInputError(f"{data[0]}: expected complex numbers as iq alone, got {_kind(nodes[0])}")
-        lengths, names = _axes(arrays.get("axes", ""), nodes[0])
-        shape = lengths["frame"], lengths["vector"], lengths["sample"]
-        values, times = _numbers(variables, arrays, shape)
-    frames = _frames(path, nodes, names, shape, data)
-    rows += [("read", f"{role}: {arrays[role]} {_size(nodes[0])}", _kind(nodes[0])) for role in data]
-    rows.append(("axes", arrays["axes"], ""))
-    if isinstance(frames, np.ndarray):
-        rows.append(("frames", "held in memory: MATLAB 7.3 files are read one by one", ""))
-    return Recording(path, settings, frames, values, time_s=times)
 
 
 def _axes(text: str, node: Any) -> tuple[dict[str, int], list[str]]:

@@ -46,7 +46,7 @@ from speckle3d.io.hdf5 import (
 )
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.readers import Reader
-from speckle3d.io.recordings import Recording, Row, Value, grid_values, rate_by_spacing
+from speckle3d.io.recordings import Facts, Recording, Value, grid_values, rate_by_spacing
 
 FORMAT = "USTB .uff"
 
@@ -59,12 +59,10 @@ def is_uff(file: h5py.File) -> bool:
     return not file_format(file) and any(kind.startswith("uff.") for kind in _objects(file).values())
 
 
-def open_uff(path: Path, settings: ImportSettings) -> Recording:
+def open_uff(path: Path, settings: ImportSettings) -> Facts:
     """Read beamformed RF or I/Q on a linear or a sector scan; real data of one sign become grey levels."""
     with open_hdf5(path) as file:
-        objects = _objects(file)
-        rows: list[Row] = [("object", f"{name}: {kind}", "") for name, kind in objects.items()]
-        return Recording.of(path, settings, rows, lambda: _recording(path, settings, file, objects, rows))
+        return (yield from _recording(path, settings, file))
 
 
 def _objects(file: h5py.File) -> dict[str, str]:
@@ -74,10 +72,9 @@ def _objects(file: h5py.File) -> dict[str, str]:
     return {name: kind for name, kind in kinds.items() if kind}
 
 
-def _recording(
-    path: Path, settings: ImportSettings, file: h5py.File, objects: dict[str, str], rows: list[Row]
-) -> Recording:
-    asked = settings.arrays.get("data")
+def _recording(path: Path, settings: ImportSettings, file: h5py.File) -> Facts:
+    asked, objects = settings.arrays.get("data"), _objects(file)
+    yield from (("object", f"{name}: {kind}", "") for name, kind in objects.items())
     names = [one for one, kind in objects.items() if kind == _BEAMFORMED and asked in (None, one)]
     if len(names) != 1:
         got = ", ".join(names or objects.values()) or "none"
@@ -92,7 +89,7 @@ def _recording(
     parts = (f"{data}/real", f"{data}/imag") if is_complex else (data,)
     axis, count = _frame_axis(require_dataset(file, parts[0]), lines * samples)
     if (video := single(group, "frame_rate")) is not None:
-        rows.append(("frame rate of videos made of it, not used", f"{video:g}", "frames/s"))
+        yield "frame rate of videos made of it, not used", f"{video:g}", "frames/s"
     modulation_hz = single(group, "modulation_frequency") or 0.0
     modulation = Value(modulation_hz, f"in {name}/modulation_frequency")
     values["demodulation_frequency_hz"] = modulation
@@ -111,7 +108,7 @@ def _recording(
     elif count and not is_complex and (kind := _kind_of(frames)) != "RF":
         is_db = kind == "decibels"
         frames, values["dynamic_range_db"] = grey_frames(source, shape, is_db, settings.dynamic_range_db)
-        rows.append(("data", f"of one sign: {kind}, made grey levels here", ""))
+        yield "data", f"of one sign: {kind}, made grey levels here", ""
     return Recording(path, settings, frames, values)
 
 

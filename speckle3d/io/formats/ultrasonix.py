@@ -23,7 +23,7 @@ from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.io.frames import FileFrames, ReadFrame
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.readers import Reader, first_bytes
-from speckle3d.io.recordings import Recording, Row, Value
+from speckle3d.io.recordings import Facts, Recording, Value
 
 FORMAT = "Ultrasonix"
 
@@ -71,42 +71,36 @@ def _claims(path: Path, start: bytes) -> bool:
     return kind.bit_count() == 1 and (is_whole or path.suffix.lower() in _SUFFIXES)
 
 
-def open_ultrasonix(path: Path, settings: ImportSettings) -> Recording:
+def open_ultrasonix(path: Path, settings: ImportSettings) -> Facts:
     """Read RF or B-mode of a linear probe.
 
     The header has no line pitch and no band; of B-mode no pixel size and no dynamic range.
     """
     header, size = _header(first_bytes(path)), path.stat().st_size
     name, bits = _READ.get(int(header["kind"]), (f"type {header['kind']}", 0))
-    rows: list[Row] = [
-        ("recorded", name, ""),
-        ("probe's number", str(header["probe"]), ""),
-        ("line density", str(header["lines"]), "lines"),
-    ]
+    yield "recorded", name, ""
+    yield "probe's number", str(header["probe"]), ""
+    yield "line density", str(header["lines"]), "lines"
     values = {
         "sampling_rate_hz": Value(float(header["sampling_hz"]) or None, "in the header"),
         "centre_frequency_hz": Value(float(header["transmit_hz"]) or None, "in the header: transmitted"),
         "frame_rate_hz": Value(max(int(header["rate_hz"]), 0) or None, "in the header"),
     }
-
-    def recording() -> Recording:
-        count, width, height = (int(header[name]) for name in ("frames", "width", "height"))
-        if header["bits"] != bits or not count:
-            raise InvalidInputError(
-                f"expected frames of RF, of 16 bits, or B-mode, of 8, got {count} of {name}, of "
-                f"{header['bits']} bits"
-            )
-        if (is_tagged := _is_tagged(header, size)) is None:
-            whole = 8 * (size - _HEADER.itemsize) // (width * height * bits)
-            raise FileError(f"{path}: ends early, or is longer than its frames: {whole} of {count} frames")
-        is_image, dtype = header["kind"] == _BMODE, np.dtype("<i2" if bits == 16 else "u1")
-        shape = (height, width) if is_image else (width, height)
-        tag = [("tag", "<i4")] if is_tagged else []
-        source = _File(path, np.dtype([*tag, ("pixels", dtype, shape)]), count, is_image)
-        frames = FileFrames(path, source, (count, width, height), dtype.newbyteorder("="))
-        return Recording(path, settings, frames, values, assumptions=() if is_image else ("parallel lines",))
-
-    return Recording.of(path, settings, rows, recording)
+    count, width, height = (int(header[name]) for name in ("frames", "width", "height"))
+    if header["bits"] != bits or not count:
+        raise InvalidInputError(
+            f"expected frames of RF, of 16 bits, or B-mode, of 8, got {count} of {name}, of "
+            f"{header['bits']} bits"
+        )
+    if (is_tagged := _is_tagged(header, size)) is None:
+        whole = 8 * (size - _HEADER.itemsize) // (width * height * bits)
+        raise FileError(f"{path}: ends early, or is longer than its frames: {whole} of {count} frames")
+    is_image, dtype = header["kind"] == _BMODE, np.dtype("<i2" if bits == 16 else "u1")
+    shape = (height, width) if is_image else (width, height)
+    tag = [("tag", "<i4")] if is_tagged else []
+    source = _File(path, np.dtype([*tag, ("pixels", dtype, shape)]), count, is_image)
+    frames = FileFrames(path, source, (count, width, height), dtype.newbyteorder("="))
+    return Recording(path, settings, frames, values, assumptions=() if is_image else ("parallel lines",))
 
 
 READER = Reader(FORMAT, _claims, open_ultrasonix)

@@ -52,7 +52,7 @@ from speckle3d.io.hdf5 import (
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.pose_paths import timed_poses
 from speckle3d.io.readers import Reader
-from speckle3d.io.recordings import Recording, Row, Value, grid_values, rate_by_spacing
+from speckle3d.io.recordings import Facts, Recording, Value, grid_values, rate_by_spacing
 
 FORMAT = "zea"
 
@@ -71,14 +71,10 @@ def is_zea(file: h5py.File) -> bool:
     return not file_format(file) and bool(_arrays(file, (*_READ, *_NOT_BEAMFORMED)))
 
 
-def open_zea(path: Path, settings: ImportSettings) -> Recording:
+def open_zea(path: Path, settings: ImportSettings) -> Facts:
     """Read beamformed RF or I/Q, else an envelope, else images; with the probe's poses."""
     with open_hdf5(path) as file:
-        names = [f"{home}data/{printable(name)}" for home in _homes(file) for name in file[f"{home}data"]]
-        advice = ": channel data need beamforming, by zea's Pipeline, and its result written"
-        is_raw = any(name.endswith(_NOT_BEAMFORMED) for name in names)
-        rows: list[Row] = [("holds", ", ".join(names) + advice * is_raw, "")]
-        return Recording.of(path, settings, rows, lambda: _recording(path, settings, file, rows))
+        return (yield from _recording(path, settings, file))
 
 
 def _homes(file: h5py.File) -> list[str]:
@@ -95,18 +91,23 @@ def _arrays(file: h5py.File, kinds: Sequence[str]) -> list[tuple[str, str, str]]
     return [one for one in names if has_member(file, one[0])]
 
 
-def _recording(path: Path, settings: ImportSettings, file: h5py.File, rows: list[Row]) -> Recording:
+def _recording(path: Path, settings: ImportSettings, file: h5py.File) -> Facts:
+    held = [f"{home}data/{printable(name)}" for home in _homes(file) for name in file[f"{home}data"]]
+    contents = ", ".join(held)
+    if any(name.endswith(_NOT_BEAMFORMED) for name in held):
+        contents += ": channel data need beamforming, by zea's Pipeline, and its result written"
+    yield "holds", contents, ""
     asked = settings.arrays.get("data", "").strip("/").removesuffix("/values")
     arrays = [one for one in _arrays(file, _READ) if asked in ("", one[0])]
     if not arrays:
-        raise InvalidInputError(f"expected {' or '.join(_READ)}, got {rows[0][1]}")
+        raise InvalidInputError(f"expected {' or '.join(_READ)}, got {contents}")
     name, kind, home = arrays[0]
     if any(same == kind for _, same, _ in arrays[1:]):
         raise InvalidInputError(
-            f"expected one track, got {rows[0][1]}: say which by arrays = {{ data = NAME }} in "
+            f"expected one track, got {contents}: say which by arrays = {{ data = NAME }} in "
             f"{path.name}.toml beside it"
         )
-    rows.append(("read", name, ""))
+    yield "read", name, ""
     group, scan = find_member(file, name), f"{home}scan"
     node = group if isinstance(group, h5py.Dataset) else require_dataset(group, "values")
     places = {"speed_of_sound_m_s": f"{scan}/sound_speed", "centre_frequency_hz": f"{scan}/center_frequency"}
