@@ -102,7 +102,8 @@ def _read(reader: Reader, path: Path, settings: ImportSettings) -> Sweep | Recor
         while True:
             rows.append(next(made))
     except StopIteration as end:
-        return replace(end.value, rows=tuple(rows))
+        recording: Recording = end.value
+        return replace(recording, rows=tuple(rows))
     except (InvalidInputError, FileError) as error:
         if not rows:
             raise
