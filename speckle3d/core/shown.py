@@ -34,7 +34,9 @@ def brief(value: Any) -> str:
     elif isinstance(value, dict | tuple):
         text = ", ".join(map(brief, value)) if len(value) <= 4 else f"{len(value)}"
     else:
-        text = f"{value:.4g}" if isinstance(value, float) else str("none" if value is None else value) or "none"
+        text = (
+            f"{value:.4g}" if isinstance(value, float) else "none" if value is None else str(value) or "none"
+        )
     return textwrap.shorten(text, _MOST_LETTERS, placeholder="…")
 
 
