@@ -160,19 +160,3 @@ def coherence(ramp_rad):
         return np.abs(np.vdot(a, turned)) ** 2 / energy if energy > 0 else np.nan
 
     return alike
-
-
-def consistent_patches(distance_mm, sigma_mm, at_mm, slopes, support_sigma):
-    """Twin of `speckle3d.motion.subset.consistent_subset`: every patch against every plane through another.
-
-    Returns all best subsets: placements may tie but for rounding.
-    """
-    raised, known = at_mm @ slopes, np.isfinite(distance_mm)
-    if not known.any():
-        return [known]
-    offset = np.concatenate([distance_mm - raised, -distance_mm - raised])[np.tile(known, 2)]
-    error = np.abs(np.abs(offset[:, None] + raised) - distance_mm) / sigma_mm
-    support = error <= support_sigma
-    misfit, count = np.where(support, error, 0.0).sum(axis=1), support.sum(axis=1)
-    most = count == count.max()
-    return list(support[most & (misfit <= misfit[most].min() + 1e-9)])

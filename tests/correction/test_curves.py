@@ -49,12 +49,3 @@ def test_twists_are_the_derivative_of_every_frame(seed, curves):
         slope = (moved[:, :3, :3] @ point + moved[:, :3, 3]) / (2 * h)
         # Central differences: h^2 times third derivatives, and rounding 1e-14 / h; 60 mm lever.
         np.testing.assert_allclose(found[:, :, k], slope, atol=2e-6)
-
-
-def test_the_same_curves_as_the_published_powers_of_t():
-    basis = curve_basis(AXES, np.ones(99), "time")
-    t = np.arange(1, 100) / 99
-    powers = np.stack([np.ones(99), t, t**2, t**3], axis=1)
-    for a in range(6):
-        left = powers - basis[1:, a, 1:] @ np.linalg.lstsq(basis[1:, a, 1:], powers)[0]
-        assert np.abs(left).max() < 1e-12

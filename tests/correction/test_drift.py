@@ -1,11 +1,9 @@
 import numpy as np
 import pytest
 from drifting import CENTRE_MM, CORNERS_MM, drifted, hand_sweep, tracked
-from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.geometry import elevational_steps, relative_poses, roll_yaw_tilt
-from speckle3d.correction.curves import CorrectedChain, curve_basis
 from speckle3d.correction.drift import DriftSettings, correct_orientation, correct_pose
 
 TIME, DISTANCE = DriftSettings(), DriftSettings(curves="distance")
@@ -58,16 +56,6 @@ def test_at_a_reversal_distance_curves_follow_where_time_curves_cannot():
     assert 1.5 < as_published < 6.0
 
 
-def test_exact_curves_are_recovered_exactly():
-    truth, *_ = sweep(20)
-    chain = CorrectedChain.of(truth, ("z", "tilt"), curve_basis(("z", "tilt"), np.ones(159), "time"))
-    bent = RigidTransform.from_matrix(chain.poses(np.array([0, 2.0, 0.5, 0, 0, 0, 0.05, 0, 0.01, 0])))
-    found = correct_pose(truth, bent, everywhere(truth), CORNERS_MM)
-    # The loss is rounded below 10 um; within it the optimum is still exact.
-    np.testing.assert_allclose(found.poses.as_matrix(), bent.as_matrix(), atol=1e-4)
-    assert found.fit.success
-
-
 @pytest.mark.parametrize("settings", [TIME, DISTANCE], ids=["time", "distance"])
 def test_orientation_correction_removes_tilt_and_keeps_every_step_of_the_centre(settings):
     truth, estimate, reference = sweep(40, turns=1)
@@ -80,37 +68,6 @@ def test_orientation_correction_removes_tilt_and_keeps_every_step_of_the_centre(
     assert np.abs(found.curves[:, :3]).max() == 0.0
 
 
-def test_neither_the_sensors_world_nor_the_images_matters():
-    truth, estimate, reference = sweep(42)
-    # At the singularity of the angles.
-    world = RigidTransform.from_rotation(Rotation.from_euler("y", 90.0, degrees=True))
-    moved = world * reference[0].inv() * reference
-    elsewhere = RigidTransform.from_components([500.0, -200.0, 90.0], Rotation.from_rotvec([1.0, 2.0, -1.0]))
-    for correct, measured, points in (
-        (correct_pose, (reference, moved), CORNERS_MM),
-        (correct_orientation, (reference.rotation, moved.rotation), CENTRE_MM),
-    ):
-        usual = relative_poses(correct(estimate, measured[0], everywhere(truth), points).poses)
-        for images, sensed, close in (
-            (estimate, measured[1], 1e-6),
-            (elsewhere * estimate, measured[0], 1e-4),
-        ):
-            poses = correct(images, sensed, everywhere(truth), points).poses
-            np.testing.assert_allclose(relative_poses(poses).as_matrix(), usual.as_matrix(), atol=close)
-
-
-def test_frames_without_a_reading_are_corrected_by_the_same_curves_at_no_cost():
-    truth, estimate, reference = sweep(44)
-    covered = everywhere(truth)
-    covered[[0, 1, 2]], covered[70:90], covered[-5:] = False, False, False
-    full = correct_pose(estimate, reference[covered], covered, CORNERS_MM)
-    assert full.coverage == pytest.approx(132 / 160)
-    assert full.fit.fun.size == 132 * 12
-    assert abs(travel(full.poses) / travel(truth) - 1) < 0.03
-    assert full.curves.shape == (160, 6)
-    assert not np.isclose(full.curves[80, 2], 0.0, atol=1e-4)
-
-
 def test_thin_coverage_is_refused():
     _, estimate, reference = sweep(45, frames=100)
     for missing in (slice(30, 70), slice(0, 11), slice(85, 100), slice(0, 100)):
@@ -120,16 +77,6 @@ def test_thin_coverage_is_refused():
             correct_orientation(estimate, reference.rotation, covered, CENTRE_MM)
     with pytest.raises(InsufficientDataError):
         correct_pose(estimate[:9], reference[:9], everywhere(estimate[:9]), CORNERS_MM)
-
-
-def test_a_probe_at_rest_has_no_distance_curves_but_time_curves_work():
-    rest = RigidTransform.identity(50)
-    jitter = tracked(rest, np.random.default_rng(47))
-    with pytest.raises(InsufficientDataError):
-        correct_pose(rest, jitter, everywhere(rest), CORNERS_MM, DISTANCE)
-    found = correct_pose(rest, jitter, everywhere(rest), CORNERS_MM)
-    # Four cubic coefficients of 50 readings with 0.15 mm: 0.15 * 4 / sqrt(50) at the ends.
-    assert abs(travel(found.poses)) < 0.3
 
 
 def test_the_claims_of_pose_hold():

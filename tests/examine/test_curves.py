@@ -7,10 +7,8 @@ import pytest
 import speckle
 
 from speckle3d.core.curves import SpeckleSize, TiltResponse
-from speckle3d.core.doubts import Doubt
-from speckle3d.core.errors import MismatchError
 from speckle3d.core.grid import ImageGrid
-from speckle3d.examine.curves import doubt_bend, doubt_depths, doubt_size, doubt_widths, unrefuted
+from speckle3d.examine.curves import doubt_bend, doubt_size, doubt_widths
 from speckle3d.matching.intensity import two_way_wavenumber
 from speckle3d.matching.patches import lay_patches
 from speckle3d.motion.coherence import RowScales
@@ -20,22 +18,6 @@ ROWS = PATCHES.row_depth_mm
 SIZE = SpeckleSize(np.linspace(0.3, 0.4, ROWS.size), np.linspace(0.07, 0.08, ROWS.size))
 CURVES = replace(speckle.curves(depth_mm=tuple(ROWS)), speckle=SIZE)
 CLEAR = np.ones(ROWS.size)
-
-
-def test_the_first_refuted_doubt_is_raised_and_the_others_are_returned():
-    fair, bad = Doubt("curves", "units", "seen", False), Doubt("curves", "clock", "never", True)
-    assert unrefuted([fair], MismatchError) == (fair,)
-    with pytest.raises(MismatchError, match="suspect: clock"):
-        unrefuted([fair, bad], MismatchError)
-
-
-def test_rows_left_out_are_told_with_the_depths_expected_and_got():
-    used = PATCHES.between(ROWS[:-2])
-    doubt = doubt_depths(replace(CURVES, depth_mm=ROWS), PATCHES, used)
-    assert not doubt.refuted
-    assert f"{ROWS[0]:.1f} to {ROWS[-1]:.1f} mm" in doubt.evidence
-    assert f"2 of {ROWS.size} rows" in doubt.evidence
-    assert doubt_depths(CURVES, PATCHES, PATCHES) is None
 
 
 @pytest.mark.parametrize(("factor", "refuted"), [(1.0, False), (5.0, False), (1000.0, True)])

@@ -128,12 +128,6 @@ def test_echoes_that_stand_still_are_doubted(share, refuted):
     assert doubt.refuted == refuted
 
 
-def test_without_phase_layers_along_the_sweep_are_not_clutter():
-    layers = np.r_[np.full(10, 0.5), np.full(40, 0.04)]
-    assert standing(layers, PAIRS, CELLS, of_echo=False) is None
-    assert standing(np.full(50, 0.3), PAIRS, CELLS, of_echo=False).refuted
-
-
 def test_a_sweep_in_pieces_is_flagged_at_each_cut():
     usable = np.ones(30, dtype=bool)
     usable[[10, 20]] = False
@@ -142,10 +136,3 @@ def test_a_sweep_in_pieces_is_flagged_at_each_cut():
     assert doubt is not None
     assert not doubt.refuted
     assert doubt.frames == ((10, 10), (20, 20))
-
-
-def test_a_lost_frame_that_others_bridge_is_no_cut():
-    usable = np.ones(30, dtype=bool)
-    usable[10] = False
-    chain = [(k, k + 1) for k in range(29) if k + 1 != 10 and k != 10] + [(9, 11)]
-    assert severed(np.array([a for a, _ in chain]), np.array([b for _, b in chain]), usable) is None

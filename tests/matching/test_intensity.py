@@ -8,7 +8,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import fft
 
-from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.grid import ImageGrid
 from speckle3d.core.sweep import BModeSettings, RFSettings
 from speckle3d.matching.intensity import IntensityExtractor, IntensitySettings
@@ -94,14 +93,6 @@ def test_i_and_q_give_what_their_rf_gives(middle_hz, every):
     assert abs(of_iq.grid.sample_spacing_mm / of_rf.grid.sample_spacing_mm - 1) < 1e-4
     shared = min(expected.shape[1], got.shape[1])
     np.testing.assert_allclose(got[:, :shared], expected[:, :shared], atol=3e-3 * expected.max())
-
-
-def test_frames_of_another_shape_and_phase_of_grey_levels_are_refused():
-    bmode = IntensityExtractor(BModeSettings(60.0), ImageGrid(6, 18, 0.1, 0.1))
-    with pytest.raises(InvalidInputError):
-        extractor().intensity(np.zeros((6, 1799), np.float32))
-    with pytest.raises(InvalidInputError):
-        bmode.analytic(np.zeros((6, 18), np.uint8))
 
 
 @settings(deadline=None, max_examples=50)

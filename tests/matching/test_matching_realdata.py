@@ -45,24 +45,6 @@ def match(matcher, fixed, moving, start=None):
     return table.inplane[0], table.correlation[0]
 
 
-@pytest.mark.parametrize(("vectors", "steps"), [(-3, -16), (5, 32)])
-def test_a_frame_and_its_shifted_copy_are_the_same_speckle(recording, vectors, steps):
-    sweep, matcher = recording
-    step = matcher.grid.sample_spacing_mm / sweep.grid.sample_spacing_mm
-    # Four samples of intensity are nine of the ultrasonix's echoes.
-    shift = (vectors, round(steps * step))
-    frame = sweep.frames[0]
-    motion, correlation = match(
-        matcher, ready(matcher, frame), ready(matcher, np.roll(frame, shift, axis=(0, 1)))
-    )
-    expected = -np.array(shift) * [sweep.grid.vector_pitch_mm, sweep.grid.sample_spacing_mm]
-    # By whole samples of intensity there is nothing to interpolate: what is left is the ends of vectors.
-    np.testing.assert_allclose(motion[:2], expected, atol=0.003)
-    assert abs(np.rad2deg(motion[2])) < 0.02
-    assert np.nanmedian(correlation) > 0.999
-    assert np.isfinite(correlation).mean() > 0.7
-
-
 def test_neighbouring_frames_are_matched(recording):
     sweep, matcher = recording
     frames = [ready(matcher, sweep.frames[i]) for i in range(len(sweep))]

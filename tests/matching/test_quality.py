@@ -16,7 +16,6 @@ from speckle3d.matching.quality import (
     DrawnOver,
     FrameFlag,
     QualitySettings,
-    describe,
     flag_frames,
     inspect_frame,
 )
@@ -128,12 +127,6 @@ def test_a_bad_frame_among_good_ones_is_flagged_and_no_other(good, name):
     assert flags_of(mixed, signal, grid) == expected
 
 
-def test_a_turned_down_gain_is_not_a_lifted_probe(good):
-    frames, signal, grid = good
-    mixed = [counts(0.1 * frame) if i in (2, 3) else frame for i, frame in enumerate(frames)]
-    assert not any(flags_of(mixed, signal, grid))
-
-
 def test_only_the_repeat_of_the_frame_before_is_frozen(phantom):
     frames, signal, grid = phantom
     a, b = frames[:2]
@@ -169,56 +162,6 @@ def test_bmode_of_good_frames_is_not_flagged(good):
     found = inspected(wide, BMODE, replace(coarse[0], vectors=wide[0].shape[0]))
     assert not flag_frames(found).any()
     assert min(f.speckle_share for f in found) > 0.4
-
-
-def test_bmode_of_bad_frames_is_flagged(good):
-    frames, signal, grid = good
-    images = [grey(f, signal, grid)[0] for f in frames]
-    _, coarse = grey(frames[0], signal, grid)
-    depth = np.linspace(0, 255, coarse.samples)
-    images[0] = np.full_like(images[0], 90)
-    images[1] = np.broadcast_to(depth, images[1].shape).astype(np.uint8)
-    images[2] = grey(lifted(frames[2], grid), signal, grid)[0]
-    images[3] = images[4].copy()
-    expected = [NO_SPECKLE, NO_SPECKLE, NO_SPECKLE, 0, FROZEN] + [0] * (len(frames) - 5)
-    assert flags_of(images, BMODE, coarse) == expected
-
-
-@pytest.mark.parametrize(("brighter_db", "saturated"), [(16, False), (19, True)])
-def test_some_white_is_no_saturation_of_bmode(phantom, brighter_db, saturated):
-    # Intensity of speckle is exponential: 2 and 14 % of pixels are white, and the median patch's distance was
-    # measured 1 and 9 % too long.
-    frames, signal, grid = phantom
-    images, coarse = zip(*(grey(f, signal, grid) for f in frames), strict=True)
-    step = 255 * brighter_db / 60
-    brighter = [np.clip(image + step, 0, 255).astype(np.uint8) for image in images]
-    assert flags_of(brighter, BMODE, coarse[0]) == [SATURATED if saturated else 0] * len(frames)
-
-
-def speckle_and_noise(image, grid=GRID):
-    """Shares of patches with speckle and with noise alone in an image of intensity."""
-    features = inspect_frame(image, image.astype(np.float32), lay_patches(grid), False)
-    return features.speckle_share, features.noise_share
-
-
-def test_vectors_that_agree_nowhere_are_noise_unless_they_are_far_apart():
-    image = np.random.default_rng(3).exponential(size=(GRID.vectors, GRID.samples)).astype(np.float32)
-    assert speckle_and_noise(image) == (0.0, 1.0)
-    # Beams 0.9 mm apart share nothing of real speckle either.
-    assert speckle_and_noise(image, replace(GRID, vector_pitch_mm=0.9)) == (1.0, 0.0)
-
-
-def test_flags_are_told_a_line_each():
-    flags = np.zeros(60, dtype=int)
-    flags[[12, 13, 40]] |= FROZEN
-    flags[13] |= SATURATED
-    flags[20:40] |= LIFTED
-    flags[59] |= FrameFlag.UNMATCHED
-    frozen, saturated, lifted, _ = describe(flags)
-    assert "12, 13, 40" in frozen
-    assert saturated.endswith(": 13")
-    assert "27 and 12 more" in lifted
-    assert flag_frames([]).shape == (0,)
 
 
 MOUSE = ImportSettings(centre_frequency_hz=20e6, bandwidth_hz=(12e6, 28e6), frame_rate_hz=10.0)

@@ -46,18 +46,6 @@ def test_speckle_has_the_size_it_was_made_with(seen):
     np.testing.assert_allclose(size.axial_mm, speckle.AXIAL_MM, rtol=0.13)
 
 
-def test_rows_without_speckle_have_no_size(seen):
-    frames = seen.copy()
-    frames[:, :, :100] = 1.0 + 0.01 * frames[:, :, :100]
-    frames[:, 5::12, 250:] *= 100.0
-    sweep = grey_sweep(frames)
-    matcher = matcher_of(sweep)
-    size, depth = measured_texture(sweep, matcher).speckle_size(), matcher.patches.row_depth_mm
-    assert np.isnan(size.lateral_mm[depth < 5.0]).all()
-    assert np.isnan(size.axial_mm[depth > 18.0]).all()
-    assert np.isfinite(size.lateral_mm[(depth > 8.0) & (depth < 14.0)]).all()
-
-
 RATE, SAMPLES = 40e6, 2048
 
 
@@ -117,11 +105,6 @@ def test_the_other_sign_of_q_is_doubted(middle_hz):
     assert sign_of(attenuated(1, middle_hz)) is None
     doubt = sign_of(attenuated(-1, middle_hz))
     assert (doubt.suspect, doubt.refuted) == ("sign of Q", False)
-
-
-@pytest.mark.parametrize("sign", [1, -1])
-def test_noise_tells_nothing_of_the_sign(sign):
-    assert sign_of(attenuated(sign, noise=30.0)) is None
 
 
 @pytest.mark.parametrize(("gain_db", "doubted"), [(-30.0, False), (-12.0, False), (0.0, True)])

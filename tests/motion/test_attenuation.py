@@ -1,6 +1,5 @@
 """Attenuation by the echo's spectrum, with structure and noise in it, and the curves stretched for it."""
 
-from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -81,10 +80,3 @@ def test_another_transmit_band_is_told_and_not_taken_for_attenuation(shift_hz):
     assert found.difference_db_cm_mhz == 0.0
     assert found.sigma_db_cm_mhz == UNKNOWN_SIGMA
     assert [each.suspect for each in found.doubts] == ["another transmit band or filter than the phantom's"]
-
-
-def test_without_a_spectrum_the_claim_covers_soft_tissue():
-    given = replace(_curves(), spectrum=None)
-    found = _found(given, _power(0.8))
-    assert found.applied(given) is given
-    assert 0.025 < found.log_length_sigma < 0.035

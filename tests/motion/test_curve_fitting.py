@@ -60,18 +60,6 @@ def test_exact_samples_of_any_curve_give_its_distances_back(law, distances):
         assert np.abs(found / d[useful] - 1).max() < 0.02
 
 
-def test_what_noise_costs_is_no_distance():
-    """Electronic noise at 14 dB takes 4 % of every coefficient; the curve begins there."""
-    curves = fit_curves(speckle.KEY, [samples(speckle.gaussian_correlation, STEPPED, noise_floor=0.96)])
-    np.testing.assert_allclose(curves.correlation[:, 0], 0.96, atol=0.003)
-    asked = np.broadcast_to([0.99, 0.9605], (len(DEPTHS_MM), 2))
-    assert read_distance(curves, asked).max() < 0.03
-    d = np.array([0.2, 0.4, 0.6])
-    for depth, width in enumerate(WIDTHS_MM):
-        asked = np.broadcast_to(0.96 * speckle.gaussian_correlation(d, width), (len(DEPTHS_MM), d.size))
-        np.testing.assert_allclose(read_distance(curves, asked)[depth], d, rtol=0.02)
-
-
 @pytest.mark.parametrize("cells", [25, 100])
 def test_cells_are_those_that_explain_the_scatter(cells):
     curves = fit_curves(

@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from speckle3d.core.curves import NominalProbe, curve_widths
+from speckle3d.core.curves import curve_widths
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.motion.diffraction import speckle_correlation
 from speckle3d.sheet_curves import ProbeSheet, data_sheet_curves
 
 SHEET = ProbeSheet(elevation_aperture_mm=5.0, elevation_focus_mm=20.0, band_mhz=(5.0, 10.0))
@@ -13,23 +12,6 @@ SHEET = ProbeSheet(elevation_aperture_mm=5.0, elevation_focus_mm=20.0, band_mhz=
 
 def widths(curves, depth_mm):
     return curve_widths(curves.distance_mm, curves.at(depth_mm).correlation)
-
-
-def test_in_the_focus_the_field_is_the_apertures_transform_on_a_curved_wavefront():
-    frequency, wavelength, height, focus = np.array([7.0e6, 7.5e6]), 1540e3 / 7.5e6, 4.0, 40.0
-    distance = np.linspace(0.0, 1.0, 21)
-    only, probe = np.array([[[0.0, 1.0]]]), NominalProbe(height, focus, 0.0, 7e6, 8e6, 0.5)
-    found = speckle_correlation(probe, np.array([[focus]]), frequency, only, distance)[0]
-    z = np.linspace(-20.0, 20.0, 40001)
-
-    def field(at):
-        return np.sinc(height * at / (wavelength * focus)) ** 2 * np.exp(
-            2j * np.pi * at**2 / wavelength / focus
-        )
-
-    overlap = np.array([abs(np.vdot(field(z - d), field(z))) for d in distance])
-    # Straight paths against Fresnel's parabolas, at f/10.
-    np.testing.assert_allclose(found, (overlap / overlap[0]) ** 2, atol=0.005)
 
 
 def test_calculated_curves_are_those_measured_on_a_phantom(sweep, curves):

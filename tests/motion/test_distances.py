@@ -35,13 +35,6 @@ def test_distance_is_the_inverse_of_the_echo_model(share, gain):
         assert (sigma > 0).all()
 
 
-def test_each_patch_is_read_on_the_curve_of_its_own_depth():
-    distance, _ = read(problem(sigma_mm=(0.3, 0.6), depth_mm=(5.0, 25.0)), 0.5)
-    # 1 / sigma is linear in depth where sqrt(-ln rho) is.
-    width = 1 / np.interp(PATCHES.centre_mm[:, 1], (5.0, 25.0), (1 / 0.3, 1 / 0.6))
-    np.testing.assert_allclose(distance[0], width * np.sqrt(2 * np.log(2)), atol=2e-3)
-
-
 def test_without_correlation_below_what_stays_or_beyond_the_curves_there_is_no_distance():
     for given, rho, share in ((problem(), np.nan, 0.0), (problem(), 0.01, 0.0), (problem(), 0.24, 0.5)):
         assert np.isnan(read(given, rho, share)).all()

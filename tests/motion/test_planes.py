@@ -173,15 +173,6 @@ def test_known_slopes_are_kept_and_tell_the_side(plane):
     assert np.abs(planes.coefficients[:, 1:] - plane[1:]).max() < 1.5e-3
 
 
-def test_a_side_is_held_where_it_is_settled_and_looked_for_where_it_is_not():
-    plane = np.array([0.3, 0.006, 0.0])
-    free, held = (
-        fit(problem(), correlations(plane), slopes=-plane[1:], either_side=side) for side in (True, False)
-    )
-    np.testing.assert_allclose(free.coefficients, -plane, atol=1e-3)
-    assert held.offset_mm > 0.25
-
-
 @pytest.mark.parametrize("start_mm", [0.0, 0.1, 0.6])
 def test_a_wrong_guess_of_the_distance_does_no_harm(start_mm):
     """A path may have frames together that are apart: from nothing, a tilt would explain it, too."""

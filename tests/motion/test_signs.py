@@ -147,16 +147,6 @@ def test_signs_hold_where_a_tenth_of_the_pairs_is_wrong(sweep):
     assert failures(sweep, wrong=0.1) == []
 
 
-def test_a_pair_has_the_sign_with_which_offset_and_slope_together_agree():
-    """The offset is within its error of none; the slope tells."""
-    path = np.array([[0.0, 0.0], [0.01, -0.02], [0.3, 0.0]])
-    cross, ahead = ([0.01, 0.02], [4e-4, 4e-8]), ([0.31, -0.001], [4e-4, 4e-6])
-    moved, variance = zip(cross, ahead, ahead, strict=True)
-    covariance = np.array([np.diag(v) for v in variance])
-    planes = planes_of(np.array([0, 0, 2]), np.array([1, 2, 0]), np.array(moved), covariance)
-    assert (on_path(planes, path).offset_mm / planes.offset_mm).tolist() == [-1.0, 1.0, -1.0]
-
-
 def wobbled(seed, told):
     """Clear steps of a wobble, which are as long as speckle lasts, that get the wrong sign."""
     rng = np.random.default_rng(seed)

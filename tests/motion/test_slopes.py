@@ -12,7 +12,7 @@ from speckle3d.core.grid import ImageGrid
 from speckle3d.kernels.statistics import correlation_variance
 from speckle3d.matching.patches import lay_patches
 from speckle3d.motion.planes import PlaneSettings
-from speckle3d.motion.uncertainty import UNEVENNESS, SlopeWeights, weigh_slopes
+from speckle3d.motion.uncertainty import UNEVENNESS, weigh_slopes
 
 GRID = ImageGrid(vectors=127, samples=640, vector_pitch_mm=0.3, sample_spacing_mm=0.06)
 PATCHES = lay_patches(GRID)
@@ -71,14 +71,6 @@ def test_a_turn_of_five_degrees_over_twenty_millimetres_is_believed():
     assert abs(rates(weights.applied(planes))[0] - DELIBERATE) < 2 * weights.deviation_per_mm[0]
 
 
-def test_offsets_stay_on_their_side_when_slopes_are_left_out():
-    covariance = np.diag([0.02, 3e-3, 3e-3])
-    covariance[0, 1] = covariance[1, 0] = -5e-3
-    planes = made([0.1, -0.1], [-0.1, 0.1], 0.0, covariance)
-    kept = SlopeWeights(np.zeros(2), np.zeros(2)).applied(planes)
-    np.testing.assert_allclose(kept.offset_mm, [0.2 / 3, -0.2 / 3])
-
-
 @pytest.mark.parametrize("sigma", [0.01, 0.04])
 def test_deviations_are_those_of_turns_as_expected_and_feigned(sigma):
     """Over many sweeps whose true and false rates are drawn, kept rates miss the true by what is claimed."""
@@ -93,16 +85,3 @@ def test_deviations_are_those_of_turns_as_expected_and_feigned(sigma):
     # 600 draws know a deviation to 3 %; believing what stands out costs some at the tails.
     assert 0.85 < np.std(off) / np.sqrt(np.mean(np.square(claimed))) < 1.15
     assert np.std(off) < 1.1 * min(feigned, EXPECTED)
-
-
-def test_keeping_part_of_a_slope_moves_the_offset_as_the_fit_has_it():
-    """The same as fitting anew with the slopes held."""
-    root = np.array([[0.02, 0, 0], [2e-4, 4e-4, 0], [-3e-4, 1e-4, 5e-4]])
-    plane = made(0.3, 0.004, -0.006, root @ root.T)
-    share = np.array([0.25, 0.7])
-    found = SlopeWeights(share, np.zeros(2)).applied(plane)
-    held = share * plane.coefficients[0, 1:]
-    information = np.linalg.inv(root @ root.T)
-    # Of (x - x0)' W (x - x0) with b and c held, the least over a.
-    offset = 0.3 - information[0, 1:] @ (held - plane.coefficients[0, 1:]) / information[0, 0]
-    np.testing.assert_allclose(found.coefficients, [[offset, *held]], rtol=1e-9)
