@@ -220,10 +220,10 @@ def track(
     """
     require_kind(sweep, Sweep, "sweep", "load_sweep(path)")
     settings = config or Config()
-    if curves is None:
-        curves = _curves_beside(sweep, settings.curves.same_probe)
-    else:
+    if curves is not None:
         require_kind(curves, DecorrelationCurves, "curves", "load_curves(path)")
+    else:
+        curves = _curves_beside(sweep, settings.curves.same_probe)
     with naming(sweep.name):
         if len(sweep) < 2:
             raise InsufficientDataError(f"expected at least 2 frames, got {len(sweep)}")

@@ -22,7 +22,6 @@ MOST_BIAS_DEG_S = 3.0
 """Biases of gyroscopes in orientation sensors are below 1 degree/s once they have stood still."""
 TILTED_DEG = 10.0
 """Angle between gravity and the world's z that contradicts a sensor."""
-MIRRORS = {"x": (-1.0, 1.0, 1.0), "y": (1.0, -1.0, 1.0), "z": (1.0, 1.0, -1.0)}
 
 
 def conventions(turned: Rotation) -> Iterator[tuple[str, Rotation]]:
@@ -31,8 +30,8 @@ def conventions(turned: Rotation) -> Iterator[tuple[str, Rotation]]:
     yield "quaternions stored xyzw for wxyz", Rotation.from_quat(xyzw[:, [3, 0, 1, 2]])
     yield "quaternions wxyz taken for xyzw", Rotation.from_quat(xyzw[:, [1, 2, 3, 0]])
     yield "quaternions inverted", turned.inv()
-    for axis, signs in MIRRORS.items():
-        flip = np.diag(signs)
+    for axis, unit in zip("xyz", np.eye(3), strict=True):
+        flip = np.diag(1.0 - 2.0 * unit)
         yield f"handedness: {axis} mirrored", Rotation.from_matrix(flip @ turned.as_matrix() @ flip)
 
 

@@ -129,10 +129,6 @@ class FrameMatcher:
             curves.key.require_same(self.key)
             self.patches = self.laid.between(curves.depth_mm)
 
-    def keep_depths(self, depth_mm: FloatArray) -> None:
-        """Leave out the patches beyond the first and the last of some depths; see `PatchGrid.between`."""
-        self.patches = self.laid.between(depth_mm)
-
     def ready(self, samples: npt.NDArray[Any]) -> ReadyFrame:
         """Make a frame, as read, ready to be matched; on any thread."""
         echo, is_bmode = self.echo(samples), isinstance(self.signal, BModeSettings)

@@ -148,5 +148,6 @@ class SweepPairs:
         matcher = FrameMatcher(self._sweep, c.intensity, c.patches, c.inplane, c.matching)
         if self._pairs is not None:
             grid, (_, sample) = matcher.grid, matcher.grid.sample_at(self._pairs.patch_centre_mm).T
-            matcher.keep_depths(np.unique(grid.first_sample_depth_mm + sample * grid.sample_spacing_mm))
+            depth_mm = np.unique(grid.first_sample_depth_mm + sample * grid.sample_spacing_mm)
+            matcher.patches = matcher.laid.between(depth_mm)
         return matcher
