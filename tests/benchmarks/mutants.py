@@ -144,7 +144,7 @@ MUTANTS = {
         "speckle3d.motion.signs:on_path", lambda function, planes, path: planes, "motion/test_signs.py"
     ),
     "a sensor's spikes kept": Mutant(
-        "speckle3d.examine.readings:spikes", returned(np.zeros_like), "examine/test_sensors.py"
+        "speckle3d.examine.sensors:spikes", returned(np.zeros_like), "examine/test_sensors.py"
     ),
     "claims of fusion a third": Mutant(
         "speckle3d.correction.fused:fuse",
