@@ -248,19 +248,21 @@ def _values(header: SequenceHeader, layout: Layout, device: DeviceSet, pixel: Va
         values["frame_rate_hz"] = Value(rate, "of its time stamps")
     across, down = (replace(pixel, value=size) for size in pixel.value or (None, None))
     vectors, samples = layout.shape(header.size)
-    scan = Value(None, "ScanConversion of the device set", _DEVICE)
-    radii_mm, width_mm = device.scan("RadiusStartMm", "RadiusStopMm"), device.scan("TransducerWidthMm")
+
+    def scanned(numbers: float | tuple[float, ...] | None) -> Value:
+        return Value(numbers, "ScanConversion of the device set", _DEVICE)
+
+    width_mm = device.scan("TransducerWidthMm")
     if device.is_curved and (layout.is_rf or layout.has_lines_in_rows):
-        values["line_angles_deg"] = replace(scan, value=device.scan("ThetaStartDeg", "ThetaStopDeg"))
-        values["array_radius_mm"] = scan
-        if radii_mm is not None and samples > 1:
-            near, far = radii_mm
-            values["array_radius_mm"] = replace(scan, value=near)
-            values["row_spacing_mm"] = replace(scan, value=(far - near) / (samples - 1))
+        near, far = device.scan("RadiusStartMm", "RadiusStopMm") or (None, 0.0)
+        angles = device.scan("ThetaStartDeg", "ThetaStopDeg")
+        values |= {"line_angles_deg": scanned(angles), "array_radius_mm": scanned(near)}
+        if near is not None and samples > 1:
+            values["row_spacing_mm"] = scanned((far - near) / (samples - 1))
     elif not layout.is_rf or down.value is not None:
         values |= {f"{'vector' if layout.is_rf else 'column'}_pitch_mm": across, "row_spacing_mm": down}
     elif width_mm is not None:
-        values["vector_pitch_mm"] = replace(scan, value=width_mm[0] / vectors)
+        values["vector_pitch_mm"] = scanned(width_mm[0] / vectors)
     return values
 
 

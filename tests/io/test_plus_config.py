@@ -54,12 +54,3 @@ def test_the_phantoms_pose_is_read_either_way_round_by_the_names_of_the_set(
     path = device_set(tmp_path, transforms=POSE.format(phantom, reference), tail=own)
     pose = read_wire_phantom(path).phantom.world_from_phantom
     np.testing.assert_allclose((pose.inv() if inverse else pose).apply([1.0, 2.0, 3.0]), [8.0, 21.0, 33.0])
-
-
-@pytest.mark.realdata
-def test_the_published_device_set_is_read(realdata):
-    config = read_wire_phantom(realdata / "plus" / "PlusDeviceSet_fCal_Sim_SpatialCalibration_2.0.xml")
-    assert config.phantom.n_shapes == ((0, 1, 2), (3, 4, 5), (6, 7, 8))
-    assert config.phantom.names[4] == "5:H3_l3"
-    np.testing.assert_array_equal(config.clip_px[[0, 2]], [[27, 27], [792, 588]])
-    np.testing.assert_allclose(config.phantom.world_from_phantom.translation, [15.6642, -25.3628, -40.7799])

@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 import SimpleITK
 import slicerio
-from hypothesis import example, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.labels import STATE_SEGMENTS, LabelMap, Segment
 from speckle3d.core.volume import VOXEL_TYPES, Volume
 from speckle3d.io.voxels.volume_writer import SUFFIXES, write_volume
@@ -51,8 +52,6 @@ def by_itk(path):
     compress=st.booleans(),
     seed=st.integers(0, 999),
 )
-@example(suffix=".mha", dtype="uint16", shape=(1, 1, 1), compress=True, seed=0)
-@example(suffix=".nrrd", dtype="int16", shape=(1, 5, 1), compress=False, seed=0)
 def test_a_voxel_is_at_the_same_place_in_itk_and_here(tmp_path_factory, suffix, dtype, shape, compress, seed):
     path = tmp_path_factory.mktemp("volume") / f"v{suffix}"
     volume = volume_of(seed, dtype, shape)
@@ -142,3 +141,13 @@ def test_nrrd_is_in_its_own_unit_and_space(tmp_path):
     expected = np.diag([-0.2, -0.3, 0.4, 1.0])
     expected[:3, 3] = -10, -20, 30
     np.testing.assert_allclose(read_volume(tmp_path / "v.nrrd").world_from_index, expected)
+
+
+def test_an_origin_with_too_few_numbers_is_told(tmp_path):
+    (tmp_path / "v.nrrd").write_bytes(
+        b"NRRD0005\ntype: uint8\ndimension: 3\nsizes: 2 3 4\nspace: left-posterior-superior\n"
+        b"kinds: domain domain domain\nspace directions: (1,0,0) (0,1,0) (0,0,1)\nspace origin: (1,2)\n"
+        b"encoding: raw\n\n" + bytes(24)
+    )
+    with pytest.raises(InvalidInputError, match="space origin"):
+        read_volume(tmp_path / "v.nrrd")

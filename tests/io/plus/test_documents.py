@@ -10,7 +10,6 @@ from speckle3d.io.load import kind_of, load_sweep
 @pytest.mark.parametrize(
     ("content", "expected", "option"),
     [
-        ("<PlusConfiguration/>", {"content": "a device set", "pixel": "unknown"}, "--plus-config"),
         (
             '\ufeff<?xml version="1.0"?>\n<!-- x -->\n<ProbeCalibrationResult><CalibrationResults><Transform '
             'From="Image" To="Probe" Matrix="0.1 0 0 1 0 0.2 0 2 0 0 1 3 0 0 0 1"/></CalibrationResults>'
@@ -22,11 +21,6 @@ from speckle3d.io.load import kind_of, load_sweep
             '<TemporalCalibrationResults TrackerLagSec="-0.0648266"/>',
             {"content": "a tracker's delay", "time offset of the tracker": "+0.0648"},
             "--time-offset-s",
-        ),
-        (
-            '<LineSegmentationResults><Frame SegmentationStatus="OK"/><Frame/></LineSegmentationResults>',
-            {"content": "lines found in images"},
-            "comparison",
         ),
     ],
 )
