@@ -117,20 +117,22 @@ def load_landmarks(path: PathLike) -> Landmarks | None:
 
 def import_record(path: PathLike) -> ImportRecord | None:
     """Settings that a file beside a recording gives; None where there is none, or it would not be read."""
-    beside, reader = settings_file(path), find_reader(path)
-    if beside is None or reader is None or not reader.takes_settings:
+    beside = _settings_beside(path, find_reader(path))
+    if beside is None:
         return None
     return ImportRecord(written_path(beside.name), settings_for(path).model_dump_json(exclude_defaults=True))
+
+
+def _settings_beside(path: PathLike, reader: Reader | None) -> Path | None:
+    return settings_file(path) if reader is not None and reader.takes_settings else None
 
 
 def recording_files(path: PathLike) -> list[Path]:
     """List the files that a recording's content depends on: itself, unless it is a folder, and companions."""
     place, reader = Path(path), find_reader(path)
     files = [] if place.is_dir() else [place]
-    if reader is None:
-        return files
-    files += reader.companions(place)
-    if reader.takes_settings and (beside := settings_file(path)) is not None:
+    files += () if reader is None else reader.companions(place)
+    if (beside := _settings_beside(path, reader)) is not None:
         config = settings_for(path).plus_config
         files += [beside, *([] if config is None else [Path(config)])]
     return files

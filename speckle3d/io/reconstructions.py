@@ -158,15 +158,14 @@ def _read_pairs(file: h5py.File, frames: int) -> FramePairs | None:
     if not has_member(file, "pairs"):
         return None
     group = require_group(file, "pairs")
-    pairs, where = read_record(group, FramePairs), locate(group)
-    if len({len(rows) for name, rows in vars(pairs).items() if name != "patch_centre_mm"}) > 1:
-        raise InvalidInputError(f"{where}: expected equally many rows in each data set, got others")
-    bad = np.flatnonzero((pairs.first < 0) | (pairs.second <= pairs.first) | (pairs.second >= frames))
-    if bad.size:
-        i = int(bad[0])
+    pairs = read_record(group, FramePairs)
+    counts = {len(rows) for name, rows in vars(pairs).items() if name != "patch_centre_mm"}
+    if (
+        len(counts) > 1
+        or not ((pairs.first >= 0) & (pairs.first < pairs.second) & (pairs.second < frames)).all()
+    ):
         raise InvalidInputError(
-            f"{where}[{i}]: expected frames 0 <= first < second < {frames}, "
-            f"got {pairs.first[i]} and {pairs.second[i]}"
+            f"{locate(group)}: expected rows of frames 0 <= first < second < {frames}, got others"
         )
     transforms_from_matrices(pairs.first_from_second, locate(group, "first_from_second"))
     return pairs

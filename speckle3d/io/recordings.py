@@ -175,9 +175,9 @@ class Recording:
         if given is None:
             asked = f"missing: --{self.asked.get(name, name).replace('_', '-')}"
             return ((words, f"{own}{source}", unit) if own else (words, asked, "")), ""
-        file, shown = settings_file(self.path), number_row(name, given)[1]
-        is_of_file = file is not None and getattr(settings_for(self.path), name) == given
-        by = f"given by {file.name}" if file is not None and is_of_file else "given"
+        shown, by = number_row(name, given)[1], "given"
+        if (file := settings_file(self.path)) and getattr(settings_for(self.path), name) == given:
+            by = f"given by {file.name}"
         if not own or one.is_assumed or shown == own:
             return (words, f"{shown} ({by})", unit), ""
         against = f"{one.said_by} says {own}"

@@ -149,14 +149,21 @@ def _read_image(clock: _Clock) -> tuple[FileFrames, ImageGrid, RFSettings | BMod
         if name == "iq":
             read_attribute(node, "demodulation_frequency_hz")
         signal = read_signal(node, name)
-        first_mm = read_attribute(node, "first_sample_depth_mm")
         if isinstance(signal, RFSettings):
-            sizes = read_attribute(node, "vector_pitch_mm"), signal.sample_spacing_mm
+            pitch_mm, spacing_mm = read_attribute(node, "vector_pitch_mm"), signal.sample_spacing_mm
         else:
-            sizes = read_attribute(node, "column_pitch_mm"), read_attribute(node, "row_spacing_mm")
-        fan = read_record(require_group(file, "fan"), FanLines) if has_member(file, "fan") else None
-        left_mm = read_attribute(node, "first_vector_mm", 0.0)
-        grid = ImageGrid(vectors, samples, *sizes, first_mm, fan=fan, first_vector_mm=left_mm)
+            pitch_mm, spacing_mm = (
+                read_attribute(node, key) for key in ("column_pitch_mm", "row_spacing_mm")
+            )
+        grid = read_record(
+            node,
+            ImageGrid,
+            vectors=vectors,
+            samples=samples,
+            vector_pitch_mm=pitch_mm,
+            sample_spacing_mm=spacing_mm,
+            fan=read_record(require_group(file, "fan"), FanLines) if has_member(file, "fan") else None,
+        )
         return slices.frames(shape, kind, stored_dtype=dtype), grid, signal
 
 

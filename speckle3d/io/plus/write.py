@@ -187,9 +187,7 @@ def _add_sensors(fields: dict[str, str], sweep: Sweep) -> list[str]:
         at = times - sensor.time_offset_s
         covered, matrices = sensor.readings.covers(at), np.tile(np.eye(4), (count, 1, 1))
         if covered.any():
-            posed = sensor.readings.at(at[covered]).as_matrix()
-            size = posed.shape[-1]  # 3 of rotations
-            matrices[np.flatnonzero(covered), :size, :size] = posed
+            matrices[covered] = _rigid(sensor.readings.at(at[covered])).as_matrix()
         _add(fields, f"{own}To{world}", matrices, covered)
         if sensor is sweep.orientation or not np.array_equal(sensor.readings.time_s, at[covered]):
             omitted.append(
@@ -197,13 +195,15 @@ def _add_sensors(fields: dict[str, str], sweep: Sweep) -> list[str]:
                 f"{np.count_nonzero(covered)} interpolated ones are at the times of {count} frames"
             )
         if (mounting := sensor.sensor_from_image) is not None:
-            if isinstance(mounting, Rotation):
-                mounting = RigidTransform.from_rotation(mounting)
             skew_rad = sensor.image_skew_rad if isinstance(sensor, Tracker) else 0.0
             first = RigidTransform.from_translation([grid.first_vector_mm, 0.0, 0.0])
-            pixels = image_matrix(mounting * first, *sizes, skew_rad)
+            pixels = image_matrix(_rigid(mounting) * first, *sizes, skew_rad)
             _add(fields, f"{IMAGE}To{own}", np.tile(pixels, (count, 1, 1)))
     return omitted if sweep.truth is None else [*omitted, "the true poses"]
+
+
+def _rigid(pose: RigidTransform | Rotation) -> RigidTransform:
+    return RigidTransform.from_rotation(pose) if isinstance(pose, Rotation) else pose
 
 
 def _standard_fields(sweep: Sweep) -> dict[str, str]:

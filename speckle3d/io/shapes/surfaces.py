@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -56,15 +57,14 @@ def write_surface(path: PathLike, surface: Surface) -> None:
     with atomic_path(path) as part:
         if suffix == ".stl":
             mesh.cell_data["facet_normals"] = [surface.normals.astype(np.float32)]
-            meshio.stl.write(part, mesh, binary=True)
-            content = part.read_bytes()[_STL_HEADER_BYTES:]
-            part.write_bytes(f"speckle3d surface. {SPACE}".encode().ljust(_STL_HEADER_BYTES) + content)
-        elif suffix == ".ply":
-            meshio.ply.write(part, mesh, binary=True)
-            _replace_line(part, b"comment ", f"comment {SPACE}")
-        else:
-            meshio.vtk.write(part, mesh, fmt_version="4.2", binary=True)
-            _replace_line(part, b"written by ", f"speckle3d surface. {SPACE}")
+        meshio.write(part, mesh, "vtk42" if suffix == ".vtk" else suffix[1:], binary=True)
+        content, title = part.read_bytes(), f"speckle3d surface. {SPACE}".encode()
+        if suffix == ".stl":
+            content = title.ljust(_STL_HEADER_BYTES) + content[_STL_HEADER_BYTES:]
+        else:  # the first line that tells of meshio; what is behind it is binary
+            title = f"comment {SPACE}".encode() if suffix == ".ply" else title
+            content = re.sub(rb"^.*meshio.*$", title, content, count=1, flags=re.MULTILINE)
+        part.write_bytes(content)
 
 
 def read_surface(path: PathLike) -> Surface:
@@ -107,13 +107,6 @@ def require_suffix(path: PathLike) -> str:
     if suffix not in SUFFIXES:
         raise InvalidInputError(f"{path}: expected a name ending in {', '.join(SUFFIXES)}")
     return suffix
-
-
-def _replace_line(part: Path, begins: bytes, line: str) -> None:
-    """Replace the first line that begins so; what is behind it is binary."""
-    held = part.read_bytes()
-    start = held.index(begins)
-    part.write_bytes(held[:start] + line.encode() + held[held.index(b"\n", start) :])
 
 
 def write_polylines(path: PathLike, lines_mm: FloatArray, frames: npt.NDArray[np.integer]) -> None:

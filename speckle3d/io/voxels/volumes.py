@@ -40,9 +40,7 @@ def is_volume(path: PathLike) -> bool:
         If it cannot be read, or its header does not make sense.
     """
     start = first_bytes(path)
-    if is_image(start):
-        return read_header(path).is_volume
-    return _is_nifti(Path(path), start)
+    return read_header(path).is_volume if is_image(start) else _is_nifti(Path(path), start)
 
 
 def may_be_volume(path: PathLike) -> bool:
@@ -56,9 +54,7 @@ def may_be_volume(path: PathLike) -> bool:
         If it cannot be read.
     """
     start = first_bytes(path)
-    if is_image(start):
-        return b"Seq_Frame" not in start
-    return _is_nifti(Path(path), start)
+    return b"Seq_Frame" not in start if is_image(start) else _is_nifti(Path(path), start)
 
 
 def read_volume(path: PathLike) -> Volume:
