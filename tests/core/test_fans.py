@@ -4,16 +4,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform
 
-from speckle3d.calibrating.recordings import open_recording
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.grid import ImageGrid
 from speckle3d.core.scan_conversion import ScanConversion
-from speckle3d.core.streams import TimedPoses
-from speckle3d.core.sweep import BModeSettings, Sweep, Tracker
 from speckle3d.imaging.cuts.planes import lateral_line
 from speckle3d.imaging.measures.belonging import belonging_of
-from speckle3d.io.plus.write import write_sequence
-from speckle3d.io.sweep_writer import write_sweep
 
 CURVED = ImageGrid.of_fan(97, 401, 0.1, 60.0, tuple(np.deg2rad((-30.0, 30.0))))
 PHASED = ImageGrid.of_fan(65, 301, 0.2, 0.0, tuple(np.deg2rad((-45.0, 45.0))), 2.0)
@@ -67,19 +62,3 @@ def test_a_disc_is_drawn_where_it_is(grid):
     fan *= np.diff(np.square(grid.fan.radius_mm + np.array([grid.first_sample_depth_mm, grid.depth_mm])))[0]
     low, high = grid.corners_mm[0], grid.corners_mm[2]
     assert inside.mean() == pytest.approx(fan / np.prod((high - low)[:2]), rel=0.02)
-
-
-def test_grey_images_of_a_fan_are_calibrated_scan_converted_and_no_sequence_takes_them(tmp_path):
-    frames = np.full((2, CURVED.vectors, CURVED.samples), 100, np.uint8)
-    time_s = np.array([0.0, 0.04])
-    tracker = Tracker(TimedPoses(time_s, RigidTransform.from_translation(np.zeros((2, 3)))))
-    sweep = Sweep(frames, CURVED, BModeSettings(60.0), time_s, tracker=tracker)
-    with pytest.raises(InvalidInputError, match="parallel vectors"):
-        write_sequence(tmp_path / "fan.mha", sweep)
-    write_sweep(tmp_path / "fan.h5", sweep)
-    recording = open_recording(tmp_path / "fan.h5", None, None, "tracker")
-    picture = recording.images[0]
-    np.testing.assert_allclose(
-        (np.array(picture.shape) - 1) * recording.pixel_mm, CURVED.corners_mm[2, :2], atol=0.3
-    )
-    assert set(np.unique(picture)) == {0.0, 100.0}

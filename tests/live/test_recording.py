@@ -34,25 +34,17 @@ def kept(tmp_path, monkeypatch):
     return keep
 
 
-def test_times_are_the_senders(kept):
-    times, counts = kept([0.0, 0.3, 0.31], [50.0, 50.04, 50.08])
-    np.testing.assert_allclose(times, [0.0, 0.04, 0.08], atol=1e-9)
-    assert (counts.restarts, counts.refused) == (0, 0)
-
-
-def test_a_clock_that_begins_anew_goes_on_by_what_passed_here(kept):
-    times, counts = kept([0.0, 0.04, 2.0, 2.04], [50.0, 50.04, 3.0, 3.04])
-    np.testing.assert_allclose(times, [0.0, 0.04, 2.0, 2.04], atol=1e-9)
-    assert (counts.restarts, counts.refused) == (1, 0)
-
-
-def test_messages_without_a_time_have_that_of_their_coming(kept):
-    times, counts = kept([7.0, 7.05, 7.09], [0.0, 0.0, 0.0])
-    np.testing.assert_allclose(times, [0.0, 0.05, 0.09], atol=1e-9)
-    assert counts.refused == 0
-
-
-def test_a_frame_a_little_before_the_last_is_refused(kept):
-    times, counts = kept([0.0, 0.04, 0.08], [50.0, 50.04, 50.03])
-    assert times.size == 2
-    assert (counts.restarts, counts.refused) == (0, 1)
+@pytest.mark.parametrize(
+    ("here_s", "sent_s", "expected_s", "restarts", "refused"),
+    [
+        ([0.0, 0.3, 0.31], [50.0, 50.04, 50.08], [0.0, 0.04, 0.08], 0, 0),
+        ([0.0, 0.04, 2.0, 2.04], [50.0, 50.04, 3.0, 3.04], [0.0, 0.04, 2.0, 2.04], 1, 0),
+        ([7.0, 7.05, 7.09], [0.0, 0.0, 0.0], [0.0, 0.05, 0.09], 0, 0),
+        ([0.0, 0.04, 0.08], [50.0, 50.04, 50.03], [0.0, 0.04], 0, 1),
+    ],
+    ids=["the sender's", "a clock that begins anew", "messages without a time", "a little before the last"],
+)
+def test_times_are_the_senders_or_what_passed_here(kept, here_s, sent_s, expected_s, restarts, refused):
+    times, counts = kept(here_s, sent_s)
+    np.testing.assert_allclose(times, expected_s, atol=1e-9)
+    assert (counts.restarts, counts.refused) == (restarts, refused)
