@@ -74,30 +74,17 @@ def read_frame(frames: Frames, index: int) -> npt.NDArray[Any]:
 
 @dataclass(frozen=True)
 class _FramesPart:
-    """Frames `first` to before `stop` of others, still read one at a time."""
+    """Some frames of others, from `first` on, still read one at a time."""
 
     frames: Frames
     first: int
-    stop: int
-
-    @property
-    def shape(self) -> tuple[int, int, int]:
-        return self.stop - self.first, *self.frames.shape[1:]
-
-    @property
-    def dtype(self) -> np.dtype[Any]:
-        return self.frames.dtype
-
-    @property
-    def stored_dtype(self) -> np.dtype[Any]:
-        return stored_dtype(self.frames)
-
-    @property
-    def any_thread(self) -> bool:
-        return True
+    shape: tuple[int, int, int]
+    dtype: np.dtype[Any]
+    stored_dtype: np.dtype[Any]
+    any_thread: ClassVar[bool] = True
 
     def __getitem__(self, index: int) -> npt.NDArray[Any]:
-        return read_frame(self.frames, range(self.first, self.stop)[index])
+        return read_frame(self.frames, self.first + range(self.shape[0])[index])
 
 
 @dataclass(frozen=True)
@@ -423,9 +410,10 @@ class Sweep:
             raise InvalidInputError(
                 f"{self.name}: expected a part among frames 0 to {len(self) - 1}, got {first} to {stop - 1}"
             )
+        shape = stop - first, *self.frames.shape[1:]
         return replace(
             self,
-            frames=_FramesPart(self.frames, first, stop),
+            frames=_FramesPart(self.frames, first, shape, self.frames.dtype, stored_dtype(self.frames)),
             frame_time_s=self.frame_time_s[first:stop],
             truth=None if self.truth is None else self.truth[first:stop],
         )
