@@ -189,8 +189,9 @@ def _batches(
                 raise MismatchError(
                     f"images[{some[n]}]: expected {first.dtype} as the others, got {image.dtype}"
                 )
-            levels = np.nan_to_num(np.rint(image)).clip(0, 255) if whole else image
-            images[n] = levels.T if turned else levels
+            if whole and image.dtype != np.uint8:
+                image = np.nan_to_num(np.rint(image)).clip(0, 255)
+            images[n] = image.T if turned else image
 
     for start in range(0, frames.size, size):
         some = frames[start : start + size]
