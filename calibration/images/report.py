@@ -21,7 +21,7 @@ from calibration.images.stacks import TrackedImages
 from speckle3d.core.arrays import Float32Array
 from speckle3d.core.calibration import Calibration, FramesUsed, Parameter
 from speckle3d.imaging.cuts.planes import image_plane
-from speckle3d.imaging.cuts.reslice import reslice_frames
+from speckle3d.imaging.cuts.reslice import reslice_at
 from speckle3d.imaging.images import ChosenImages
 
 PIXEL_MM = 0.15
@@ -102,7 +102,7 @@ def cut_of(
     # A little more than the distance between frames deep in a fan.
     steps = np.linalg.norm(np.diff(poses.apply([0.0, 40.0, 0.0]), axis=0), axis=1)
     reach = max(_REACH_MM, 1.5 * float(np.percentile(steps, 98)))
-    return reslice_frames(ChosenImages(other.images, frames), other.grid, poses, plane, reach)
+    return reslice_at(ChosenImages(other.images, frames), other.grid, [(poses, plane)], reach)[0]
 
 
 def _draw_images(

@@ -125,8 +125,9 @@ def _any_thread(images: Images) -> bool:
 def require_poses(world_from_image: RigidTransform) -> None:
     """Raise `InvalidInputError` unless there is a row of at least one pose."""
     if world_from_image.single or len(world_from_image) == 0:
-        got = "a single one outside a row" if world_from_image.single else "none"
-        raise InvalidInputError(f"world_from_image: expected a row of poses, one per image, got {got}")
+        raise InvalidInputError(
+            "world_from_image: expected a row of poses, one per image, got a single one or none"
+        )
 
 
 def image_corners(grid: ImageGrid, world_from_image: RigidTransform) -> FloatArray:

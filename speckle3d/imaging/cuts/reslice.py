@@ -18,17 +18,17 @@ from speckle3d.imaging.images import Images, PosedImages
 from speckle3d.imaging.nearest import NearestImages, look_up
 
 
-def reslice_frames(
+def reslice_at(
     images: Images,
     grid: ImageGrid,
-    world_from_image: RigidTransform,
-    cut: Cut,
+    cuts: Sequence[tuple[RigidTransform, Cut]],
     max_distance_mm: float,
-) -> Float32Array:
-    """Cut a plane or a curved sheet through a sweep's images.
+    region: BoolArray | None = None,
+) -> list[Float32Array]:
+    """Cut planes or curved sheets through a sweep's images, each at poses of its own.
 
-    One pass over the images, in any order, with memory for the cut and a few images; images too far from
-    the cut are not even read. A pixel between two images is interpolated linearly by its distances to
+    One pass over the images, in any order, with memory for the cuts and a few images; images too far from
+    all cuts are not even read. A pixel between two images is interpolated linearly by its distances to
     their planes; with support on one side only it takes that image's level.
 
     Parameters
@@ -36,14 +36,16 @@ def reslice_frames(
     images : indexable or callable
         Grey images by frame number, shape (vector, sample); see `speckle3d.imaging.images.Images`.
     grid : ImageGrid
-    world_from_image : RigidTransform, length n
-    cut : ReslicePlane or CurvedSheet
+    cuts : sequence of RigidTransform, length n, and ReslicePlane or CurvedSheet
+        World from image of every frame, and what is cut there.
     max_distance_mm : float
         Images this far from a pixel or farther do not count: about the distance between frames.
+    region : ndarray of bool, shape (vector, sample), optional
+        Samples of the images that count; by default all.
 
     Returns
     -------
-    ndarray of float32, shape (rows, columns)
+    list of ndarray of float32, shape (rows, columns)
         NaN where no image is near enough.
 
     Raises
@@ -56,25 +58,11 @@ def reslice_frames(
     .. [1] W. Wein et al., "Backward-warping ultrasound reconstruction for improving diagnostic value and
        registration", MICCAI, 2006.
     """
-    return reslice_at(images, grid, [(world_from_image, cut)], max_distance_mm)[0]
-
-
-def reslice_at(
-    images: Images,
-    grid: ImageGrid,
-    wanted: Sequence[tuple[RigidTransform, Cut]],
-    max_distance_mm: float,
-    region: BoolArray | None = None,
-) -> list[Float32Array]:
-    """Make several cuts, each at poses of its own, in one pass over the images; else as `reslice_frames`.
-
-    Of the images only samples of a region count, shape (vector, sample).
-    """
     sought = [
         NearestImages(
             PosedImages(images, grid, poses), cut.lines(), cut.shape[0], cut.hull_mm, max_distance_mm
         )
-        for poses, cut in wanted
+        for poses, cut in cuts
     ]
     look_up(sought, region)
     return [np.ascontiguousarray(points.blended()[0].T) for points in sought]

@@ -86,8 +86,8 @@ def compound(
         Directions of the axes of cubic voxels; without it, the world's.
     **settings
         Fields of `CompoundingSettings`: `splat` ("nearest", "linear"), `rule` ("mean", "maximum", "latest",
-        "weighted", or "plus", whose voxels must be of uint8), `fill_radius` (half the edge of the
-        largest such cube, in voxels; by default 3), `fill_mm`, `max_memory_gb`, `voxel_type` (by default
+        "weighted", "plus"), `fill_radius` (half the edge of the largest such cube, in voxels; by default
+        3), `fill_mm`, `max_memory_gb`, `voxel_type` (by default
         "float32", in which empty voxels are NaN; in others levels are rounded and clipped, and empty voxels
         0), and `backward_mm` for sparse sweeps: above zero, each voxel is interpolated between the images
         nearest on either side, up to this far from it, without splat, rule and filling.
@@ -152,10 +152,6 @@ def compound_onto(
     if settings.backward_mm > 0:
         voxels, state = look_up_voxels(source, voxel_grid, settings.backward_mm, region)
     else:
-        if settings.rule == "plus" and kind != "uint8":
-            raise InvalidInputError(
-                f"rule plus: expected voxels of type uint8, whose whole grey levels it keeps, got {kind}"
-            )
         voxels, state = splat_images(source, voxel_grid, settings.splat, settings.rule, weights, region)
         if settings.fill_mm > 0:
             fill_holes(voxels, state, settings.fill_mm, voxel_grid.spacing_mm)

@@ -8,7 +8,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.grid import ImageGrid
 from speckle3d.imaging.cuts.planes import ReslicePlane
-from speckle3d.imaging.cuts.reslice import reslice_frames
+from speckle3d.imaging.cuts.reslice import reslice_at
 
 GRID = ImageGrid(vectors=9, samples=14, vector_pitch_mm=0.5, sample_spacing_mm=0.3, first_sample_depth_mm=0.7)
 
@@ -38,7 +38,7 @@ def test_matches_brute_force_for_any_plane(seed, max_distance_mm, moderate):
     images[rng.integers(7), :3, :3] = np.nan
     turned = Rotation.from_rotvec(rng.normal(0, 0.3, 3)) if moderate else Rotation.random(rng=rng)
     plane = ReslicePlane(RigidTransform.from_components(rng.uniform(-1, 3, 3), turned), 4.0, 3.0, 0.21)
-    got = reslice_frames(images, GRID, poses, plane, max_distance_mm)
+    (got,) = reslice_at(images, GRID, [(poses, plane)], max_distance_mm)
     expected, _ = oracles.between_images(
         images, GRID, poses, pixel_points(plane).reshape(-1, 3), max_distance_mm
     )
