@@ -146,7 +146,7 @@ class Calibration:
     def rows(self) -> list[tuple[str, str, str]]:
         """Description, value with its 95 % interval, and unit, angles in degrees, for people."""
         rows = [("method", self.method, ""), ("sensor", self.sensor, "")]
-        rows += [one.row() for one in self.parameters if one.name not in _ANGLES]
+        rows += [parameter.row() for parameter in self.parameters if parameter.name not in _ANGLES]
         angles = np.rad2deg(roll_yaw_tilt(self.rotation))
         errors = np.rad2deg(np.sqrt(np.diag(self.covariance)[2::-1]))
         rows += [

@@ -144,8 +144,8 @@ class EchoSpectra:
 
     def at(self, depth_mm: FloatArray, frequency_hz: FloatArray) -> FloatArray:
         """Power at depths of any shape and at other frequencies, shape (..., f)."""
-        known = np.stack([np.interp(frequency_hz, self.frequency_hz, row) for row in self.power])
-        flat = [np.interp(depth_mm.ravel(), self.depth_mm, column) for column in known.T]
+        columns = np.stack([np.interp(frequency_hz, self.frequency_hz, row) for row in self.power])
+        flat = [np.interp(depth_mm.ravel(), self.depth_mm, column) for column in columns.T]
         return np.stack(flat, axis=-1).reshape(*depth_mm.shape, -1)
 
 

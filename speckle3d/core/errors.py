@@ -42,10 +42,10 @@ class NoSpaceError(FileError):
 
 
 def _quotable(words: str) -> str:
-    shown = printable(words)
-    if len(shown) <= _LONGEST:
-        return shown
-    return f"{shown[: _LONGEST // 2]} ... {shown[-_LONGEST // 4 :]}"
+    text = printable(words)
+    if len(text) <= _LONGEST:
+        return text
+    return f"{text[: _LONGEST // 2]} ... {text[-_LONGEST // 4 :]}"
 
 
 @contextmanager

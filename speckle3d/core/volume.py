@@ -66,10 +66,10 @@ class Volume:
 
     def to_napari(self, viewer: Any = None) -> tuple[Any, dict[str, Any], str]:
         """Voxels as layer data of napari, added to a viewer if one is given (extra ``napari``)."""
-        known = {"name": "speckle3d", "affine": self.world_from_index, "units": ("mm", "mm", "mm")}
+        place = {"name": "speckle3d", "affine": self.world_from_index, "units": ("mm", "mm", "mm")}
         if viewer is not None:
-            viewer.add_image(self.voxels, **known)
-        return self.voxels, known, "image"
+            viewer.add_image(self.voxels, **place)
+        return self.voxels, place, "image"
 
     @property
     def world_from_index(self) -> FloatArray:

@@ -80,11 +80,11 @@ class WirePhantom:
         meets = [[self._nearest(n[1], outer) for outer in (n[0], n[2])] for n in self.n_shapes]
         return np.reshape(meets, (len(self.n_shapes), 2, 3))
 
-    def _nearest(self, one: int, other: int) -> FloatArray:
+    def _nearest(self, wire: int, crossed: int) -> FloatArray:
         """Point of a wire that is nearest to another."""
-        axes = np.column_stack([self.directions[one], -self.directions[other]])
-        along = np.linalg.lstsq(axes, self.points_mm[other] - self.points_mm[one], rcond=None)[0]
-        return np.asarray(self.points_mm[one] + along[0] * self.directions[one])
+        axes = np.column_stack([self.directions[wire], -self.directions[crossed]])
+        along = np.linalg.lstsq(axes, self.points_mm[crossed] - self.points_mm[wire], rcond=None)[0]
+        return np.asarray(self.points_mm[wire] + along[0] * self.directions[wire])
 
     @cached_property
     def _normals(self) -> FloatArray:

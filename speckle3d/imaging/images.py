@@ -52,10 +52,10 @@ class PosedImages:
 
     def __post_init__(self) -> None:
         require_poses(self.world_from_image)
-        known = len(self.images) if isinstance(self.images, Sized) else len(self)
-        if known != len(self):
+        count = len(self.images) if isinstance(self.images, Sized) else len(self)
+        if count != len(self):
             raise MismatchError(
-                f"world_from_image: expected {known} poses for {known} images, got {len(self)}"
+                f"world_from_image: expected {count} poses for {count} images, got {len(self)}"
             )
 
     def __len__(self) -> int:

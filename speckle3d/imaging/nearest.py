@@ -102,13 +102,13 @@ class NearestImages:
 
         def blend(first: int, stop: int) -> None:
             band = slice(first, stop)
-            (behind, front), (level, other) = self._distance_mm[:, band], self._grey[:, band]
-            shown = ~np.isnan(self._grey[:, band])
-            measured = (shown & (self._distance_mm[:, band] <= alone_mm)).any(axis=0)
+            (behind, front), (back_level, front_level) = self._distance_mm[:, band], self._grey[:, band]
+            present = ~np.isnan(self._grey[:, band])
+            measured = (present & (self._distance_mm[:, band] <= alone_mm)).any(axis=0)
             with np.errstate(invalid="ignore"):
-                between = level + behind / (behind + front) * (other - level)
-            alone = np.where(shown[0], level, other)
-            counts = np.select([measured, shown.all(axis=0)], [MEASURED, FILLED], EMPTY)
+                between = back_level + behind / (behind + front) * (front_level - back_level)
+            alone = np.where(present[0], back_level, front_level)
+            counts = np.select([measured, present.all(axis=0)], [MEASURED, FILLED], EMPTY)
             levels[band] = np.where(np.isnan(between), alone, between)
             levels[band][counts == EMPTY] = np.nan
             state[band] = counts
@@ -147,8 +147,8 @@ def look_up(sought: Sequence[NearestImages], region: BoolArray | None = None) ->
             image[~region] = np.nan
         return image
 
-    wanted = np.flatnonzero(np.any([points.near for points in sought], axis=0)).tolist()
-    for start in range(0, len(wanted), _BATCH):
-        batch = {index: read(index) for index in wanted[start : start + _BATCH]}
+    frames = np.flatnonzero(np.any([points.near for points in sought], axis=0)).tolist()
+    for start in range(0, len(frames), _BATCH):
+        batch = {index: read(index) for index in frames[start : start + _BATCH]}
         for points in sought:
             points.add(batch)

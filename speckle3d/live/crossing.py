@@ -29,13 +29,13 @@ PAUSE_S = 5.0
 """Between two looks, each of which takes seconds."""
 
 
-def words_of(found: CrossingSoFar, settings: CrossingSettings) -> str:
+def words_of(crossing: CrossingSoFar, settings: CrossingSettings) -> str:
     """What to say of two sweeps, by the limits below which the reconstruction refuses them."""
-    if found.similarity < settings.least_similarity:
+    if crossing.similarity < settings.least_similarity:
         return NO_PLACE
-    if found.angle_deg < settings.least_angle_deg:
+    if crossing.angle_deg < settings.least_angle_deg:
         return TURN_MORE
-    if found.overlap_mm < settings.least_overlap_mm:
+    if crossing.overlap_mm < settings.least_overlap_mm:
         return NOT_YET
     return GOOD
 

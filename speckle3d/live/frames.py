@@ -90,10 +90,10 @@ class ImageLayout:
         where = f"IMAGE {image.device}"
         pixels = _plane(image, where)
         frame = pixels.T if self.samples_along_columns else pixels
-        held = self.example.frames
-        if frame.shape != held.shape[1:] or frame.dtype != held.dtype:
+        frames = self.example.frames
+        if frame.shape != frames.shape[1:] or frame.dtype != frames.dtype:
             raise InvalidInputError(
-                f"{where}: expected {held.shape[1:]} of {held.dtype} as the first, got {frame.shape} of "
+                f"{where}: expected {frames.shape[1:]} of {frames.dtype} as the first, got {frame.shape} of "
                 f"{frame.dtype}"
             )
         return np.ascontiguousarray(frame)

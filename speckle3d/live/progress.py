@@ -98,9 +98,11 @@ class Devices:
     @property
     def missing(self) -> str:
         """Which of those that were asked for have sent nothing, beside others that have; empty if none."""
-        told = []
+        sentences = []
         for kind, name in self._wanted:
             if (kind, name) not in self._heard:
-                others = ", ".join(sorted(device for each, device in self._heard if each == kind))
-                told.append(f"no {kind} {name}" + (f", but {others}" if others else " yet"))
-        return "; ".join(told)
+                devices = ", ".join(
+                    sorted(device for heard_kind, device in self._heard if heard_kind == kind)
+                )
+                sentences.append(f"no {kind} {name}" + (f", but {devices}" if devices else " yet"))
+        return "; ".join(sentences)

@@ -251,7 +251,7 @@ class Session:
             work |= {"volumes": self._send_volumes} if settings.volume else {}
             work |= {"crossing check": self._look_for_crossing} if self._crossing is not None else {}
             threads = [
-                threading.Thread(target=self._guarded, args=each, daemon=True) for each in work.items()
+                threading.Thread(target=self._guarded, args=task, daemon=True) for task in work.items()
             ]
             for thread in threads:
                 thread.start()
@@ -321,11 +321,11 @@ class Session:
         """Send the volume about once a second."""
         assert self._volume is not None
         assert self.tracker is not None
-        seen = 0
+        drawn = 0
         while not self._over.wait(VOLUME_EVERY_S):
             poses = self.tracker.poses
-            if len(poses) > max(seen, 1):
-                seen = len(poses)
+            if len(poses) > max(drawn, 1):
+                drawn = len(poses)
                 with on_one_thread():
                     self.voxels = self._volume.compounded(poses)
                     self._send(volume_message(self.voxels, self._sent_s))

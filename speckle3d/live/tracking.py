@@ -254,23 +254,23 @@ class LiveTracker:
             first=np.searchsorted(frames, self._tables[number].first),
             second=np.full(len(self._tables[number]), frames.size - 1),
         )
-        problem, known = replace(motion.problem, frames=frames.size), self._poses[frames[:-1]]
+        problem, before = replace(motion.problem, frames=frames.size), self._poses[frames[:-1]]
         rows = alike_pairs(problem, table)
         models = motion.coherence.models(np.full(rows.size, LAST))
         pairs, determined = pair_planes(problem, table, rows, models)
         pairs = pairs[determined].scaled(motion.coherence.scale)
         if not len(pairs):
             return
-        earlier = elevation_of(known, problem.centre_mm)[:, :2]
+        earlier = elevation_of(before, problem.centre_mm)[:, :2]
         apart = strangers(problem, table)
         pairs = on_path(pairs, likeliest_path(pairs, frames.size, apart, earlier))
         edges = edges_of(table, motion.slopes.applied(pairs))
         # Earlier frames stay: every edge then starts at the first of them.
         centre, start = RigidTransform.from_translation(problem.centre_mm), np.zeros_like(edges.first)
-        relative = centre.inv() * known[0].inv() * known[edges.first] * centre * edges.poses
+        relative = centre.inv() * before[0].inv() * before[edges.first] * centre * edges.poses
         both = RelativePoses(start, start + 1, relative, edges.covariance)
         placed = solve_trajectory(both, 2, problem.centre_mm, problem.trajectory.huber).poses
-        self._poses = RigidTransform.concatenate([self._poses[:-1], known[0] * placed[-1:]])
+        self._poses = RigidTransform.concatenate([self._poses[:-1], before[0] * placed[-1:]])
 
     def _revise_now(self) -> None:
         """Revise if it is time to, without help of another thread."""
@@ -333,5 +333,5 @@ class LiveTracker:
 
 def _against(poses: RigidTransform, others: RigidTransform, centre_mm: FloatArray) -> bool:
     """Whether two trajectories of the same frames go opposite ways along the image's normal."""
-    steps = [(each[:-1].inv() * each[1:]).apply(centre_mm)[:, 2] - centre_mm[2] for each in (poses, others)]
+    steps = [(path[:-1].inv() * path[1:]).apply(centre_mm)[:, 2] - centre_mm[2] for path in (poses, others)]
     return bool(steps[0] @ steps[1] < 0)

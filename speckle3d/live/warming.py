@@ -31,14 +31,14 @@ def warm_up(curves: DecorrelationCurves, config: Config) -> None:
     field = changing + np.roll(changing, 1, axis=1)
     frames = (2000 * field).astype(np.int16) if of_rf else np.clip(128 + 40 * field, 0, 255).astype(np.uint8)
     times_s = np.arange(float(len(frames)))
-    made = Sweep(frames, grid, signal, times_s, name="warming up", probe=curves.key.probe)
+    sweep = Sweep(frames, grid, signal, times_s, name="warming up", probe=curves.key.probe)
     try:
-        tracker = LiveTracker(made, curves, config, background=False)
+        tracker = LiveTracker(sweep, curves, config, background=False)
     except MismatchError:
         # Curves that ask for more than these small images: what comes will do the loading.
         return
     volume = GrowingVolume(tracker.image_grid)
     tracker.images = volume.keep
-    for frame, time_s in zip(frames, made.frame_time_s.tolist(), strict=True):
+    for frame, time_s in zip(frames, sweep.frame_time_s.tolist(), strict=True):
         tracker.append(frame, time_s)
     volume.compounded(tracker.poses)

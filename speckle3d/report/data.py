@@ -50,10 +50,10 @@ def load_view(directory: Path, outcome: SweepOutcome) -> SweepView:
     """
     folder, summary, reference = directory / outcome.folder, outcome.summary, None
     assert summary is not None
-    made = read_reconstruction(folder / "reconstruction.h5")
-    notes, poses = list(summary.lines), dict(made.poses)
+    reconstruction = read_reconstruction(folder / "reconstruction.h5")
+    notes, poses = list(summary.lines), dict(reconstruction.poses)
     try:
-        sweep = sweep_of(made, outcome.path)
+        sweep = sweep_of(reconstruction, outcome.path)
         alone = tracker_alone(sweep)
         if alone is not None and any(row.mode == TRACKER for row in summary.rows):
             poses[TRACKER] = alone
@@ -62,9 +62,9 @@ def load_view(directory: Path, outcome: SweepOutcome) -> SweepView:
             poses[reference.name] = reference.world_from_image
     except Speckle3DError as error:
         notes.append(f"{error}: neither the reference nor the tracker is in its curves")
-    covariance = None if made.trust is None else made.trust.covariance
-    if made.trust is not None:
-        notes += [f"{line}: poses there are guesses" for line in describe(made.trust.flags)]
-    own = poses if reference is None else {m: p for m, p in poses.items() if m != reference.name}
-    curves = sweep_curves(own, made.grid.centre_mm, reference, covariance)
-    return SweepView(folder, made, curves, poses, notes)
+    covariance = None if reconstruction.trust is None else reconstruction.trust.covariance
+    if reconstruction.trust is not None:
+        notes += [f"{line}: poses there are guesses" for line in describe(reconstruction.trust.flags)]
+    estimates = poses if reference is None else {m: p for m, p in poses.items() if m != reference.name}
+    curves = sweep_curves(estimates, reconstruction.grid.centre_mm, reference, covariance)
+    return SweepView(folder, reconstruction, curves, poses, notes)

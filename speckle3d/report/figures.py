@@ -70,17 +70,17 @@ def plot_curves(curves: SweepCurves) -> go.Figure:
     views: dict[str, FloatArray] = {"accumulated": np.zeros((len(CURVE_LABELS), curves.frames))}
     if curves.reference is not None:
         views[f"minus {curves.reference_name}"] = curves.reference
-    shown: list[str] = []
+    trace_views: list[str] = []
     for view, zero in views.items():
         for q, label in enumerate(CURVE_LABELS):
             place = {"row": q // 2 + 1, "col": q % 2 + 1}
             for trace in _curve_traces(curves, q, zero):
                 figure.add_trace(trace.update(visible=view == "accumulated"), **place)
-                shown.append(view)
+                trace_views.append(view)
             figure.update_xaxes(title_text="frame" if q > 1 else "", **place)
             figure.update_yaxes(title_text=label, **place)
     buttons = [
-        {"label": view, "method": "restyle", "args": [{"visible": [each == view for each in shown]}]}
+        {"label": view, "method": "restyle", "args": [{"visible": [each == view for each in trace_views]}]}
         for view in views
     ]
     if len(views) > 1:
@@ -150,10 +150,10 @@ def plot_rejected(pairs: FramePairs, frames: int) -> go.Figure:
     measured = np.isfinite(pairs.distance_mm)
     left_out = measured & ~pairs.used
     share = _percent(left_out.sum(axis=0), measured.sum(axis=0))
-    in_frames = [np.bincount(pairs.first, each.sum(axis=1), frames) for each in (left_out, measured)]
+    in_frames = [np.bincount(pairs.first, mask.sum(axis=1), frames) for mask in (left_out, measured)]
     by_frame = _percent(in_frames[0], in_frames[1])
     centres = np.round(pairs.patch_centre_mm, 6)
-    (across, column), (down, row) = (np.unique(each, return_inverse=True) for each in centres.T)
+    (across, column), (down, row) = (np.unique(places, return_inverse=True) for places in centres.T)
     table = np.full((down.size, across.size), np.nan)
     table[row, column] = share
     figure = make_subplots(1, 2, column_widths=[0.4, 0.6], horizontal_spacing=0.18)

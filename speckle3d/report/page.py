@@ -81,7 +81,7 @@ def write_report(study: Study) -> Path:
         If the page cannot be written.
     """
     overview = _overview(study)
-    sections = [_section(study.directory, each, f"sweep-{i + 1}") for i, each in enumerate(study.done)]
+    sections = [_section(study.directory, outcome, f"sweep-{i + 1}") for i, outcome in enumerate(study.done)]
     target = study.directory / "report.html"
     with atomic_path(target) as part:
         part.write_text(_page(study, overview, sections), encoding="utf-8")
@@ -92,7 +92,7 @@ def _page(study: Study, overview: PageFigure | None, sections: Sequence[Section]
     """Fill the template."""
     from plotly.offline import get_plotlyjs
 
-    anchors = {each.name: each.anchor for each in sections}
+    anchors = {section.name: section.anchor for section in sections}
     scripts = [get_plotlyjs(), files("speckle3d.report").joinpath("script.js").read_text(encoding="utf-8")]
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("speckle3d", "report"),
@@ -102,14 +102,16 @@ def _page(study: Study, overview: PageFigure | None, sections: Sequence[Section]
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    plots = [overview, *(each for some in sections for each in some.figures)]
+    plots = [overview, *(figure for section in sections for figure in section.figures)]
     keys, (intervals, paired) = ("name", "path", "sha256", "key", "seconds"), study.statistics
     drifts = {key for row in study.drift for key, value in row.items() if value is not None}
     return environment.get_template("page.html").render(
         shown=tables.counted(len(study.done) or len(study.broken), "sweep"),
         lead=tables.summary_lines(study),
-        doubts=tables.records_table([_said(each) for each in study.doubts], (), anchors),
-        broken=tables.records_table([each.record() for each in study.broken], ("name", "status", "reason")),
+        doubts=tables.records_table([_said(doubt) for doubt in study.doubts], (), anchors),
+        broken=tables.records_table(
+            [outcome.record() for outcome in study.broken], ("name", "status", "reason")
+        ),
         overview=overview,
         parts=tables.parts_table(study.rows, anchors),
         drift=tables.records_table(study.drift, (), anchors),
@@ -117,10 +119,10 @@ def _page(study: Study, overview: PageFigure | None, sections: Sequence[Section]
         intervals=means_table(intervals) if intervals else [],
         paired=tables.pairs(paired),
         sections=sections,
-        plots=[each for each in plots if each is not None and each.plot],
+        plots=[figure for figure in plots if figure is not None and figure.plot],
         configuration=study.settings_toml,
         version=version("speckle3d"),
-        provenance=tables.records_table([each.record() for each in study.outcomes], keys),
+        provenance=tables.records_table([outcome.record() for outcome in study.outcomes], keys),
         scripts=[Markup(text) for text in scripts],
         script_hashes=" ".join(_hash(text) for text in scripts),
     )

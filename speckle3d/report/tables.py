@@ -32,13 +32,13 @@ def counted(count: int, what: str) -> str:
 
 def parts_table(rows: Sequence[Row], anchors: Mapping[str, str]) -> Table:
     """Errors of every sweep, part and mode; sweeps lead to their figures."""
-    shown = []
+    table = []
     for row in rows:
         sigma = row.get("sigma_mm")
-        shown.append({**row, "interval_mm": None if sigma is None else 1.96 * sigma})
+        table.append({**row, "interval_mm": None if sigma is None else 1.96 * sigma})
     columns = ["sweep", "part", "mode", "estimate_mm", "interval_mm", "reference", "reference_mm", *ERRORS]
     remark = ["remark"] if any(row.get("remark") for row in rows) else []
-    return records_table(shown, columns + remark, anchors)
+    return records_table(table, columns + remark, anchors)
 
 
 def pairs(paired: Sequence[Row]) -> Table:
@@ -96,11 +96,11 @@ def summary_lines(study: Study) -> list[str]:
     lines, (intervals, paired) = [], study.statistics
     for quantity in ("length_error_percent", "tilt_error_deg"):
         of = [row for row in intervals if row["quantity"] == quantity]
-        each = ", ".join(
+        names = ", ".join(
             f"{row['mode']} {with_interval(row, 'mean')} ({counted(row['sweeps'], 'sweep')})" for row in of
         )
         if of:
-            lines.append(f"mean magnitude of {words_of(quantity)}, with its 95 % interval: {each}")
+            lines.append(f"mean magnitude of {words_of(quantity)}, with its 95 % interval: {names}")
     if not rows:
         lines.append("no sweep has a reference: the lengths below are estimates alone")
     elif not lines:

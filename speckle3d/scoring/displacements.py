@@ -83,7 +83,7 @@ def point_errors(
         If there are no landmarks, or one is in no frame that has an error.
     """
     _require_comparable(poses, true)
-    relative = [(each[0].inv() * each[1:], relative_poses(each)) for each in (poses, true)]
+    relative = [(path[0].inv() * path[1:], relative_poses(path)) for path in (poses, true)]
     errors: dict[str, Any] = dict.fromkeys(CHALLENGE_ERRORS)
     for letter, estimated, exact in zip("GL", *relative, strict=True):
         differences = estimated.as_matrix()[:, :3] - exact.as_matrix()[:, :3]
@@ -180,8 +180,8 @@ def _mean_over_landmarks(differences: FloatArray, landmarks: Landmarks) -> float
     at, points, last = landmarks.frame, landmarks.points_mm, len(differences)
     if not at.size or at.min() < 1 or at.max() > last:
         raise InvalidInputError(f"landmarks: expected some, all in frames 1 to {last}, got frames {at}")
-    there = differences[at - 1]
-    shifts = there[:, :, 3] + np.einsum("pij,pj->pi", there[:, :, :3], points)
+    moved = differences[at - 1]
+    shifts = moved[:, :, 3] + np.einsum("pij,pj->pi", moved[:, :, :3], points)
     return float(np.linalg.norm(shifts, axis=1).mean())
 
 

@@ -211,18 +211,18 @@ def compare_modes(
     if lengths != {frames}:
         raise MismatchError(f"expected {frames} poses of each mode and of the reference, got {lengths}")
     true = accumulated(true_poses, centre_mm)
-    estimates = {mode: accumulated(each[used], centre_mm) for mode, each in poses.items()}
+    estimates = {mode: accumulated(path[used], centre_mm) for mode, path in poses.items()}
     rows = []
     for part in monotone_parts(true.length_mm):
-        frames, (wanted, reference_sigma_mm) = part.last - part.first + 1, _changes(true, part, end_frames)
-        reference_mm, sign = abs(wanted[0]), -1.0 if wanted[0] < 0 else 1.0
+        frames, (exact, reference_sigma_mm) = part.last - part.first + 1, _changes(true, part, end_frames)
+        reference_mm, sign = abs(exact[0]), -1.0 if exact[0] < 0 else 1.0
         for mode, estimate in estimates.items():
             changes, sigma_mm = _changes(estimate, part, END_FRAMES if mode == TRACKER else end_frames)
-            error_mm = sign * (changes[0] - wanted[0])
+            error_mm = sign * (changes[0] - exact[0])
             percent = 100.0 * error_mm / reference_mm if reference_mm else np.nan
-            turns = np.rad2deg(np.subtract(changes[1:], wanted[1:])).tolist()
-            own = sigma_mm if mode == TRACKER else np.nan
-            errors = reference_mm + error_mm, error_mm, percent, *turns, reference_sigma_mm, own
+            turns = np.rad2deg(np.subtract(changes[1:], exact[1:])).tolist()
+            own_sigma_mm = sigma_mm if mode == TRACKER else np.nan
+            errors = reference_mm + error_mm, error_mm, percent, *turns, reference_sigma_mm, own_sigma_mm
             rows.append(ModeError(part.name, mode, frames, reference_mm, *errors))
     return rows
 
@@ -273,8 +273,8 @@ def _width(size: int, end_frames: int) -> int:
 
 def _changes(motion: Accumulated, part: Part, end_frames: int) -> tuple[list[float], float]:
     """Change of length, tilt, yaw and roll over a part, and the length's deviation by jitter at both ends."""
-    inside = [each[part.first : part.last + 1] for each in motion]
-    changes = [read_end(each, end_frames) - read_end(each[::-1], end_frames) for each in inside]
+    inside = [values[part.first : part.last + 1] for values in motion]
+    changes = [read_end(values, end_frames) - read_end(values[::-1], end_frames) for values in inside]
     width = _width(inside[0].size, end_frames)
     variance = _LINE_EXCESS * (4 * width - 2) / (width * (width + 1)) if width > 2 else 1.0
     jitter = 0.0 if end_frames == 1 else jitter_mm(motion.length_mm)

@@ -145,7 +145,7 @@ def sweep_curves(
 
     """
     modes = {
-        mode: _curves(each, centre_mm, END_FRAMES if mode == TRACKER else 1) for mode, each in poses.items()
+        mode: _curves(path, centre_mm, END_FRAMES if mode == TRACKER else 1) for mode, path in poses.items()
     }
     half_width = None
     if covariance is not None and "image" in modes:
@@ -168,25 +168,25 @@ def error_rows(
     poses : mapping of str to RigidTransform, length n
         By mode; the reference may be among them.
     """
-    others = {mode: each for mode, each in poses.items() if reference is None or mode != reference.name}
+    estimates = {mode: path for mode, path in poses.items() if reference is None or mode != reference.name}
     frames = len(next(iter(poses.values())))
-    if reference is None or not others:
+    if reference is None or not estimates:
         return [
-            ModeError("all", mode, frames, estimate_mm=abs(travelled_mm(mode, each, centre_mm)))
-            for mode, each in poses.items()
+            ModeError("all", mode, frames, estimate_mm=abs(travelled_mm(mode, path, centre_mm)))
+            for mode, path in poses.items()
         ]
     true = reference.world_from_image
-    rows = compare_modes(others, true, centre_mm, reference.covered, reference.end_frames)
+    rows = compare_modes(estimates, true, centre_mm, reference.covered, reference.end_frames)
     if reference.name == TRACKER:
         for last in {row.part: row for row in rows}.values():
             length, sigma = last.reference_mm, last.reference_sigma_mm
-            own = ModeError(last.part, TRACKER, last.frames, length, length)
-            rows.insert(rows.index(last) + 1, replace(own, reference_sigma_mm=sigma, sigma_mm=sigma))
+            row = ModeError(last.part, TRACKER, last.frames, length, length)
+            rows.insert(rows.index(last) + 1, replace(row, reference_sigma_mm=sigma, sigma_mm=sigma))
     return rows
 
 
 def _curves(poses: RigidTransform, centre_mm: npt.ArrayLike, end_frames: int) -> FloatArray:
     """Length (mm), tilt, yaw and roll (degrees), shape (4, n), zero where the first end is read."""
     curves = _UNITS * np.stack(accumulated(poses, centre_mm))
-    start = np.array([[read_end(each[::-1], end_frames)] for each in curves])
+    start = np.array([[read_end(curve[::-1], end_frames)] for curve in curves])
     return np.asarray(curves - start)

@@ -97,10 +97,16 @@ def load_estimate(path: Path, mode: str | None = None, length_unit: LengthUnit |
     if kind_of(path) == "text":
         text = read_tum(path, length_unit)
         return Trajectory(path.name, text.time_s, text.world_from_sensor)
-    made = read_reconstruction(path, with_pairs=False)
-    mode = default_mode(made)[0] if mode is None else mode
-    name, of = f"{path.name}, mode {mode}", made.provenance.input_sha256
-    return Trajectory(name, made.frame_time_s, poses_of(made, mode), made.grid, sweep_sha256=of)
+    reconstruction = read_reconstruction(path, with_pairs=False)
+    mode = default_mode(reconstruction)[0] if mode is None else mode
+    name, sha256 = f"{path.name}, mode {mode}", reconstruction.provenance.input_sha256
+    return Trajectory(
+        name,
+        reconstruction.frame_time_s,
+        poses_of(reconstruction, mode),
+        reconstruction.grid,
+        sweep_sha256=sha256,
+    )
 
 
 def poses_of(reconstruction: Reconstruction, mode: str) -> RigidTransform:

@@ -48,8 +48,8 @@ class CurvedSheet(Cut):
         """Points of the world by what the picture's axes say, shape (..., 3), mm; NaN beyond the ends."""
         x, y = np.broadcast_arrays(np.asarray(x_mm, dtype=float), np.asarray(y_mm, dtype=float))
         column = (x - self.first_mm[0]) / self.pixel_mm
-        known = np.arange(len(self.base_mm))
-        base = [np.interp(column, known, values, np.nan, np.nan) for values in self.base_mm.T]
+        columns = np.arange(len(self.base_mm))
+        base = [np.interp(column, columns, values, np.nan, np.nan) for values in self.base_mm.T]
         return np.stack(base, axis=-1) + (y - self.first_mm[1])[..., None] * self.down
 
 

@@ -31,7 +31,7 @@ def spanned_plane(origin_mm: npt.ArrayLike, right: npt.ArrayLike, down: npt.Arra
     normal = np.cross(x, y)
     sine = np.linalg.norm(normal)
     if not (sine >= _LEAST_SINE and np.isfinite(origin_mm).all()):
-        got = " and ".join(vector_words(np.asarray(each)) for each in (origin_mm, right, down))
+        got = " and ".join(vector_words(np.asarray(vector)) for vector in (origin_mm, right, down))
         raise InvalidInputError(f"plane: expected an origin and two directions that span it, got {got}")
     axes = Rotation.from_matrix(np.column_stack([x, np.cross(normal / sine, x), normal / sine]))
     return RigidTransform.from_components(np.asarray(origin_mm, dtype=float), axes)
@@ -89,4 +89,4 @@ def covering_plane(
 
 def vector_words(vector: Iterable[float]) -> str:
     """Text of a vector for messages."""
-    return "(" + ", ".join(f"{each:.4g}" for each in vector) + ")"
+    return "(" + ", ".join(f"{value:.4g}" for value in vector) + ")"

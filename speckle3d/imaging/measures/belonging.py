@@ -37,7 +37,7 @@ def belonging_of(points_mm: FloatArray, grid: ImageGrid, world_from_image: Rigid
         _place(points[first : first + rows], image_from_world, grid)
         for first in range(0, max(len(points), 1), rows)
     ]
-    return Belonging(*(np.concatenate(each) for each in zip(*parts, strict=True)))
+    return Belonging(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
 
 def require_inside(
@@ -74,12 +74,12 @@ def _place(
     beside = (x - np.clip(x, left, right)) ** 2 + (y - np.clip(y, top, bottom)) ** 2
     away = q**2 + beside
     row, best = np.arange(len(points)), away.argmin(axis=0)
-    own, second, weight = q[best, row], np.zeros(len(points), dtype=np.int64), np.zeros(len(points))
+    height, second, weight = q[best, row], np.zeros(len(points), dtype=np.int64), np.zeros(len(points))
     for step in (-1, 1):
         neighbour = np.clip(best + step, 0, len(q) - 1)
-        share = np.abs(own) / np.maximum(np.abs(own) + np.abs(q[neighbour, row]), 1e-12)
+        share = np.abs(height) / np.maximum(np.abs(height) + np.abs(q[neighbour, row]), 1e-12)
         # Of two neighbours on the other side, where the probe turns back, the nearer.
-        across = (own * q[neighbour, row] < 0) & (neighbour != best) & (share > weight)
+        across = (height * q[neighbour, row] < 0) & (neighbour != best) & (share > weight)
         second[across], weight[across] = neighbour[across], share[across]
     gap = np.sqrt(np.where(weight > 0.0, beside[best, row], away[best, row]))
     return np.stack([best, second], axis=1), np.stack([1.0 - weight, weight], axis=1), gap

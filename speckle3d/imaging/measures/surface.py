@@ -107,13 +107,13 @@ def surfaces_of_labels(volume: Volume) -> dict[int, Surface]:
         raise InvalidInputError(
             f"labels: expected whole numbers, at most {MAX_LABELS}, got others: are these grey levels?"
         )
-    every, found = np.ones(volume.shape, dtype=bool), {}
+    every, surfaces = np.ones(volume.shape, dtype=bool), {}
     for label in (int(label) for label in labels if label != 0):
         surface = _marched(volume, (voxels == label).astype(np.float32), 0.5, "above", every)
-        found[label] = replace(surface, fields={**surface.fields, "label": str(label)})
-    if not found:
+        surfaces[label] = replace(surface, fields={**surface.fields, "label": str(label)})
+    if not surfaces:
         raise InsufficientDataError("labels: expected voxels other than 0, got none")
-    return found
+    return surfaces
 
 
 def known_voxels(volume: Volume) -> BoolArray:
@@ -139,9 +139,9 @@ def smoothed(surface: Surface, passes: int) -> Surface:
     """
     n, edges = len(surface.vertices_mm), surface.triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     both = np.concatenate([edges, edges[:, ::-1]])
-    beside = coo_array((np.ones(len(both)), both.T), shape=(n, n)).tocsr()
-    beside.data[:] = 1.0
-    mean = diags_array(1.0 / np.maximum(beside.sum(axis=1), 1.0)) @ beside
+    neighbours = coo_array((np.ones(len(both)), both.T), shape=(n, n)).tocsr()
+    neighbours.data[:] = 1.0
+    mean = diags_array(1.0 / np.maximum(neighbours.sum(axis=1), 1.0)) @ neighbours
     free = ~np.isin(np.arange(n), surface.open_edges())[:, None]
     vertices = surface.vertices_mm
     for _ in range(passes):

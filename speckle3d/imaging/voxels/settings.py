@@ -57,17 +57,17 @@ class CompoundingSettings(BaseModel):
 
     @model_validator(mode="before")
     @classmethod
-    def _amplitudes_are_float32(cls, given: Any) -> Any:
+    def _amplitudes_are_float32(cls, values: Any) -> Any:
         """Echo amplitudes are no grey levels of one byte: unless a type is given, they are float32."""
-        if isinstance(given, dict) and given.get("levels") == "linear":
-            return {"voxel_type": "float32", **given}
-        return given
+        if isinstance(values, dict) and values.get("levels") == "linear":
+            return {"voxel_type": "float32", **values}
+        return values
 
     @field_validator("levels")
     @classmethod
-    def _levels_fit(cls, levels: str, known: ValidationInfo) -> str:
+    def _levels_fit(cls, levels: str, info: ValidationInfo) -> str:
         """Refuse amplitudes in whole numbers: those of B-mode are below one, and few of RF fit in a byte."""
-        kind = known.data.get("voxel_type", "float32")
+        kind = info.data.get("voxel_type", "float32")
         if levels == "linear" and kind != "float32":
             raise PydanticCustomError(
                 "levels", "expected voxel type float32 with it, got {kind}", {"kind": kind}
