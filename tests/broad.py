@@ -78,13 +78,12 @@ def errors_rad(found_wxyz, true_wxyz, counts, steady=False):
         between = (found * true.inv()).as_quat(scalar_first=True)
         offset = np.angle(np.exp(2j * np.arctan2(between[:, 3], between[:, 0])).mean())
         found = Rotation.from_rotvec([0.0, 0.0, -offset]) * found
-    w, x, y, z = (found * true.inv()).as_quat(scalar_first=True, canonical=True).T
-    whole = np.hypot(w, z)
+    between = found * true.inv()
+    w, _, _, z = between.as_quat(scalar_first=True, canonical=True).T
+    heading = 2 * np.arctan2(z, w)
     # The turn about a horizontal axis that is left when the turn about up is taken away.
-    tilt_xy = np.column_stack([w * x + z * y, w * y - z * x]) / np.maximum(whole, 1e-12)[:, None]
-    sine = np.hypot(x, y)
-    length = 2 * np.arcsin(np.clip(sine, 0, 1)) / np.maximum(sine, 1e-12)
-    return Errors(2 * np.arccos(np.clip(w, 0, 1)), 2 * np.arctan2(z, w), tilt_xy * length[:, None])
+    level = Rotation.from_rotvec(np.outer(heading, [0.0, 0.0, -1.0])) * between
+    return Errors(between.magnitude(), heading, level.as_rotvec()[:, :2])
 
 
 def counting(true_wxyz, moving):

@@ -84,22 +84,17 @@ def linear_array_response(points_mm, frequency_hz, *, step_mm, pitch_mm, element
     z = ((np.arange(round(height_mm / step_mm)) + 0.5) / round(height_mm / step_mm) - 0.5) * height_mm
     lens_path = lens_focus_mm - np.sqrt(lens_focus_mm**2 + z**2)
     k = 2e-3 * np.pi * np.asarray(frequency_hz) / speed_m_s
-    phase, weight = [], []
+    turned = []
     for focus, width in zip(focus_mm, widths_mm, strict=True):
-        phase.append(focus - np.sqrt(focus**2 + element**2))
         hump = edge_weight + (1 - edge_weight) * np.cos(np.pi * element / width) ** 2
-        weight.append(np.where(np.abs(element) <= width / 2, hump, 0))
-    out = np.zeros((len(points_mm), len(k)), complex)
-    for n, (px, py, pz) in enumerate(points_mm):
-        r = np.sqrt((px - x[:, :, None]) ** 2 + py**2 + (pz - z) ** 2)
-        for j, kj in enumerate(k):
-            per_element_field = (py / r**2 * np.exp(-1j * kj * (r + lens_path))).sum(axis=(1, 2))
-            sent, heard = (
-                (w * np.exp(-1j * kj * p) * per_element_field).sum()
-                for w, p in zip(weight, phase, strict=True)
-            )
-            out[n, j] = sent * heard
-    return out
+        weight = np.where(np.abs(element) <= width / 2, hump, 0)
+        turned.append(weight[:, None] * np.exp(-1j * np.outer(focus - np.sqrt(focus**2 + element**2), k)))
+    out = []
+    for px, py, pz in points_mm:
+        r = np.sqrt((px - x[:, :, None]) ** 2 + py**2 + (pz - z) ** 2)[..., None]
+        field = (py / r**2 * np.exp(-1j * k * (r + lens_path[:, None]))).sum(axis=(1, 2))
+        out.append(np.prod([(each * field).sum(axis=0) for each in turned], axis=0))
+    return np.array(out)
 
 
 def scatter_echoes(position_mm, amplitude, vector_mm, field, reach, curvature, grid, sample_mm,

@@ -16,7 +16,6 @@ from speckle3d.core.volume import Volume
 from speckle3d.io.plus.write import write_sequence
 from speckle3d.io.sweep_writer import attach_orientation, write_sweep
 from speckle3d.io.voxels.volume_writer import write_volume
-from speckle3d.study.figures import new_figure, save_figure
 from speckle3d.study.results import write_texts
 from xsens.live.recording import RawFile
 from xsens.logs.read import parse_stream
@@ -25,7 +24,6 @@ from xsens.logs.textlogs import write_csv
 FULL = "File too large"
 """What the system says where no file of a process may grow; of a disk, "No space left on device"."""
 SWEEP = sweep_examples.rf_sweep()
-VALUES = np.random.default_rng(0).random((99, 50), np.float32)
 VOLUME = Volume(
     np.random.default_rng(0).integers(0, 255, (20, 15, 10)).astype(np.uint8),
     (0.5, 0.5, 1.0),
@@ -44,18 +42,11 @@ def limited(size):
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
-def figure():
-    drawn = new_figure(4, 3)
-    drawn.subplots().plot(VALUES[0])
-    return drawn
-
-
 WRITERS = {
     "sweep.h5": lambda path: write_sweep(path, SWEEP),
     "sequence.mha": lambda path: write_sequence(path, SWEEP, compressed=False),
     "attached.h5": lambda path: attach_orientation(path, SWEEP.orientation),
     "volume.nii.gz": lambda path: write_volume(path, VOLUME),
-    "figure.png": lambda path: save_figure(figure(), path),
     "summary.json": lambda path: write_texts(path.parent, {path.name: "0123456789" * 500}),
     "log.csv": lambda path: write_csv(
         path, parse_stream(b"".join(imu_logs.mtdata2_messages(imu_logs.samples())))

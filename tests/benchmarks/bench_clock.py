@@ -25,7 +25,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--scans", type=int, default=3)
     parser.add_argument("--frames", type=int, default=100)
-    options = parsed(parser, scans=1, frames=40)
+    options = parsed(parser, scans=1, frames=60)
     for seed in range(FIRST_SEED, FIRST_SEED + options.scans):
         frames = {"frames": options.frames, "length_mm": options.frames / 5.0}
         settings = SimulationSettings(preset="reversal", seed=seed, vectors=32, samples=1909, **frames)

@@ -8,7 +8,6 @@ kept. A ``!`` marks a target that is missed; peers are given in the unit of the 
 import argparse
 import os
 import platform
-import re
 import sys
 from functools import cache
 from importlib import import_module
@@ -31,13 +30,6 @@ from speckle3d.simulation.settings import SimulationSettings
 SWEEP = SimulationSettings(preset="phantom", seed=2001, length_mm=7.5, frames=60)
 
 
-def machine():
-    """Kind of processor, and how many of its cores are used."""
-    file = Path("/proc/cpuinfo")
-    name = re.search(r"model name\s*: (.*)", file.read_text() if file.is_file() else "")
-    return f"{name[1] if name else platform.processor()}, {cores()} cores, {platform.system()}"
-
-
 def main():
     curves_file = DEFAULT / "curves-of-bench.h5"
 
@@ -50,12 +42,12 @@ def main():
         "tracking": lambda: ([simulated(SWEEP), long(commands.FRAMES[0])], curves()),
         "patches": lambda: (simulated(SWEEP),),
     }
-    parts = ("tracking", "patches", "sensors", "simulation", "commands", "voxels", "files", "memory")
+    parts = ("tracking", "patches", "sensors", "commands", "voxels", "files", "memory")
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--runs", type=int, default=7)
     parser.add_argument("--only", nargs="*", choices=parts, default=parts)
     options = parsed(parser, runs=1, only=["commands"])
-    print(machine(), flush=True)
+    print(f"{platform.machine()}, {cores()} cores, {platform.system()}", flush=True)
     table = []
     for part in options.only:
         if part == "memory":

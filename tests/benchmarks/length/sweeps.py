@@ -143,17 +143,18 @@ def outcomes(name, seed, cache):
 
 
 def figures(found):
-    """Text of one mode's errors."""
-    refused = [each for each in found if isinstance(each, str)]
+    """Text of errors: tuples of length, tilt and claim, %, degrees and %, or words of a refusal."""
     errors = np.abs([each for each in found if not isinstance(each, str)])
+    text = f"{len(found) - len(errors)} of {len(found)} refused"
     if not len(errors):
-        return f"all refused; {'; '.join(refused)}"
+        return text
     error, tilt, claimed = errors.T
+    inside = [np.mean(error < limit * claimed) for limit in (1.0, 1.96)]
     wrong = int(((error > 3 * claimed) & (error > 3.0)).sum())
     return (
-        f"length {np.median(error):.2f} % (90th {np.percentile(error, 90):.2f}), claimed "
-        f"{np.median(claimed):.1f} %; tilt {np.median(tilt):.2f} deg; {wrong} confident and wrong; "
-        f"{len(refused)} refused {'; '.join(refused)}"
+        f"{text}; length {np.median(error):.2f} % (90th {np.percentile(error, 90):.2f}), claimed "
+        f"{np.median(claimed):.2f} %, 68 %: {inside[0]:.0%}, 95 %: {inside[1]:.0%}; {wrong} confident and "
+        f"wrong; tilt {np.median(tilt):.2f} deg"
     )
 
 

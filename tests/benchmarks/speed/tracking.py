@@ -12,8 +12,6 @@ from speckle3d.pipeline import track
 from speed.rows import Row, timed
 
 TARGETS = {1: 80.0, 2: 150.0}
-MOST_TIMES = 5.0
-"""A frame's time over its transforms'."""
 FRAMES = 20
 
 
@@ -38,19 +36,7 @@ def rows(paths, curves, runs):
                 cores=ours.cores,
             )
         )
-    made += [ratio(row) for row in made[1:]]
     return made
-
-
-def ratio(row):
-    """Time of a frame over that of its transforms on one core."""
-    return Row(
-        f"{row.what}: a frame's time over its transforms'",
-        row.peer_value / row.value,
-        "",
-        target=MOST_TIMES,
-        falling=True,
-    )
 
 
 def transforms_per_second(sweep, runs):
