@@ -7,9 +7,8 @@ that lies inside: no voxels, no splatting, and no model of the estimator.
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform
+from drifting import hand_sweep
 
-from speckle3d.core.geometry import rotation_from_fixed_angles
 from speckle3d.core.grid import ImageGrid
 
 OUTSIDE, INSIDE = 40.0, 200.0
@@ -49,16 +48,10 @@ class Phantom:
         return [self.image(pose) for pose in poses]
 
 
-def curved_path(frames, length_mm, seed=0):
-    """A freehand sweep: bends, wanders, tilts, yaws and rolls, at an uneven speed."""
-    rng = np.random.default_rng(seed)
-    t = np.linspace(0.0, 1.0, frames)
-    phase = rng.uniform(0, 2 * np.pi, 6)
-    waves = [np.sin(2 * np.pi * (0.6 + 0.3 * k) * t + phase[k]) for k in range(6)]
-    uneven = t + 0.04 * np.sin(4 * np.pi * t) / (4 * np.pi)
-    places = np.column_stack([0.8 * waves[0], 0.5 * waves[1], length_mm * uneven])
-    roll, yaw, tilt = (np.deg2rad(4.0) * wave for wave in waves[3:])
-    return RigidTransform.from_components(places, rotation_from_fixed_angles(roll / 2, yaw, tilt))
+def by_hand(frames, length_mm, seed=0):
+    """Poses of a hand's sweep from where its first image lies."""
+    poses = hand_sweep(np.random.default_rng(seed), frames, length_mm)
+    return poses[0].inv() * poses
 
 
 def voxel_volume(volume, ball, step_mm):

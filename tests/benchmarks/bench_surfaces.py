@@ -1,4 +1,4 @@
-"""Spheres, cut by formula along a curved freehand path, compounded in three ways at known poses.
+"""Spheres, cut by formula along a path by hand, compounded in three ways at known poses.
 
 Run: ``python tests/benchmarks/bench_surfaces.py``.
 """
@@ -12,7 +12,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import numpy as np
-from digital_phantom import LEVEL, Ball, Phantom, curved_path, voxel_volume
+from digital_phantom import LEVEL, Ball, Phantom, by_hand, voxel_volume
 from options import parsed
 
 from speckle3d.core.grid import ImageGrid
@@ -47,7 +47,7 @@ def main():
     options = parsed(parser, balls=1, frames=110)
     balls = BALLS[: options.balls]
     phantom = Phantom(balls, ImageGrid(200, 230, 0.1, 0.1))
-    poses = curved_path(options.frames, 0.1 * options.frames)
+    poses = by_hand(options.frames, 0.1 * options.frames)
     images, grid = phantom.images(poses), phantom.grid
     voxel_grid = grid_around(grid, poses, STEP_MM)
     print(f"known poses; voxels of {STEP_MM} mm, images 0.1 mm apart with pixels of 0.1 mm")

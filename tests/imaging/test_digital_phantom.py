@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from digital_phantom import LEVEL, Ball, Phantom, curved_path, voxel_volume
+from digital_phantom import LEVEL, Ball, Phantom, by_hand, voxel_volume
 
 from speckle3d.core.grid import ImageGrid
 from speckle3d.imaging.measures.surface import largest_part, surface_of
@@ -14,7 +14,7 @@ STEP_MM = 0.25
 
 def test_a_sphere_swept_by_hand_has_its_size():
     body = Ball((6.0, 6.0, 6.0), 3.0)
-    poses = curved_path(120, 12.0, seed=1)
+    poses = by_hand(120, 12.0, seed=1)
     images = [np.rint(image).astype(np.uint8) for image in Phantom((body,), GRID).images(poses)]
     voxels = compound(images, GRID, poses, STEP_MM)
     surface = largest_part(surface_of(voxels, LEVEL))
