@@ -94,6 +94,11 @@ def late(sweep):
     return replace(sweep, **moved)
 
 
+def in_metres(read):
+    place_mm = read.translation_mm
+    return read if place_mm is None else replace(read, translation_mm=1e-3 * place_mm)
+
+
 def enlarged(solution):
     return replace(solution, chain=replace(solution.chain, pixel_mm=1.03 * solution.chain.pixel_mm))
 
@@ -153,7 +158,7 @@ MUTANTS = {
     ),
     "mounting in metres": Mutant(
         "speckle3d.io.calibrations:read_calibration",
-        returned(lambda read: replace(read, translation_mm=1e-3 * read.translation_mm)),
+        returned(in_metres),
         "io/test_calibrations.py",
     ),
     "wrong lines weigh as much": Mutant(

@@ -1,5 +1,6 @@
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import sweep_examples
 from calibration_files import made
@@ -19,7 +20,8 @@ def test_both_sensors_are_calibrated_from_their_files_and_the_files_told(path):
     turn = path.with_name("turn.h5")
     write_calibration(turn, made("orientation"))
     sweep, held = apply_calibrations(sweep_examples.rf_sweep(), [path, turn])
-    assert (sweep.tracker.sensor_from_image.rotation.inv() * made().rotation).magnitude() < 1e-12
+    off = sweep.tracker.sensor_from_image.inv() * made().sensor_from_image
+    np.testing.assert_allclose(off.as_matrix(), np.eye(4), atol=1e-9)
     assert (sweep.orientation.sensor_from_image.inv() * made().rotation).magnitude() < 1e-12
     assert [(one.sensor, one.path, one.sha256) for one in held] == [
         ("tracker", str(path), sha256_of(path)),
