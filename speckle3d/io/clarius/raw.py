@@ -14,11 +14,11 @@ from __future__ import annotations
 
 import struct
 import zlib
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from speckle3d.core.arrays import ComplexArray
 from speckle3d.core.errors import FileError, InvalidInputError
@@ -30,79 +30,47 @@ from speckle3d.io.hdf5 import reading
 
 HEADER = struct.Struct("<5I")
 _MAGIC = b"\x89LZO\x00\r\n\x1a\n"
-_SAMPLES = {"RF": ("<i2", 1, np.int16), "IQ": ("<i2", 2, np.complex64), "envelope": ("u1", 1, np.uint8)}
+SAMPLES = {"RF": ("<i2", 1, np.int16), "IQ": ("<i2", 2, np.complex64), "envelope": ("u1", 1, np.uint8)}
 """By kind: type of the numbers in the file, how many make a sample, and type of the samples."""
 
 
-@dataclass(frozen=True)
-class ClariusFile:
-    """Frames of a raw file.
-
-    Attributes
-    ----------
-    size : tuple of int
-        Frames, lines and samples.
-    turns : ndarray, shape (sample,), optional
-        Complex factors of the samples, the same in all frames.
-    """
-
-    member: Member
-    kind: str
-    size: tuple[int, int, int]
-    turns: ComplexArray | None = None
-
-    @property
-    def dtype(self) -> np.dtype[Any]:
-        """Type of the frames."""
-        return np.dtype(_SAMPLES[self.kind][2])
-
-    def records(self) -> Any:
-        """Frames as they lie in the file: ``time`` in ns and ``samples``, shape (line, sample, part).
-
-        Raises
-        ------
-        FileError
-            If the file ends early.
-        """
-        dtype, parts, _ = _SAMPLES[self.kind]
-        held, (count, lines, samples) = _content(self.member), self.size
-        with reading(self.member.where):  # of more samples than memory has places for
-            record = np.dtype([("time", "<u8"), ("samples", dtype, (lines, samples, parts))])
-        whole = (len(held) - HEADER.size) // record.itemsize
-        if whole < count:
-            raise FileError(f"{self.member.where}: ends early: {whole} of {count} frames")
-        return np.frombuffer(held, record, count, HEADER.size)
-
-    def __call__(self) -> ReadFrame:
-        """Map or unpack the file."""
-        samples = self.records()["samples"]
-
-        def frame(i: int) -> Any:
-            parts = samples[i]
-            echoes = (parts.astype(np.float32).view(np.complex64) if self.kind == "IQ" else parts)[..., 0]
-            return echoes if self.turns is None else echoes * self.turns
-
-        return frame
-
-
-def open_raw(member: Member, said: Description) -> ClariusFile:
-    """Open a raw file.
+def open_raw(member: Member, said: Description) -> npt.NDArray[Any]:
+    """Frames as they lie in a raw file: ``time`` in ns and ``samples``, shape (line, sample, part).
 
     Raises
     ------
+    FileError
+        If the file ends early.
     InvalidInputError
         If its header contradicts the yml.
     """
-    dtype, parts, _ = _SAMPLES[said.kind]
-    size = said.frames, said.size.lines, said.size.samples
-    expected = (*size, parts * np.dtype(dtype).itemsize)
-    got = HEADER.unpack(bytes(_content(member)[: HEADER.size]).ljust(HEADER.size, b"\0"))[1:]
+    held, (dtype, parts, _) = _content(member), SAMPLES[said.kind]
+    size = said.size.lines, said.size.samples
+    expected = (said.frames, *size, parts * np.dtype(dtype).itemsize)
+    got = HEADER.unpack(bytes(held[: HEADER.size]).ljust(HEADER.size, b"\0"))[1:]
     if got != expected or 0 in got:
         raise InvalidInputError(
             f"{member.where}: header: expected frames, lines, samples and bytes of a sample of {said.kind} "
             f"as in the yml, {expected}, got {got}"
         )
-    return ClariusFile(member, said.kind, size)
+    with reading(member.where):  # of more samples than memory has places for
+        record = np.dtype([("time", "<u8"), ("samples", dtype, (*size, parts))])
+    whole = (len(held) - HEADER.size) // record.itemsize
+    if whole < said.frames:
+        raise FileError(f"{member.where}: ends early: {whole} of {said.frames} frames")
+    return np.frombuffer(held, record, said.frames, HEADER.size)
+
+
+def open_frames(member: Member, said: Description, turns: ComplexArray | None = None) -> ReadFrame:
+    """Map or unpack a raw file, whose I/Q are multiplied by `turns`, shape (sample,)."""
+    samples = open_raw(member, said)["samples"]
+
+    def frame(i: int) -> Any:
+        parts = samples[i]
+        echoes = (parts.astype(np.float32).view(np.complex64) if said.kind == "IQ" else parts)[..., 0]
+        return echoes if turns is None else echoes * turns
+
+    return frame
 
 
 def _content(member: Member) -> Any:

@@ -25,7 +25,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -36,7 +36,7 @@ from speckle3d.core.errors import FileError, InvalidInputError, naming
 from speckle3d.core.printable import printable
 from speckle3d.io.clarius.imu import SensorSamples, read_samples
 from speckle3d.io.clarius.package import find_files
-from speckle3d.io.clarius.raw import open_raw
+from speckle3d.io.clarius.raw import SAMPLES, open_frames, open_raw
 from speckle3d.io.clarius.sidecars import Description, parsed
 from speckle3d.io.clarius.spectrum import band_hz
 from speckle3d.io.frames import FileFrames
@@ -87,7 +87,8 @@ def open_package(path: Path, settings: ImportSettings) -> Facts:
     kind = min(files.raw, key=lambda kind: _ORDER.index(described[kind].kind))
     yield "sweep is made from", kind, ""
     said = described[kind]
-    file = open_raw(files.raw[kind], said)
+    member, turns = files.raw[kind], None
+    records = open_raw(member, said)
     with naming(files.yml[kind].where):
         elements = _elements(said)
         per_line = step_of(elements, "lines (packets of a Doppler mode are no image): rx element")
@@ -127,14 +128,15 @@ def open_package(path: Path, settings: ImportSettings) -> Facts:
                 # is not documented. Left as they are, simulated I/Q shifted down by 9 to 6 MHz gave lengths
                 # 10 % off, and turned back 0.001 % from those of RF.
                 cycles = cumulative_trapezoid(slid_hz - middle_hz, initial=0) / rate_hz
-                file = replace(file, turns=np.exp(2j * np.pi * cycles))
+                turns = np.exp(2j * np.pi * cycles)
                 remarks.append(
                     f"demodulation frequency from its yml: {shallow_hz / 1e6:g} to {deep_hz / 1e6:g} MHz "
                     f"over {filter_mm:g} mm, turned to that of the line's middle"
                 )
             shift_hz = middle_hz if shift_hz is None else shift_hz
-    narrow = np.int16 if said.kind == "IQ" and file.turns is None else None
-    frames = FileFrames(file.member.path, file, file.size, file.dtype, narrow)
+    narrow = np.int16 if said.kind == "IQ" and turns is None else None
+    source, shape = partial(open_frames, member, said, turns), records["samples"].shape[:3]
+    frames = FileFrames(member.path, source, shape, SAMPLES[said.kind][2], narrow)
     sent_hz, band = settings.centre_frequency_hz or said.sent_hz, None
     is_known = said.kind == "RF" or (said.kind == "IQ" and shift_hz is not None)
     if settings.bandwidth_hz is None and sent_hz and is_known:
@@ -150,7 +152,7 @@ def open_package(path: Path, settings: ImportSettings) -> Facts:
         settings,
         frames,
         values,
-        time_s=file.records()["time"] / 1e9,
+        time_s=records["time"] / 1e9,
         orientation=None if sensor is None else sensor.orientation,
         # In one spelling, so that curves and calibrations of a probe are found to be of it.
         probe=f"Clarius {_model(probe)}" if _model(probe) in ELEMENT_PITCH_MM else probe,

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
+from functools import partial
+from typing import Any, TypeAlias
 
 import h5py
 import numpy as np
@@ -16,6 +17,9 @@ from speckle3d.core.printable import printable
 from speckle3d.io.frames import FileFrames, HDF5Slices
 from speckle3d.io.hdf5 import has_member, locate, read_checked
 from speckle3d.io.recordings import Value, step_of
+
+Turn: TypeAlias = Callable[..., npt.NDArray[Any]]
+"""Makes a frame (vector, sample) of slices of data sets."""
 
 ENVELOPE_RANGE_DB = 80.0
 """Of grey levels made here unless another is given: 0.31 dB a level, while speckle itself spreads by 5.6
@@ -98,11 +102,12 @@ def text_of(value: Any) -> str:
     return printable(first.decode("utf-8", "replace") if isinstance(first, bytes) else str(first)).strip("\0")
 
 
-@dataclass(frozen=True)
-class Grid:
-    """Turns numbers of a frame, in one array or in real and imaginary parts, into (vector, sample).
+def frame_of(
+    *parts: npt.NDArray[Any], shape: tuple[int, ...], across: bool = False, pairs: bool = False
+) -> npt.NDArray[Any]:
+    """Turn numbers of a frame, in one array or in real and imaginary parts, into (vector, sample).
 
-    Attributes
+    Parameters
     ----------
     shape : tuple of int
         Vectors and samples of a frame.
@@ -111,41 +116,24 @@ class Grid:
     pairs : bool
         Whether the last axis is I and Q.
     """
-
-    shape: tuple[int, ...]
-    across: bool = False
-    pairs: bool = False
-
-    def __call__(self, *parts: npt.NDArray[Any]) -> npt.NDArray[Any]:
-        """Make a frame."""
-        if self.pairs:
-            parts = parts[0][..., 0], parts[0][..., 1]
-        elif parts[0].dtype.names:
-            parts = parts[0]["real"], parts[0]["imag"]
-        places = self.shape[::-1] if self.across else self.shape
-        frame, *imaginary = (
-            part.reshape(places).T if self.across else part.reshape(places) for part in parts
-        )
-        return frame + np.complex64(1j) * imaginary[0] if imaginary else frame
+    if pairs:
+        parts = parts[0][..., 0], parts[0][..., 1]
+    elif parts[0].dtype.names:
+        parts = parts[0]["real"], parts[0]["imag"]
+    frame, *imaginary = (part.reshape(shape[::-1]).T if across else part.reshape(shape) for part in parts)
+    return frame + np.complex64(1j) * imaginary[0] if imaginary else frame
 
 
-@dataclass(frozen=True)
-class Levels:
-    """Turns decibels, or an echo's amplitude, into grey levels, 255 at `top`, 0 that range below."""
-
-    grid: Callable[..., npt.NDArray[Any]]
-    decibels: bool
-    top: float
-    dynamic_range_db: float
-
-    def __call__(self, *parts: npt.NDArray[Any]) -> npt.NDArray[Any]:
-        """Make a frame."""
-        values = self.grid(*parts).astype(np.float64)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            below = values - self.top if self.decibels else 20.0 * np.log10(values / self.top)
-        if np.isnan(below).any():
-            raise InvalidInputError("expected echoes' amplitudes, got NaN or a negative one")
-        return np.rint(np.clip(255.0 * (1.0 + below / self.dynamic_range_db), 0.0, 255.0)).astype(np.uint8)
+def grey_levels(
+    *parts: npt.NDArray[Any], turn: Turn, decibels: bool, top: float, dynamic_range_db: float
+) -> npt.NDArray[Any]:
+    """Turn decibels, or an echo's amplitude, into grey levels, 255 at `top`, 0 that range below."""
+    values = turn(*parts).astype(np.float64)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        below = values - top if decibels else 20.0 * np.log10(values / top)
+    if np.isnan(below).any():
+        raise InvalidInputError("expected echoes' amplitudes, got NaN or a negative one")
+    return np.rint(np.clip(255.0 * (1.0 + below / dynamic_range_db), 0.0, 255.0)).astype(np.uint8)
 
 
 def grey_frames(
@@ -158,10 +146,10 @@ def grey_frames(
     InvalidInputError
         If there is no echo at all.
     """
-    read = source()
+    read, span = source(), dynamic_range_db or ENVELOPE_RANGE_DB
     top = max((float(read(i).max()) for i in range(shape[0])), default=0.0)
     if not np.isfinite(top) or not (decibels or top > 0):
-        raise InvalidInputError(f"{source.path}: expected echoes, got amplitudes up to {top:g}")
-    span = dynamic_range_db or ENVELOPE_RANGE_DB
-    frames = replace(source, turn=Levels(source.turn, decibels, top, span)).frames(shape, np.uint8)
+        raise InvalidInputError(f"expected echoes, got amplitudes up to {top:g}")
+    turn = partial(grey_levels, turn=source.turn, decibels=decibels, top=top, dynamic_range_db=span)
+    frames = replace(source, turn=turn).frames(shape, np.uint8)
     return frames, Value(span, f"of grey levels made here below {top:g}")

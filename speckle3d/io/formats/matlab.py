@@ -21,7 +21,6 @@ from __future__ import annotations
 import re
 import warnings
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -35,7 +34,7 @@ from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.geometry import require_finite
 from speckle3d.core.printable import printable
 from speckle3d.core.sweep import Frames
-from speckle3d.io.formats.hdf5_values import Grid, text_of
+from speckle3d.io.formats.hdf5_values import Turn, frame_of, text_of
 from speckle3d.io.frames import HDF5Slices
 from speckle3d.io.hdf5 import SIGNATURE, find_member, open_hdf5, reading
 from speckle3d.io.import_settings import ImportSettings
@@ -186,18 +185,12 @@ def _class(node: h5py.Dataset) -> str:
     return text_of(node.attrs.get("MATLAB_class"))
 
 
-@dataclass(frozen=True)
-class _Greys:
-    """Turns numbers into grey levels, refused where they are none."""
-
-    grid: Grid
-
-    def __call__(self, *parts: npt.NDArray[Any]) -> npt.NDArray[Any]:
-        """Make a frame."""
-        frame = self.grid(*parts)
-        if not np.isin(frame, np.arange(256)).all():
-            raise InvalidInputError("bmode: expected grey levels, whole numbers from 0 to 255, got others")
-        return frame.astype(np.uint8)
+def _greys(*parts: npt.NDArray[Any], turn: Turn) -> npt.NDArray[Any]:
+    """Turn numbers into grey levels, refused where they are none."""
+    frame = turn(*parts)
+    if not np.isin(frame, np.arange(256)).all():
+        raise InvalidInputError("bmode: expected grey levels, whole numbers from 0 to 255, got others")
+    return frame.astype(np.uint8)
 
 
 def _axes(text: str, node: Any) -> tuple[dict[str, int], list[str]]:
@@ -221,8 +214,10 @@ def _frames(
     is_short = nodes[0].dtype in (np.int8, np.uint8, np.int16)
     dtypes: dict[str, Any] = {"bmode": np.uint8, "rf": np.int16 if is_short else np.float32}
     dtype = dtypes.get(data[0], np.complex64)
-    grid = Grid(shape[1:], [name for name in names if name in ("vector", "sample")][-1] == "vector")
-    turn = _Greys(grid) if data == ("bmode",) else grid
+    across = [name for name in names if name in ("vector", "sample")][-1] == "vector"
+    turn = partial(frame_of, shape=shape[1:], across=across)
+    if data == ("bmode",):
+        turn = partial(_greys, turn=turn)
     axis = names.index("frame") if "frame" in names else None
     if isinstance(nodes[0], h5py.Dataset):
         return HDF5Slices(path, tuple(node.name for node in nodes), turn, axis).frames(shape, dtype)

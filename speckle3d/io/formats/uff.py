@@ -17,6 +17,7 @@ References
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import h5py
@@ -26,10 +27,10 @@ from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.printable import printable
 from speckle3d.io.carrier import demodulation_of
 from speckle3d.io.formats.hdf5_values import (
-    Grid,
     band_about,
     fan_values,
     flat,
+    frame_of,
     grey_frames,
     single,
     text_of,
@@ -101,7 +102,7 @@ def _recording(path: Path, settings: ImportSettings, file: h5py.File) -> Facts:
     for other in (other for other, kind in objects.items() if kind == _CHANNELS):
         values |= values_of(file, {"speed_of_sound_m_s": f"{other}/sound_speed"})
     shape = count, lines, samples
-    source = HDF5Slices(path, parts, Grid(shape[1:]), axis)
+    source = HDF5Slices(path, parts, partial(frame_of, shape=shape[1:]), axis)
     frames = source.frames(shape, np.complex64 if is_complex else np.float32)
     if is_complex and count and settings.demodulation_frequency_hz is None:
         _require_phase(frames, values, settings, modulation_hz)

@@ -13,7 +13,7 @@ they are the image's columns and rows, and a row lies together.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -38,19 +38,10 @@ _BMODE, _LAST_TYPE = 4, 2**19
 _SUFFIXES = (".rf", ".bpr", ".b8", ".b32", ".mpr", ".drf", ".pw", ".crf", ".col", ".cvv", ".el", ".gps")
 
 
-@dataclass(frozen=True)
-class _File:
-    """Maps frames that lie one after the other, each with its number before it or not."""
-
-    path: Path
-    record: np.dtype[Any]
-    count: int
-    is_image: bool
-
-    def __call__(self) -> ReadFrame:
-        """Map the file."""
-        pixels = np.memmap(self.path, self.record, "r", _HEADER.itemsize, (self.count,))["pixels"]
-        return lambda i: pixels[i].T if self.is_image else pixels[i]
+def _mapped(path: Path, record: np.dtype[Any], count: int, is_image: bool) -> ReadFrame:
+    """Map frames that lie one after the other, each with its number before it or not."""
+    pixels = np.memmap(path, record, "r", _HEADER.itemsize, (count,))["pixels"]
+    return lambda i: pixels[i].T if is_image else pixels[i]
 
 
 def _header(content: bytes) -> Any:
@@ -98,7 +89,7 @@ def open_ultrasonix(path: Path, settings: ImportSettings) -> Facts:
     is_image, dtype = header["kind"] == _BMODE, np.dtype("<i2" if bits == 16 else "u1")
     shape = (height, width) if is_image else (width, height)
     tag = [("tag", "<i4")] if is_tagged else []
-    source = _File(path, np.dtype([*tag, ("pixels", dtype, shape)]), count, is_image)
+    source = partial(_mapped, path, np.dtype([*tag, ("pixels", dtype, shape)]), count, is_image)
     frames = FileFrames(path, source, (count, width, height), dtype.newbyteorder("="))
     return Recording(path, settings, frames, values, assumptions=() if is_image else ("parallel lines",))
 

@@ -19,6 +19,7 @@ References
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import h5py
@@ -31,9 +32,9 @@ from speckle3d.core.printable import printable
 from speckle3d.core.sweep import Tracker
 from speckle3d.io.carrier import demodulation_of
 from speckle3d.io.formats.hdf5_values import (
-    Grid,
     band_about,
     fan_values,
+    frame_of,
     grey_frames,
     single,
     text_of,
@@ -128,7 +129,9 @@ def _recording(path: Path, settings: ImportSettings, file: h5py.File) -> Facts:
         values |= numbers
     lines, samples = sizes[1:] if x_first else sizes[:0:-1]
     shape, is_complex = (sizes[0], lines, samples), channels == (2,)
-    source = HDF5Slices(path, (str(node.name),), Grid((lines, samples), not x_first, is_complex))
+    source = HDF5Slices(
+        path, (str(node.name),), partial(frame_of, shape=shape[1:], across=not x_first, pairs=is_complex)
+    )
     if is_beamformed or is_image:
         frames = source.frames(shape, np.uint8 if is_image else np.complex64 if is_complex else np.float32)
     else:
