@@ -141,26 +141,26 @@ def read_samples(member: Member) -> SensorSamples:
             f"the accelerometer's median norm is {np.median(norms):.3g} g, and 1 g is felt at rest: its unit "
             "or scale is another than assumed"
         )
-    turned, sign, fault = None, -1.0, "is missing"
-    rows: list[Row] = [("sensor, longest pause", f"{np.diff(time_s).max(initial=0.0):.3f}", "s")]
+    turned, sign, fault, rows = None, -1.0, "is missing", list[Row]()
     if wanted[9:].all():
         turned = Rotation.from_quat(wxyz, scalar_first=True)
         along = turned.apply(measured_g)[:, 2] / norms
         sign = 1.0 if along.mean() >= 0 else -1.0
         off = np.rad2deg(np.sqrt(np.mean(np.arccos(np.clip(sign * along, -1.0, 1.0)) ** 2)))
-        rows.append(("quaternion, off the vertical", f"{off:.2f}", "deg RMS"))
+        meaning = "specific force" if sign > 0 else "gravity (against the world's z): negated"
+        rows = [
+            ("quaternion, off the vertical", f"{off:.2f}", "deg RMS"),
+            ("accelerometer taken as", meaning, ""),
+        ]
         if off >= _MOST_OFF_DEG:
             turned, sign, fault = None, -1.0, "does not agree with gravity"
     if turned is None:
-        rows.append(("quaternion", f"{fault}: see `speckle3d imu orient`", ""))
         remarks.append(
             f"the sensor's quaternion {fault}: the sweep has no orientation, which `speckle3d imu orient "
             f"{member.path} --into SWEEP.h5` finds"
         )
     else:
-        meaning = "specific force" if sign > 0 else "gravity (against the world's z): negated"
         rows.append(("quaternion", f"{MEANING} (checked against the accelerometer)", ""))
-        rows.append(("accelerometer taken as", meaning, ""))
     force = sign * G_M_S2 * measured_g
     field = magnetometer if wanted[6:9].all() else None
     return SensorSamples(time_s, force, gyroscope, field, turned, rows, remarks)

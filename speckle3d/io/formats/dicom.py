@@ -12,7 +12,7 @@ import warnings
 from bisect import bisect
 from collections.abc import Generator, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +34,7 @@ FORMAT = "DICOM"
 _MARK, _MARK_BYTE = b"DICM", 128
 _TISSUE, _CM, _POLAR = [1.0, 1.0], [3.0, 3.0], [12.0, 3.0]
 """Region Spatial Format and Data Type of 2-D tissue; Physical Units of X and Y, cm, or degrees and cm."""
+_KIND = ("RegionSpatialFormat", "RegionDataType")
 _BOX = [f"RegionLocation{end}" for end in ("MinX0", "MinY0", "MaxX1", "MaxY1")]
 _LOSSY_SPREAD = 12
 """Levels by which the colours of a grey pixel may differ after lossy packing; the tint of a colour map is
@@ -55,11 +56,10 @@ _TAGS = (
 """All that is loaded."""
 
 
-@dataclass(frozen=True)
-class DicomFile:
-    """Decodes grey frames of a region, one at a time.
+def _frames(path: Path, part: tuple[slice, slice], inverted: bool, spread: int) -> ReadFrame:
+    """Decode grey frames of a region, (column, row), each from the file anew.
 
-    Attributes
+    Parameters
     ----------
     part : pair of slice
         Rows and columns of the region.
@@ -68,39 +68,22 @@ class DicomFile:
     spread : int
         Levels by which the colours of a grey pixel may differ.
     """
+    from pydicom.pixels.utils import pixel_array
 
-    path: Path
-    part: tuple[slice, slice]
-    inverted: bool
-    spread: int
-
-    def __call__(self) -> ReadFrame:
-        """Open nothing: each frame is read from the file anew."""
-        return self.read
-
-    def read(self, i: int) -> Any:
-        """Decode frame i, shape (column, row)."""
-        from pydicom.pixels.utils import pixel_array
-
-        with _reading(f"{self.path}: frame {i}"), open_regular(self.path) as stream:
-            image = np.asarray(pixel_array(stream, index=i))[self.part]
+    def frame(i: int) -> Any:
+        with _reading(f"{path}: frame {i}"), open_regular(path) as stream:
+            image = np.asarray(pixel_array(stream, index=i))[part]
         if image.ndim == 3:
-            coloured = np.argwhere(np.ptp(image.astype(np.int16), axis=2) > self.spread)
+            coloured = np.argwhere(np.ptp(image.astype(np.int16), axis=2) > spread)
             if len(coloured):
                 raise InvalidInputError(
                     f"expected grey, got {len(coloured)} pixels of a colour, the first at row, column "
                     f"{coloured[0].tolist()} of the region: colour Doppler or an overlay"
                 )
             image = np.rint(image.mean(axis=2)).astype(np.uint8)
-        return 255 - image.T if self.inverted else image.T
+        return 255 - image.T if inverted else image.T
 
-    def is_cut(self, i: int) -> bool:
-        """Whether the file ends before the end of frame i."""
-        try:
-            self.read(i)
-        except FileError:
-            return True
-        return False
+    return frame
 
 
 def open_dicom(path: Path, settings: ImportSettings) -> Facts:
@@ -126,10 +109,19 @@ def open_dicom(path: Path, settings: ImportSettings) -> Facts:
     if is_lossy:
         yield "pixels", "packed with loss, which smooths speckle", ""
     spread = _LOSSY_SPREAD if is_lossy or "YBR" in kind else 0
-    source = DicomFile(path, part, kind == "MONOCHROME1", spread)
-    first = source.read(0)  # what cannot be decoded at all, and colour, is told at once
-    if source.is_cut(count - 1):
-        whole = bisect(range(count), False, key=source.is_cut)
+    source = partial(_frames, path, part, kind == "MONOCHROME1", spread)
+    read = source()
+
+    def is_cut(i: int) -> bool:
+        try:
+            read(i)
+        except FileError:
+            return True
+        return False
+
+    first = read(0)  # what cannot be decoded at all, and colour, is told at once
+    if is_cut(count - 1):
+        whole = bisect(range(count), False, key=is_cut)
         raise FileError(f"{path}: ends early: {whole} of {count} frames")
     times, values["frame_rate_hz"], remarks = _clock(header, count)
     frames = FileFrames(path, source, (count, *first.shape), np.uint8)
@@ -154,21 +146,24 @@ def _place(header: Any) -> Generator[Row, None, tuple[tuple[slice, slice], dict[
         spacing = _numbers(header, "PixelSpacing") if header.get("PixelSpacing") else []
         sizes = zip(("row_spacing_mm", "column_pitch_mm"), spacing, strict=False)
         return (slice(None), slice(None)), {name: Value(mm or None, "PixelSpacing") for name, mm in sizes}
-    kinds = [_numbers(one, "RegionSpatialFormat", "RegionDataType") for one in regions]
-    boxes = [[int(number) for number in _numbers(one, *_BOX)] for one in regions]
-    words = [
-        ("2-D tissue" if kind == _TISSUE else "RegionSpatialFormat {:g}, RegionDataType {:g}".format(*kind))
-        + " (columns {0} to {2}, rows {1} to {3})".format(*box)
-        for kind, box in zip(kinds, boxes, strict=True)
-    ]
-    if kinds.count(_TISSUE) != 1:
-        listed = "; ".join(words)
-        raise InvalidInputError(f"expected one region of 2-D tissue, got {kinds.count(_TISSUE)} of {listed}")
-    i = kinds.index(_TISSUE)
-    region, (left, top, right, bottom) = regions[i], boxes[i]
+    chosen = []
+    for one in regions:
+        kind, box = _numbers(one, *_KIND), [int(number) for number in _numbers(one, *_BOX)]
+        name = (
+            "2-D tissue" if kind == _TISSUE else "RegionSpatialFormat {:g}, RegionDataType {:g}".format(*kind)
+        )
+        place = "columns {0} to {2}, rows {1} to {3}".format(*box)
+        yield f"region {'read' if kind == _TISSUE else 'left out'}", f"{name} ({place})", ""
+        chosen += [(one, box)] if kind == _TISSUE else []
+    if len(chosen) != 1:
+        raise InvalidInputError(f"expected one region of 2-D tissue, got {len(chosen)} of {len(regions)}")
+    region, (left, top, right, bottom) = chosen[0]
     width, height = _numbers(header, "Columns", "Rows")
     if not (0 <= left < right < width and 0 <= top < bottom < height):
-        raise InvalidInputError(f"expected a region within {width:g} x {height:g} pixels, got {words[i]}")
+        raise InvalidInputError(
+            f"expected a region within {width:g} x {height:g} pixels, got columns {left} to {right}, rows "
+            f"{top} to {bottom}"
+        )
     units = _numbers(region, "PhysicalUnitsXDirection", "PhysicalUnitsYDirection")
     x_step, y_cm = _numbers(region, "PhysicalDeltaX", "PhysicalDeltaY")
     if units not in (_CM, _POLAR) or not x_step * y_cm:
@@ -185,8 +180,6 @@ def _place(header: Any) -> Generator[Row, None, tuple[tuple[slice, slice], dict[
     # The first row taken is the region's last where y falls.
     for depth_cm in _along(region, "Y", y_cm, np.array([bottom - top if y_cm < 0 else 0])):
         values["first_sample_depth_mm"] = Value(10.0 * depth_cm, "ReferencePixelY0 and its physical value")
-    yield "region read", words[i], ""
-    yield from (("region left out", other, "") for k, other in enumerate(words) if k != i)
     if x_step < 0:
         yield "columns", "run against the file's x (PhysicalDeltaX below 0): left as shown", ""
     depths = slice(top, bottom + 1)
