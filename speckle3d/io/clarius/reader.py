@@ -111,29 +111,26 @@ def open_package(path: Path, settings: ImportSettings) -> Facts:
         **({} if said.speed_m_s is None else {"speed_of_sound_m_s": Value(said.speed_m_s, "", _OWN)}),
         **spreading,
     }
-    shift_hz = None
-    if said.kind == "IQ":
-        shift_hz, receive = settings.demodulation_frequency_hz, said.receive
-        if receive is not None:
-            shallow_hz, deep_hz, filter_mm = receive
-            start_mm = first_mm or settings.first_sample_depth_mm or 0.0
-            depths_mm = start_mm + spacing_mm * np.arange(said.size.samples)
-            slid_hz = np.interp(depths_mm, [0.0, filter_mm], [shallow_hz, deep_hz])
-            middle_hz = float(np.interp(depths_mm[[0, -1]].mean(), depths_mm, slid_hz))
-            values["demodulation_frequency_hz"] = Value(middle_hz, "of the lines' middle", _OWN)
-            if shift_hz is None and shallow_hz != deep_hz:
-                # The frequency falls along a straight line with depth, as from 11 to 8 MHz; a sweep has one.
-                # Samples are turned as if the oscillator had stayed at that of the line's middle, which takes
-                # its phase to be the integral of its frequency: so it is where a frequency is swept, but it
-                # is not documented. Left as they are, simulated I/Q shifted down by 9 to 6 MHz gave lengths
-                # 10 % off, and turned back 0.001 % from those of RF.
-                cycles = cumulative_trapezoid(slid_hz - middle_hz, initial=0) / rate_hz
-                turns = np.exp(2j * np.pi * cycles)
-                remarks.append(
-                    f"demodulation frequency from its yml: {shallow_hz / 1e6:g} to {deep_hz / 1e6:g} MHz "
-                    f"over {filter_mm:g} mm, turned to that of the line's middle"
-                )
-            shift_hz = middle_hz if shift_hz is None else shift_hz
+    shift_hz = settings.demodulation_frequency_hz if said.kind == "IQ" else None
+    if said.kind == "IQ" and said.receive is not None:
+        shallow_hz, deep_hz, filter_mm = said.receive
+        start_mm = first_mm or settings.first_sample_depth_mm or 0.0
+        depths_mm = start_mm + spacing_mm * np.arange(said.size.samples)
+        slid_hz = np.interp(depths_mm, [0.0, filter_mm], [shallow_hz, deep_hz])
+        middle_hz = float(np.interp(depths_mm[[0, -1]].mean(), depths_mm, slid_hz))
+        values["demodulation_frequency_hz"] = Value(middle_hz, "of the lines' middle", _OWN)
+        if shift_hz is None and shallow_hz != deep_hz:
+            # The frequency falls along a straight line with depth, as from 11 to 8 MHz; a sweep has one.
+            # Samples are turned as if the oscillator had stayed at that of the line's middle, which takes
+            # its phase to be the integral of its frequency: so it is where a frequency is swept, but it
+            # is not documented. Left as they are, simulated I/Q shifted down by 9 to 6 MHz gave lengths
+            # 10 % off, and turned back 0.001 % from those of RF.
+            turns = np.exp(2j * np.pi * cumulative_trapezoid(slid_hz - middle_hz, initial=0) / rate_hz)
+            remarks.append(
+                f"demodulation frequency from its yml: {shallow_hz / 1e6:g} to {deep_hz / 1e6:g} MHz "
+                f"over {filter_mm:g} mm, turned to that of the line's middle"
+            )
+        shift_hz = middle_hz if shift_hz is None else shift_hz
     narrow = np.int16 if said.kind == "IQ" and turns is None else None
     source, shape = partial(open_frames, member, said, turns), records["samples"].shape[:3]
     frames = FileFrames(member.path, source, shape, SAMPLES[said.kind][2], narrow)
@@ -206,7 +203,7 @@ def _pitch(said: Description, per_line: float, settings: ImportSettings) -> Valu
         if element_mm is not None:
             words = f"{per_line:g} elements a line (yml) x {element_mm:g} mm ({source})"
             return Value(element_mm * per_line, words, _OWN)
-    return Value(settings.vector_pitch_mm, "--vector-pitch-mm")
+    return Value()
 
 
 def _spreading(
