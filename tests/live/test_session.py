@@ -25,7 +25,7 @@ RF = ImportSettings(
 
 def image(frame, time_s):
     """RF as PLUS sends it: samples along the columns."""
-    return ImageReceived("Image_Reference", time_s, frame.T, np.eye(4), np.ones(3))
+    return ImageReceived("Image_Reference", time_s, frame.T, np.eye(4))
 
 
 def reading(time_s, device="ProbeToReference"):

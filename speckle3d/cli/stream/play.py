@@ -70,15 +70,15 @@ def play(
     """
     require_extra("live", "play", "pyigtl", "fastcrc")
     from speckle3d.io.igtl.link import Server
-    from speckle3d.io.igtl.played import Names, clock_shift_s, played
+    from speckle3d.io.igtl.played import clock_shift_s, played
     from speckle3d.io.load import load_sweep
 
     read = load_sweep(images)
     frames, grid, upright = _frames(read, kind)
-    names = Names(image, transform, orientation)
+    devices = image, transform, orientation
     times, shift_s = read.frame_time_s, clock_shift_s(read)
     round_s = float(times[-1] - times[0] + (times[-1] - times[-2] if len(times) > 1 else 1.0))
-    next(played(read, frames, grid, upright, names, shift_s))  # refused at once if messages cannot hold it
+    next(played(read, frames, grid, upright, devices, shift_s))  # refused at once if messages cannot hold it
     if shift_s:
         note(f"times in the messages are the sweep's and {shift_s:g} s")
     with Server(port, address) as server:
@@ -95,11 +95,13 @@ def play(
             note(f"{sent} frames sent to {server.state.peers} client(s){slow}")
 
         for turn in range(sys.maxsize if loop else 1):
-            for message in played(read, frames, grid, upright, names, shift_s + turn * round_s):
-                due_s = start_s + (turn * round_s + message.at_s) / rate
+            for at_s, message, is_frame in played(
+                read, frames, grid, upright, devices, shift_s + turn * round_s
+            ):
+                due_s = start_s + (turn * round_s + at_s) / rate
                 time.sleep(max(0.0, due_s - time.monotonic()))
-                server.send(message.message)
-                sent += message.is_frame
+                server.send(message)
+                sent += is_frame
                 if time.monotonic() - said_s >= _TELL_S:
                     said_s = time.monotonic()
                     tell()

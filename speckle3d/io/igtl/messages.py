@@ -56,8 +56,6 @@ class ImageReceived:
         In the message's order, whose columns run fastest: the transposed of one slice is contiguous.
     image_to_world : ndarray, shape (4, 4)
         From column, row and slice of a pixel's centre to mm; the size of pixels is in it.
-    spacing_mm : ndarray, shape (3,)
-        Distance between columns, rows and slices.
     components : int
         Numbers a pixel has: 3 of a colour image.
     """
@@ -66,8 +64,12 @@ class ImageReceived:
     time_s: float
     pixels: npt.NDArray[Any]
     image_to_world: FloatArray
-    spacing_mm: FloatArray
     components: int = 1
+
+    @property
+    def spacing_mm(self) -> FloatArray:
+        """Distance between columns, rows and slices, shape (3,)."""
+        return np.asarray(np.linalg.norm(self.image_to_world[:3, :3], axis=0))
 
 
 @dataclass(frozen=True)
@@ -121,17 +123,16 @@ def decode(start: bytes, body: bytes) -> Received:
     where = f"{type_} {device}"
     if crc and ecma_182(body) != crc:
         raise MessageError(f"{where}: expected a body of check sum {crc:016x}, got another")
-    made = {"IMAGE": ImageMessage, "TRANSFORM": TransformMessage}.get(type_)
-    if made is None:
+    kinds: dict[str, Any] = {"IMAGE": (ImageMessage, _image), "TRANSFORM": (TransformMessage, _transform)}
+    if type_ not in kinds:
         return Other(device, time_s, type_)
     fields = {"message_type": type_, "device_name": device, "timestamp": time_s, "header_version": version}
     try:
         with np.errstate(all="ignore"):  # infinite matrices are refused below
-            message = made()
+            kind, received = kinds[type_]
+            message = kind()
             message.unpack(fields, body)
-            return (_image if type_ == "IMAGE" else _transform)(message)
-    except MessageError:
-        raise
+            return received(message)
     # pyigtl trusts a body: what makes no sense shows in whatever it stumbles over.
     except Exception as error:
         words = str(error).splitlines()[0] if str(error) else type(error).__name__
@@ -210,8 +211,7 @@ def _image(message: Any) -> ImageReceived:
         pixels = pixels[:, :, 0]
     pixels = pixels.astype(pixels.dtype.newbyteorder("="), copy=False)
     components = by_slice.shape[3] if by_slice.ndim == 4 else 1
-    spacing = np.linalg.norm(matrix[:3, :3], axis=0)
-    return ImageReceived(message.device_name, message.timestamp, pixels, matrix, spacing, components)
+    return ImageReceived(message.device_name, message.timestamp, pixels, matrix, components)
 
 
 def _transform(message: Any) -> TransformReceived:

@@ -8,16 +8,13 @@ from __future__ import annotations
 import heapq
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
-from functools import partial
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import FloatArray
-from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.grid import ImageGrid
 from speckle3d.core.sweep import Frames, OrientationSensor, Sweep, Tracker
 from speckle3d.io.igtl.messages import packed_image, packed_transform
@@ -25,28 +22,8 @@ from speckle3d.io.igtl.messages import packed_image, packed_transform
 _SLICE_MM = 1.0
 """Thickness that an image is given to be seen with."""
 
-
-@dataclass(frozen=True)
-class Names:
-    """Devices of the messages; ``A_B`` and ``AToB`` are PLUS's ways to say that A is told in B."""
-
-    image: str = "Image_Reference"
-    tracker: str = "ProbeToReference"
-    orientation: str = "ProbeToWorld"
-
-
-@dataclass(frozen=True)
-class Played:
-    """A message and when it was sent, s from the first frame, whose own time it carries.
-
-    Attributes
-    ----------
-    is_frame : bool
-    """
-
-    at_s: float
-    message: bytes
-    is_frame: bool
+Played: TypeAlias = tuple[float, bytes, bool]
+"""When a message was sent, s from the first frame, the message, and whether it is an image."""
 
 
 def played(
@@ -54,10 +31,10 @@ def played(
     frames: Frames,
     grid: ImageGrid,
     upright: bool,
-    names: Names | None = None,
+    devices: tuple[str, str, str],
     later_s: float = 0.0,
 ) -> Iterator[Played]:
-    """Make messages of a sweep, in the order of their times.
+    """Make messages of a sweep, in the order of their times; each carries its own time.
 
     Parameters
     ----------
@@ -68,6 +45,9 @@ def played(
         Of these.
     upright : bool
         Whether vectors are columns of the images, or their rows.
+    devices : tuple of str
+        Of the images, the tracker and the orientation sensor; ``A_B`` and ``AToB`` are PLUS's ways to say
+        that A is told in B.
     later_s : float
         Added to the times in the messages.
 
@@ -76,26 +56,27 @@ def played(
     InvalidInputError
         If a message cannot hold the frames, or a time.
     """
-    names = names or Names()
+    image, *others = devices
     first_s = float(sweep.frame_time_s[0])
-    place = partial(_place, sweep, grid, upright)
 
     def images() -> Iterator[Played]:
         for i, time_s in enumerate(sweep.frame_time_s):
             pixels, components = _pixels(frames, i, upright)
-            message = packed_image(names.image, time_s + later_s, pixels, place(i), components)
-            yield Played(float(time_s) - first_s, message, True)
+            place = _place(sweep, grid, upright, i)
+            yield (
+                float(time_s) - first_s,
+                packed_image(image, time_s + later_s, pixels, place, components),
+                True,
+            )
 
-    streams = [images()]
-    for sensor, name in ((sweep.tracker, names.tracker), (sweep.orientation, names.orientation)):
-        if sensor is not None:
-            streams.append(_readings(sensor, name, first_s, later_s))
-    return heapq.merge(*streams, key=lambda each: each.at_s)
+    sensors = zip((sweep.tracker, sweep.orientation), others, strict=True)
+    readings = (_readings(one, name, first_s, later_s) for one, name in sensors if one is not None)
+    return heapq.merge(images(), *readings, key=lambda message: message[0])
 
 
 def clock_shift_s(sweep: Sweep) -> float:
     """Whole seconds by which a sweep's times are to be put later: messages hold none below zero."""
-    sensors = [each.readings.time_s for each in (sweep.tracker, sweep.orientation) if each is not None]
+    sensors = (one.readings.time_s for one in (sweep.tracker, sweep.orientation) if one is not None)
     earliest_s = min(float(times[0]) for times in (sweep.frame_time_s, *sensors))
     return float(max(0, math.ceil(-earliest_s)))
 
@@ -109,7 +90,7 @@ def _readings(
     for time_s, matrix in zip(sensor.readings.time_s, poses.as_matrix(), strict=True):
         # Sent when the image of the same moment is; it tells its own clock.
         at_s = float(time_s) + sensor.time_offset_s - first_s
-        yield Played(at_s, packed_transform(name, time_s + later_s, matrix), False)
+        yield at_s, packed_transform(name, time_s + later_s, matrix), False
 
 
 def _pixels(frames: Frames, i: int, upright: bool) -> tuple[npt.NDArray[Any], int]:
@@ -129,10 +110,7 @@ def _place(sweep: Sweep, grid: ImageGrid, upright: bool, i: int) -> FloatArray:
     if not upright:
         # Columns are samples; slices turn round so that the axes stay right-handed.
         image_from_pixel = image_from_pixel[:, [1, 0, 2, 3]] @ np.diag([1.0, 1.0, -1.0, 1.0])
-    if sweep.tracker is not None and sweep.tracker.sensor_from_image is not None:
-        try:
-            pose = sweep.tracker.world_from_image(sweep.frame_time_s[i])
-        except InsufficientDataError:  # the tool was not seen
-            return image_from_pixel
-        return pose.as_matrix() @ image_from_pixel
-    return image_from_pixel
+    tracker, time_s = sweep.tracker, sweep.frame_time_s[i]
+    if tracker is None or tracker.sensor_from_image is None or not tracker.covers(time_s):
+        return image_from_pixel
+    return tracker.world_from_image(time_s).as_matrix() @ image_from_pixel
