@@ -4,7 +4,6 @@ The layout, units and conventions are those of the maker's documents and of two 
 ``speckle3d/io/clarius``; the writer shares no code with the reader.
 """
 
-import io
 import struct
 import tarfile
 import zlib
@@ -32,22 +31,20 @@ G = 9.80665
 
 def sweep_of(kind, frames=4, samples=40):
     """A sweep of noise, its sensor in bursts: "rf", "iq" or "env"; `GIVEN` is what its package lacks."""
-    made = rf_sweep(frames, 5, samples)
-    times = bursts_s(9.9, 10.4)
-    sensor = sensor_of(swayed(times), times)
+    made, times, rng = rf_sweep(frames, 5, samples), bursts_s(9.9, 10.4), np.random.default_rng(1)
     # At 11 frames/s and every third frame left out, as RF is interleaved.
     clock = 10.0 + np.delete(np.arange(3 * frames), slice(None, None, 3))[:frames] / 11
+    sensor = sensor_of(swayed(times), times)
     made = replace(made, orientation=sensor, tracker=None, truth=None, frame_time_s=np.round(clock, 9))
-    if kind == "rf":
-        return made
-    rng = np.random.default_rng(1)
     if kind == "env":
         data = rng.integers(0, 256, made.frames.shape).astype(np.uint8)
-        return replace(made, frames=data, signal=BModeSettings(60.0))
-    pairs = rng.integers(-3000, 3000, (*made.frames.shape, 2)).astype(np.float32)
-    signal = RFSettings(15e6, 1540.0, 6e6, (4e6, 8e6), 6e6)
-    grid = ImageGrid(5, samples, 0.3, signal.sample_spacing_mm, 2.0)
-    return replace(made, frames=pairs.view(np.complex64)[..., 0], signal=signal, grid=grid)
+        made = replace(made, frames=data, signal=BModeSettings(60.0))
+    if kind == "iq":
+        pairs = rng.integers(-3000, 3000, (*made.frames.shape, 2)).astype(np.float32)
+        signal = RFSettings(15e6, 1540.0, 6e6, (4e6, 8e6), 6e6)
+        grid = ImageGrid(5, samples, 0.3, signal.sample_spacing_mm, 2.0)
+        made = replace(made, frames=pairs.view(np.complex64)[..., 0], signal=signal, grid=grid)
+    return made
 
 
 def write_package(target, sweep, **fields):
@@ -56,23 +53,20 @@ def write_package(target, sweep, **fields):
 
 
 def write_files(target, files):
+    folder = target.with_suffix("") if target.suffix == ".tar" else target
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, content in files.items():
+        (folder / name).write_bytes(content)
     if target.suffix == ".tar":
         with tarfile.open(target, "w") as archive:
-            for name, content in files.items():
-                entry = tarfile.TarInfo(name)
-                entry.size = len(content)
-                archive.addfile(entry, io.BytesIO(content))
-        return target
-    target.mkdir(parents=True, exist_ok=True)
-    for name, content in files.items():
-        (target / name).write_bytes(content)
+            for name in files:
+                archive.add(folder / name, name)
     return target
 
 
 def package_files(sweep, packed=False, name=NAME, element_mm=ELEMENT_MM, yml=None):
     """Content of a package's files by name."""
-    kind = kind_of(sweep)
-    raw = raw_bytes(sweep)
+    kind, raw = kind_of(sweep), raw_bytes(sweep)
     files = {
         f"{name}_{kind}.raw{'.lzo' if packed else ''}": lzop_bytes(raw) if packed else raw,
         f"{name}_{kind}.yml": (yml or yml_text(sweep, element_mm)).encode(),
@@ -88,80 +82,65 @@ def kind_of(sweep):
     return "rf" if sweep.signal.demodulation_frequency_hz is None else "iq"
 
 
-def frame_times_ns(sweep):
-    return np.round(sweep.frame_time_s * 1e9).astype(np.int64)
+SAMPLE_BYTES, SPOKEN = {"rf": 2, "iq": 4, "env": 1}, {"rf": "RF", "iq": "IQ", "env": "B pre-scan"}
 
 
 def raw_bytes(sweep):
-    n, lines, samples = sweep.frames.shape
-    frames = [sweep.frames[i] for i in range(n)]
-    parts = [struct.pack("<5I", 1, n, lines, samples, sample_bytes(sweep))]
-    for time_ns, frame in zip(frame_times_ns(sweep), frames, strict=True):
-        if np.iscomplexobj(frame):
+    kind = kind_of(sweep)
+    parts = [struct.pack("<5I", 1, *sweep.frames.shape, SAMPLE_BYTES[kind])]
+    for i, time_s in enumerate(sweep.frame_time_s):
+        frame = sweep.frames[i]
+        if kind == "iq":
             frame = np.stack([frame.real, frame.imag], axis=-1)
-        stored = np.uint8 if kind_of(sweep) == "env" else "<i2"
-        parts += [struct.pack("<Q", int(time_ns)), np.round(frame).astype(stored).tobytes()]
+        stored = np.uint8 if kind == "env" else "<i2"
+        parts += [struct.pack("<Q", round(time_s * 1e9)), np.round(frame).astype(stored).tobytes()]
     return b"".join(parts)
-
-
-def sample_bytes(sweep):
-    return {"rf": 2, "iq": 4, "env": 1}[kind_of(sweep)]
 
 
 def yml_text(sweep, element_mm=ELEMENT_MM):
     """The description; the delay has the microsecond that passes before depth 0."""
     n, lines, samples = sweep.frames.shape
-    grid, signal = sweep.grid, sweep.signal
+    grid, signal, kind = sweep.grid, sweep.signal, kind_of(sweep)
     rate_hz = getattr(signal, "sampling_rate_hz", 1540e3 / (2 * grid.sample_spacing_mm))
     delay = rate_hz * (grid.first_sample_depth_mm * 2e-3 / 1540.0 + 1e-6)
     step = grid.vector_pitch_mm / element_mm
-    centre_mhz = getattr(signal, "centre_frequency_hz", 10e6) / 1e6
-    lists = "".join(
-        f"  - {{rx element: {i * step!r}, tx element: {(i // 2 * 2 + 0.5) * step!r}, angle: 0 °}}\n"
-        for i in range(lines)
-    )
-    spoken = {"rf": "RF", "iq": "IQ", "env": "B pre-scan"}[kind_of(sweep)]
+    places = "".join(f"  - {{rx element: {i * step!r}, angle: 0 °}}\n" for i in range(lines))
     shift = getattr(signal, "demodulation_frequency_hz", None)
-    focus = ""
-    if shift:
-        ends = f"shallowfreq: {shift / 1e6!r} MHz, deepfreq: {shift / 1e6!r} MHz, filterdepth: 40 mm"
-        focus = f"focus:\n  - depth: 20 mm\n    receive:\n      - {{{ends}}}\n"
     return (
-        "# raw data parameters\n\n"
-        f"frames: {n}\nframe rate: 11 Hz\ntransmit frequency: {centre_mhz!r} MHz\n"
-        f"imaging depth: {grid.depth_mm:.4f} mm\n"
-        "focal depth: 20 mm\ntgc: { 0.00mm, 23.00dB }{ 40.00mm, 26.00dB }\n"
+        f"# raw data parameters\n\nframes: {n}\nframe rate: 11 Hz\n"
+        f"transmit frequency: {getattr(signal, 'centre_frequency_hz', 10e6) / 1e6!r} MHz\n"
+        "tgc: { 0.00mm, 23.00dB }{ 40.00mm, 26.00dB }\n"
         f"size: {{samples per line: {samples}, number of lines: {lines}, "
-        f"sample size: {sample_bytes(sweep)} bytes}}\n"
-        f"type: {spoken}\ncompression: none\nsampling rate: {rate_hz / 1e6!r} MHz\ndelay samples: {delay!r}\n"
-        f"lines:\n{lists}{focus}"
+        f"sample size: {SAMPLE_BYTES[kind]} bytes}}\n"
+        f"type: {SPOKEN[kind]}\ncompression: none\n"
+        f"sampling rate: {rate_hz / 1e6!r} MHz\ndelay samples: {delay!r}\nlines:\n{places}"
+        + (focus_text(shift / 1e6, shift / 1e6) if shift else "")
     )
+
+
+def focus_text(shallow_mhz, deep_mhz):
+    ends = f"shallowfreq: {shallow_mhz!r} MHz, deepfreq: {deep_mhz!r} MHz, filterdepth: 40 mm"
+    return f"focus:\n  - depth: 20 mm\n    receive:\n      - {{{ends}}}\n"
 
 
 def sensor_text(sensor):
     """Samples of the sensor, documents of YAML: accelerometer in g, against the specific force."""
     quaternions = sensor.readings.world_from_sensor.as_quat(scalar_first=True)
-    times = np.round(sensor.readings.time_s * 1e9).astype(np.int64)
-    rows = zip(
-        times.tolist(), (-sensor.accelerometer_m_s2 / G).tolist(), sensor.gyroscope_rad_s.tolist(),
-        sensor.magnetometer_au.tolist(), quaternions.tolist(), strict=True,
-    )  # fmt: skip
-    return "---\n".join(sample_text(*row) for row in rows)
-
-
-def sample_text(time_ns, accelerometer, gyroscope, magnetometer, quaternion):
-    vectors = zip(
-        ("gyroscope", "accelerometer", "magnetometer"), (gyroscope, accelerometer, magnetometer), strict=True
-    )
-    lines = [
-        f"{name} {axis}: {value!r}\n"
-        for name, values in vectors
-        for axis, value in zip("xyz", values, strict=True)
-    ]
-    turn = ", ".join(f"q{i}: {value!r}" for i, value in enumerate(quaternion))
-    return (
-        f"timestamp: {time_ns}\n{''.join(lines)}temperature: 31\norientation: {{{turn}}}\nstationary: false\n"
-    )
+    vectors = {
+        "gyroscope": sensor.gyroscope_rad_s,
+        "accelerometer": -sensor.accelerometer_m_s2 / G,
+        "magnetometer": sensor.magnetometer_au,
+    }
+    documents = []
+    for i, time_s in enumerate(sensor.readings.time_s):
+        lines = [f"timestamp: {round(time_s * 1e9)}"]
+        for name, values in vectors.items():
+            lines += [
+                f"{name} {axis}: {value!r}" for axis, value in zip("xyz", values[i].tolist(), strict=True)
+            ]
+        turn = ", ".join(f"q{k}: {value!r}" for k, value in enumerate(quaternions[i].tolist()))
+        documents.append("\n".join([*lines, f"orientation: {{{turn}}}", "stationary: false\n"]))
+    return "---\n".join(documents)
 
 
 def sensor_of(rotations, time_s, seed=0):

@@ -203,7 +203,7 @@ def _pitch(said: Description, per_line: float, settings: ImportSettings) -> Valu
         if element_mm is not None:
             words = f"{per_line:g} elements a line (yml) x {element_mm:g} mm ({source})"
             return Value(element_mm * per_line, words, _OWN)
-    return Value()
+    return Value(settings.vector_pitch_mm, "--vector-pitch-mm")  # also between columns of an envelope
 
 
 def _spreading(

@@ -123,16 +123,14 @@ def decode(start: bytes, body: bytes) -> Received:
     where = f"{type_} {device}"
     if crc and ecma_182(body) != crc:
         raise MessageError(f"{where}: expected a body of check sum {crc:016x}, got another")
-    kinds: dict[str, Any] = {"IMAGE": (ImageMessage, _image), "TRANSFORM": (TransformMessage, _transform)}
-    if type_ not in kinds:
+    if type_ not in _READ:
         return Other(device, time_s, type_)
     fields = {"message_type": type_, "device_name": device, "timestamp": time_s, "header_version": version}
     try:
         with np.errstate(all="ignore"):  # infinite matrices are refused below
-            kind, received = kinds[type_]
-            message = kind()
+            message = MessageBase.create_message(type_)
             message.unpack(fields, body)
-            return received(message)
+            return _READ[type_](message)
     # pyigtl trusts a body: what makes no sense shows in whatever it stumbles over.
     except Exception as error:
         words = str(error).splitlines()[0] if str(error) else type(error).__name__
@@ -218,6 +216,9 @@ def _transform(message: Any) -> TransformReceived:
     said = message.metadata
     valid = said.get("TransformValid", "True") != "False" and said.get("TransformStatus", "OK") == "OK"
     return TransformReceived(message.device_name, message.timestamp, _finite(message.matrix), valid)
+
+
+_READ = {"IMAGE": _image, "TRANSFORM": _transform}
 
 
 def _finite(matrix: npt.ArrayLike) -> FloatArray:

@@ -53,11 +53,6 @@ def test_rf_is_preferred_and_a_raw_file_gives_its_own_kind(tmp_path):
     require_equal(load_sweep(folder / f"{examples.NAME}_iq.raw", GIVEN), iq)
 
 
-def falling(sweep, shallow, deep):
-    said = f"shallowfreq: {shallow} MHz, deepfreq: {deep} MHz, filterdepth: 40 mm"
-    return examples.yml_text(sweep).split("focus:")[0] + f"focus:\n  - receive:\n      - {{{said}}}\n"
-
-
 def test_iq_of_a_falling_frequency_becomes_that_of_one(tmp_path):
     """Echoes of 7 MHz, shifted down by 9 to 6 MHz, are afterwards a constant frequency at all depths."""
     rate_hz, samples = 15e6, 600
@@ -67,7 +62,8 @@ def test_iq_of_a_falling_frequency_becomes_that_of_one(tmp_path):
     sweep = sweep_of("iq", samples=samples)
     frames = np.tile(np.round(8000 * np.exp(1j * phase)), (len(sweep), 5, 1)).astype(np.complex64)
     sweep = replace(sweep, frames=frames, grid=replace(sweep.grid, first_sample_depth_mm=0.0))
-    got = load_sweep(examples.write_package(tmp_path / "p.tar", sweep, yml=falling(sweep, 9, 6)), GIVEN)
+    yml = examples.yml_text(sweep).split("focus:")[0] + examples.focus_text(9, 6)
+    got = load_sweep(examples.write_package(tmp_path / "p.tar", sweep, yml=yml), GIVEN)
     line = got.frames[1][2]
     turn_hz = np.angle(line[1:] * line[:-1].conj()) * rate_hz / (2 * np.pi)
     # Rounding of 8000 to whole numbers: 1e-4 rad, 200 Hz.
