@@ -167,12 +167,6 @@ def _without_jumps(readings: TimedPoses) -> tuple[TimedPoses, list[str]]:
     def is_jump(i: IntArray, k: IntArray) -> BoolArray:
         return moved_mm(i, k) > _SLACK_MM + _FASTEST_MM_S * np.abs(time_s[i] - time_s[k])
 
-    def reached(pieces: list[IntArray]) -> IntArray:
-        rows = pieces[0]
-        for piece in pieces[1:]:
-            rows = rows if is_jump(rows[-1:], piece[:1]) else np.append(rows, piece)
-        return rows
-
     jumps = numbers[1:][is_jump(numbers[:-1], numbers[1:])]
     if not jumps.size:
         return readings, []
@@ -180,8 +174,11 @@ def _without_jumps(readings: TimedPoses) -> tuple[TimedPoses, list[str]]:
     is_seen = (poses.as_matrix() != np.eye(4)).any(axis=(1, 2))
     pieces = [piece for piece in np.split(numbers, jumps) if is_seen[piece].any()]
     largest = int(np.argmax([piece.size for piece in pieces]))
-    earlier = reached([piece[::-1] for piece in pieces[largest::-1]])[::-1]
-    rows = np.union1d(earlier, reached(pieces[largest:]))
+    rows = pieces[largest]
+    for piece in pieces[largest + 1 :]:
+        rows = rows if is_jump(rows[-1:], piece[:1]) else np.append(rows, piece)
+    for piece in pieces[:largest][::-1]:
+        rows = rows if is_jump(piece[-1:], rows[:1]) else np.append(piece, rows)
     worst = jumps[:1]
     moved, took_s = moved_mm(worst - 1, worst)[0], np.diff(time_s)[worst - 1][0]
     jump = f"{moved:.3g} mm in {1e3 * took_s:.3g} ms at {time_s[worst][0]:.3f} s"

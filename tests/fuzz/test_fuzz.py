@@ -103,20 +103,18 @@ def read(path):
 def damaged(content, rng):
     """Bytes with a few changed, a run of zeros in them, or cut off."""
     how, data = rng.integers(0, 6), bytearray(content)
-    at = int(rng.integers(0, len(data)))
+    at, length = int(rng.integers(0, len(data))), int(rng.integers(1, 64))
     if how == 0:
-        return bytes(data[:at])
-    if how == 1:
-        data[at : at + int(rng.integers(1, 64))] = b""
-        return bytes(data)
-    if how == 2:
-        length = int(rng.integers(1, 64))
+        del data[at:]
+    elif how == 1:
+        del data[at : at + length]
+    elif how == 2:
         data[at : at + length] = bytes(len(data[at : at + length]))
-        return bytes(data)
-    # Structures lie at the beginning more often than elsewhere.
-    most = len(data) if how < 5 else min(len(data), 2048)
-    for _ in range(int(rng.integers(1, 9))):
-        data[int(rng.integers(0, most))] = int(rng.integers(0, 256))
+    else:  # structures lie at the beginning more often than elsewhere
+        for _ in range(int(rng.integers(1, 9))):
+            data[int(rng.integers(0, min(len(data), 2048 if how == 5 else len(data))))] = int(
+                rng.integers(0, 256)
+            )
     return bytes(data)
 
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import re
 import struct
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
@@ -218,7 +219,7 @@ def _transform(message: Any) -> TransformReceived:
     return TransformReceived(message.device_name, message.timestamp, _finite(message.matrix), valid)
 
 
-_READ = {"IMAGE": _image, "TRANSFORM": _transform}
+_READ: dict[str, Callable[[Any], Received]] = {"IMAGE": _image, "TRANSFORM": _transform}
 
 
 def _finite(matrix: npt.ArrayLike) -> FloatArray:
