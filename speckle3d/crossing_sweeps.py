@@ -73,10 +73,8 @@ def require_pair(first: Sweep, second: Sweep) -> None:
     MismatchError
         If images or signal differ.
     InvalidInputError
-        If they have frames in common, or vectors that spread.
+        If they have frames in common.
     """
-    if first.grid.fan is not None:
-        raise InvalidInputError(f"{first.name}: expected parallel vectors of crossing sweeps, got a fan's")
     for what, one, other in (("images", first.grid, second.grid), ("signal", first.signal, second.signal)):
         if one != other:
             advice = BAND_ADVICE if what == "signal" else ""
