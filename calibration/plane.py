@@ -42,8 +42,8 @@ _TOLERANCE, _ROUGHLY = 1e-12, 1e-3
 _REWEIGHTINGS = 8
 _REFINED, _KEPT, _ANGLE_FRAMES, _ROUNDS = 6, 3, 30, 4
 """Normals whose angles are refined, from so many frames with so many reweightings, and those that go on."""
-_HOPELESS, _TINY = 3.0, 1e-12
-"""Ends whose mean absolute residual is as many times the least are not looked at again."""
+_TINY = 1e-12
+"""Of a normal matrix's diagonal, where residuals do not depend on a parameter at all."""
 _CONTRADICTS = 3.0
 """Standard errors by which lines must move a pixel size given for it to be doubted."""
 _TURNED, _OVER = np.diag([-1.0, -1.0, 1.0, 1.0]), np.diag([1.0, -1.0, -1.0, 1.0])
@@ -268,10 +268,7 @@ class Equations:
             raise InvalidInputError("expected finite residuals at the starting point, got some that are not")
         damping, step = 1e-6, np.zeros(len(CHAIN))
         for _ in range(_MOST_STEPS):
-            scale = np.sqrt(np.diag(normal))
-            scale = np.where(scale > 0, scale, 1.0)
-            scaled = normal / np.outer(scale, scale) + damping * np.eye(len(scale))
-            moved = np.linalg.solve(scaled, pull / scale) / scale
+            moved = np.linalg.solve(normal + damping * np.diag(np.maximum(np.diag(normal), _TINY)), pull)
             step[columns] = -moved
             moved_chain = chain.displaced(step)
             trial = at(moved_chain)
@@ -412,9 +409,8 @@ def angle_starts(
         ends.append((float(np.abs(equations.residuals(end)).mean()), end))
     ends.sort(key=lambda one: one[0])
     kept = list[Chain]()
-    for cost, end in ends:
-        hopeless = cost > _HOPELESS * ends[0][0] + _TINY
-        if not hopeless and all(apart(end, one, directions, phantom) for one in kept):
+    for _, end in ends:
+        if all(apart(end, one, directions, phantom) for one in kept):
             kept.append(end)
     return kept[:_KEPT]
 
@@ -425,25 +421,17 @@ def rotation_to_z(normal: FloatArray) -> Rotation:
 
 
 def _with_distances(lines: ImagePoints, angles: Chain, pixel_mm: FloatArray | None) -> Chain:
-    """Second stage: linear distances, for the image or its in-plane mirror, which they tell apart."""
+    """Second stage: linear distances and the pixels' size, negative for the image's in-plane mirror."""
     normal = angles.target[2, :3]
-    up, square = normal @ lines.turns, angles.pixel_mm if pixel_mm is None else pixel_mm
-    ends = list[tuple[float, Chain]]()
-    for one in (angles, angles.mirrored()):
-        height = np.sum(up * ((lines.pixels * square) @ one.probe[:3, :2].T), axis=1)
-        unknown, wanted = [up, np.ones((len(lines), 1))], -lines.shifts_mm @ normal
-        if pixel_mm is None:
-            unknown.append(height[:, None])
-        else:
-            wanted = wanted - height
-        answer, left = robust_linear(np.hstack(unknown), wanted)
-        size = square * (answer[4] if pixel_mm is None else 1.0)
-        if size[1] < 0:
-            one, size = one.mirrored(), -size
-        end = Chain(size, one.probe.copy(), one.target.copy())
-        end.probe[:3, 3], end.target[2, 3] = answer[:3], answer[3]
-        ends.append((float(np.median(np.abs(left))), end))
-    return min(ends, key=lambda one: one[0])[1]
+    up, flat = normal @ lines.turns, lines.pixels * angles.pixel_mm
+    height = np.sum(up * (flat @ angles.probe[:3, :2].T), axis=1)
+    unknown = np.column_stack([up, np.ones(len(lines)), height])
+    answer, _ = robust_linear(unknown, -lines.shifts_mm @ normal)
+    near = angles if answer[4] > 0 else angles.mirrored()
+    size = abs(answer[4]) * angles.pixel_mm if pixel_mm is None else pixel_mm
+    chain = Chain(size, near.probe.copy(), near.target.copy())
+    chain.probe[:3, 3], chain.target[2, 3] = answer[:3], answer[3]
+    return chain
 
 
 def _facing_up(solution: Solution) -> Solution:

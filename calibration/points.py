@@ -1,4 +1,4 @@
-"""Points of a phantom in images, joined with the sensor's poses, and the names of what they determine."""
+"""Recordings, points of a phantom in them joined with its poses, and names of what they determine."""
 
 from __future__ import annotations
 
@@ -8,12 +8,15 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError, MismatchError
 from speckle3d.core.geometry import require_finite
+from speckle3d.core.grid import ImageGrid
 from speckle3d.core.shown import shown
+from speckle3d.core.streams import TimedPoses, TimedRotations
+from speckle3d.core.sweep import Frames
 
 SOME_FRAMES = 100
 """Frames that choose among starting points; the answer is refined from all."""
@@ -35,6 +38,56 @@ CHAIN = (*PROBE, *TARGET)
 def columns_of(names: Sequence[str]) -> list[int]:
     """Where parameters are in `CHAIN`."""
     return [CHAIN.index(name) for name in names]
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Images and the readings of a sensor on the probe.
+
+    Parameters
+    ----------
+    images : Frames, shape (n, column, row)
+        Grey levels; of a fan scan converted.
+    grid : ImageGrid
+        Of the images; rough where pixels are to be estimated.
+    frame_time_s : ndarray, shape (n,)
+    readings : TimedPoses or TimedRotations
+        World from sensor.
+    time_offset_s : float
+        A reading at t belongs to image time t + `time_offset_s`.
+    name : str
+        For messages.
+    mounting : RigidTransform, optional
+        Sensor from image, as the file has it.
+    """
+
+    images: Frames
+    grid: ImageGrid
+    frame_time_s: FloatArray
+    readings: TimedPoses | TimedRotations
+    time_offset_s: float = 0.0
+    name: str = "recording"
+    mounting: RigidTransform | None = None
+
+    @property
+    def pixel_mm(self) -> FloatArray:
+        """Distance between columns and between rows, shape (2,)."""
+        return np.array([self.grid.vector_pitch_mm, self.grid.sample_spacing_mm])
+
+    @property
+    def first_px(self) -> FloatArray:
+        """Place of the first column and of the first row, from the image's origin, in columns and rows."""
+        return np.array([self.grid.first_vector_mm, self.grid.first_sample_depth_mm]) / self.pixel_mm
+
+    def covered(self) -> IntArray:
+        """Numbers of the frames that the readings cover."""
+        return np.flatnonzero(self.readings.covers(self.frame_time_s - self.time_offset_s))
+
+    def world_from_sensor(self, frames: IntArray, offset_s: float | None = None) -> RigidTransform:
+        """Pose of the sensor at frames by number, by a clock that is off by `offset_s` if not by its own."""
+        at_s = self.frame_time_s[frames] - (self.time_offset_s if offset_s is None else offset_s)
+        poses: RigidTransform | Rotation = self.readings.at(at_s)
+        return RigidTransform.from_rotation(poses) if isinstance(poses, Rotation) else poses
 
 
 @shown

@@ -7,20 +7,16 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform, Rotation
 
 from calibration.beam import BeamBias
 from calibration.clock.fitted import estimate_offset, with_uncertain_offset
 from calibration.clock.offset import ClockOffset, covered
 from calibration.consensus import GATES_MM, Consensus, find_consensus
-from calibration.points import ImagePoints, Seen
+from calibration.points import ImagePoints, Recording, Seen
 from calibration.report import Shot, as_calibration
 from calibration.solution import Solution
-from speckle3d.core.arrays import FloatArray
 from speckle3d.core.calibration import Calibration, FramesUsed
 from speckle3d.core.errors import InsufficientDataError
-from speckle3d.core.streams import TimedPoses, TimedRotations
-from speckle3d.core.sweep import Frames
 
 SEARCH_S = 0.4
 """Clock offsets tried to either side of the recording's own: usual latencies of trackers and frame grabbers
@@ -31,32 +27,6 @@ _FEWEST_COVERED = 0.3
 """Least share of the frames with a detection that must have a reading; below it, the recordings do not belong
 together."""
 _UNREAD = "no sensor reading at its time"
-
-
-@dataclass(frozen=True)
-class Recording:
-    """Images of a phantom and a sensor's readings.
-
-    Parameters
-    ----------
-    images : Frames, shape (n, column, row)
-        Grey levels.
-    pixel_mm : ndarray, shape (2,)
-        Distance between columns and between rows; rough where it is to be estimated.
-    first_px : ndarray, shape (2,)
-        Place of the first column and of the first row, from the image's origin, in columns and rows.
-    frame_time_s : ndarray, shape (n,)
-    readings : TimedPoses or TimedRotations
-    time_offset_s : float
-        A reading at t belongs to image time t + `time_offset_s`.
-    """
-
-    images: Frames
-    pixel_mm: FloatArray
-    first_px: FloatArray
-    frame_time_s: FloatArray
-    readings: TimedPoses | TimedRotations
-    time_offset_s: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -144,8 +114,7 @@ def paired(recording: Recording, seen: Seen, offset_s: float) -> tuple[ImagePoin
             f"{recording.frame_time_s[0]:.3f} to {recording.frame_time_s[-1]:.3f} s"
         )
     missing = dict.fromkeys((int(n) for n in np.unique(seen.frame[~with_reading])), _UNREAD)
-    read: RigidTransform | Rotation = recording.readings.at(times[with_reading] - offset_s)
-    poses = RigidTransform.from_rotation(read) if isinstance(read, Rotation) else read
+    poses = recording.world_from_sensor(seen.frame[with_reading], offset_s)
     below_origin = replace(seen, pixels=seen.pixels + recording.first_px)
     return below_origin[with_reading].points(poses, times[with_reading]), {**seen.dropped, **missing}
 

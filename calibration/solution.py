@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 
 _SMALLEST_SIGMA = 1e-7
 """Residuals of exact data are rounding; nothing in them is an outlier."""
-_FREE_ROUNDS, _MOST_ROUNDS = 5, 30
-"""After so many rounds frames may be left out but not taken back, so that the rounds end."""
+_ROUNDS = 12
+"""In the second half frames may be left out but not taken back, so that the rounds end."""
 _RUNAWAY, _RESIZED = 2.0, 0.1
 """A fit with wandering errors that doubles the residuals or changes pixel sizes by a tenth has run away along
 what the motion leaves open."""
@@ -185,7 +185,7 @@ class Problem:
         chain = equations.least_absolute(start, first)
         residuals = equations.residuals(chain)
         used = _within(residuals, points.frame, self.outlier_sigma * sigma_of(residuals))
-        for number in range(_MOST_ROUNDS):
+        for number in range(_ROUNDS):
             frames, agreeing = len(points.frames), len(np.unique(points.frame[used]))
             if 2 * agreeing <= frames:
                 raise InsufficientDataError(
@@ -196,7 +196,7 @@ class Problem:
             chain = equations[used].least_squares(chain, self.free, self.prior, sigma)
             residuals = equations.residuals(chain)
             now = _within(residuals, points.frame, self.outlier_sigma * sigma_of(residuals[used]))
-            if number >= _FREE_ROUNDS:
+            if 2 * number >= _ROUNDS:
                 now &= used
             if (now == used).all():
                 break

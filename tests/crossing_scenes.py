@@ -9,7 +9,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from calibration.images.stacks import TrackedImages
+from calibration.points import Recording
 from speckle3d.core.geometry import rotation_from_fixed_angles
 from speckle3d.core.grid import ImageGrid
 from speckle3d.core.streams import TimedPoses
@@ -76,9 +76,7 @@ def crossing_sweeps(
         images = _frames(grey, poses, grid)
         sensor = poses * MOUNTING.inv() * _jitter(rng, frames, jitter)
         time_s = np.arange(frames) * 0.04
-        made.append(
-            TrackedImages(images, grid, time_s, TimedPoses(time_s, sensor), name=f"sweep {number + 1}")
-        )
+        made.append(Recording(images, grid, time_s, TimedPoses(time_s, sensor), name=f"sweep {number + 1}"))
     return made[0], made[1], MOUNTING
 
 

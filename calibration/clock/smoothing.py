@@ -33,8 +33,9 @@ class SmoothReadings:
 
     def __init__(self, readings: TimedPoses | TimedRotations) -> None:
         time_s, samples = readings.time_s, readings.world_from_sensor
-        poses = samples if isinstance(samples, RigidTransform) else RigidTransform.from_rotation(samples)
-        places, turns = poses.translation, poses.rotation.as_quat()
+        self.time_s = time_s
+        self.poses = samples if isinstance(samples, RigidTransform) else RigidTransform.from_rotation(samples)
+        places, turns = self.poses.translation, self.poses.rotation.as_quat()
         back = np.append(False, np.sum(turns[1:] * turns[:-1], axis=1) < 0)
         turns = turns * np.where(np.cumsum(back) % 2, -1.0, 1.0)[:, None]
         self._readings = readings

@@ -2,9 +2,7 @@
 
 An answer sits on a bump of speckle, where the similarity falls more steeply than it would without speckle. So
 the curvature behind the standard errors is taken over displacements wider than speckle; from its place on the
-bump alone, errors were claimed half as large as they were. Where tissue is layered there may be nothing but
-such bumps, and the one found far from the truth: so the fit is started again beside the answer, and where it
-ends elsewhere, that is part of the claim.
+bump alone, errors were claimed half as large as they were.
 """
 
 from __future__ import annotations
@@ -16,9 +14,9 @@ from scipy.linalg import eigh
 from scipy.spatial.transform import RigidTransform
 
 from calibration.images.angulation import PARAMETERS, Angulation, point_motion
-from calibration.images.fit import Refined, about_pivot, refine
+from calibration.images.fit import Refined, about_pivot
 from calibration.images.search import apart_mm
-from calibration.images.similarity import Comparison, CrossingSweeps, Level, Similarity, stepped
+from calibration.images.similarity import Comparison, CrossingSweeps, Similarity, stepped
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.geometry import skew
@@ -52,17 +50,6 @@ DEEP_MM = 0.1
 between its parts show it, in units of the images' size: a thick beam displays echoes from beside the image
 plane too deep. The root mean square over six simulated pairs of sweeps."""
 
-RESTARTED = Level(1.0, images=8, overlap=0.25)
-"""Resolution of the fits started again: at finer ones speckle holds them halfway for tens of steps, in tissue
-of clear structure too."""
-
-_BESIDE_DEG, _BESIDE_MM, _RESTART_STEPS = 2.0, 1.5, 14
-"""Turns about the image's centre and displacements, in units of the images' size, from which fits start
-again: over speckle's size, and within reach of the fit. And the most steps of each."""
-
-_SIDES = np.array([[1, 1, 1, 1, 1, 1], [1, -1, 1, -1, -1, 1]])
-"""Signs of turns and displacements; each side has its opposite."""
-
 MOST_MM, MOST_DEG = 1.0, 2.5
 """Largest standard errors of the image's centre and turns: 95 % intervals of 2 mm, within which the published
 method agreed with phantoms in vivo (Wein and Khamene 2008), and 5 degrees. It agreed within 4 degrees;
@@ -94,14 +81,13 @@ def curvature_of(refined: Refined, steps: FloatArray) -> tuple[FloatArray, Float
 
 
 def claimed(
-    refined: Refined, angulation: Angulation, crossing: CrossingSweeps, tracker: tuple[float, float]
+    refined: Refined, crossing: CrossingSweeps, tracker: tuple[float, float]
 ) -> tuple[FloatArray, FloatArray]:
     """Covariance of an answer's turns and displacements at the image's origin, (6, 6).
 
     Errors of tissue (speckle, reflections) and of poses are told by how the answer changes when one block of
     tissue, or one stretch of images, after another is left out. An error of the tracker that lasts for
-    seconds displaces one sweep against the other and shows in no such change; its effect is computed. To
-    their sum comes the scatter of fits started beside the answer.
+    seconds displaces one sweep against the other and shows in no such change; its effect is computed.
 
     Parameters
     ----------
@@ -121,7 +107,9 @@ def claimed(
        Human Resources, 2015 (the jackknife over clusters).
     """
     unit, base = crossing.unit, about_pivot(refined.pivot_mm)
-    wide, shows = unit * WIDE_MM, angulation.alone / np.repeat([np.deg2rad(1.0), 1.0], 3)
+    # How far an error of one displaces the sweeps against each other, a shift that shows most by as much.
+    stiff, wide = np.diag(refined.system[0]), unit * WIDE_MM
+    shows = np.sqrt(stiff / stiff[3:].max())
     farthest = _FARTHEST * np.repeat([1.0, unit], 3)
     bends, curvature = curvature_of(refined, np.minimum(wide / np.maximum(shows, 1e-6), farthest))
     slopes = (refined.weight[:, None] * refined.similarity.gradient) @ base
@@ -134,7 +122,6 @@ def claimed(
     wander = moved @ _wandering(refined, _pulls(refined, wide, base), variance) @ moved.T
     covariance = base @ (sum(left_out) + wander) @ base.T
     covariance[4, 4] += (DEEP_MM * unit) ** 2
-    covariance += _scatter(refined, crossing)
     return np.asarray(covariance), curvature
 
 
@@ -193,25 +180,6 @@ def require_one_answer(
                 f"fits as well (correlation {there.score:.3f} and {here.score:.3f}, +- {noise:.3f}): tissue "
                 "with more structure, or a better start with a smaller --capture-mm, would tell them apart"
             )
-
-
-def _scatter(refined: Refined, crossing: CrossingSweeps) -> FloatArray:
-    """Mean square of how far fits that start beside the answer end from one that starts at it, shape (6, 6).
-
-    Not about their own mean: fits that all end in the same other place are in doubt, too. Nor about the
-    answer, for at `RESTARTED` images are blurred, which moves all ends alike.
-    """
-    comparison = crossing.level(RESTARTED, refined.sensor_from_image)
-    beside = np.repeat([np.deg2rad(_BESIDE_DEG), _BESIDE_MM * crossing.unit], 3)
-
-    def end(side: FloatArray) -> RigidTransform:
-        start = stepped(refined.sensor_from_image, side * beside, refined.pivot_mm)
-        return refine(comparison, start, max_steps=_RESTART_STEPS).sensor_from_image
-
-    back = end(np.zeros(6)).inv()
-    away = [back * end(side) for side in np.concatenate([_SIDES, -_SIDES])]
-    ends = np.array([np.append(one.rotation.as_rotvec(), one.translation) for one in away])
-    return np.asarray(ends.T @ ends / (len(ends) - 1))
 
 
 def _pulls(refined: Refined, step_mm: float, base: FloatArray) -> FloatArray:

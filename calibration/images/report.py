@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from scipy.spatial.transform import RigidTransform
 
 from calibration.images.solver import SPECKLED_SIMILARITY, ImageCalibration
-from calibration.images.stacks import TrackedImages
+from calibration.points import Recording
 from speckle3d.core.arrays import Float32Array
 from speckle3d.core.calibration import Calibration, FramesUsed, Parameter
 from speckle3d.imaging.cuts.planes import image_plane
@@ -34,9 +34,7 @@ _WORSE = 0.02
 different starts."""
 
 
-def calibration_from_images(
-    result: ImageCalibration, sweeps: tuple[TrackedImages, TrackedImages]
-) -> Calibration:
+def calibration_from_images(result: ImageCalibration, sweeps: tuple[Recording, Recording]) -> Calibration:
     """Turn an answer into a `Calibration`; the second sweep's frames are numbered after the first's."""
     counts = [len(each.frame_time_s) for each in sweeps]
     first, second = result.sweeps.frames
@@ -71,15 +69,14 @@ def notes_of(result: ImageCalibration) -> list[str]:
         f"image centre known to {centre[0]:.2f}, {centre[1]:.2f} and {centre[2]:.2f} mm across, along the "
         "beam and out of plane",
         f"sweeps at {angles.crossing_deg:.0f} degrees, fans of {angles.fan_deg[0]:.0f} and "
-        f"{angles.fan_deg[1]:.0f}; they share {100 * angles.overlap[0]:.0f} % and "
-        f"{100 * angles.overlap[1]:.0f} % of their images",
+        f"{angles.fan_deg[1]:.0f}",
         "what both sweeps have wrong alike, as pixel sizes or a clock offset, shows in none of these",
         f"claimed errors allow for a tracker that displaces one sweep against the other by "
         f"{settings.tracker_mm:g} mm and {settings.tracker_deg:g} degrees",
     ]
 
 
-def figure_of(result: ImageCalibration, sweeps: tuple[TrackedImages, TrackedImages]) -> Figure:
+def figure_of(result: ImageCalibration, sweeps: tuple[Recording, Recording]) -> Figure:
     """One page: an image of each sweep beside what the other shows in its place, before and after."""
     figure = Figure(figsize=(12.0, 8.0), layout="constrained")
     FigureCanvasAgg(figure)
@@ -91,9 +88,7 @@ def figure_of(result: ImageCalibration, sweeps: tuple[TrackedImages, TrackedImag
     return figure
 
 
-def cut_of(
-    shown: TrackedImages, other: TrackedImages, frame: int, sensor_from_image: RigidTransform
-) -> Float32Array:
+def cut_of(shown: Recording, other: Recording, frame: int, sensor_from_image: RigidTransform) -> Float32Array:
     """Cut the plane of one image out of the other sweep; shape (rows, columns), NaN where nothing is."""
     frames = other.covered()
     poses = other.world_from_sensor(frames) * sensor_from_image
@@ -106,7 +101,7 @@ def cut_of(
 
 
 def _draw_images(
-    row: Sequence[Axes], result: ImageCalibration, shown: TrackedImages, other: TrackedImages, frame: int
+    row: Sequence[Axes], result: ImageCalibration, shown: Recording, other: Recording, frame: int
 ) -> None:
     """An image, and what the other sweep shows in its place at the start and at the answer."""
     own, grid = np.asarray(shown.images[frame]).T, shown.grid

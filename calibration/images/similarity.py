@@ -11,7 +11,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from calibration.images.stacks import BASE_PIXEL_MM, WHOLE, Stack, TrackedImages, read_stack
+from calibration.images.stacks import BASE_PIXEL_MM, WHOLE, Stack, read_stack
+from calibration.points import Recording
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import MismatchError
 from speckle3d.core.progress import Progress
@@ -131,40 +132,39 @@ class Comparison:
 
 
 def spread_patches(
-    stack: Stack, images: Sequence[int] | IntArray, side: int, spacing_mm: float, overlap: float = 0.5
+    stack: Stack,
+    images: Sequence[int] | IntArray,
+    spacing_mm: float,
+    side: int | None = None,
+    overlap: float = 0.5,
 ) -> PatchGrid:
-    """Square patches all over some images, without those that are mostly empty.
+    """Patches all over some images, without those that are mostly empty.
 
     Parameters
     ----------
     spacing_mm : float
         Distance between a patch's points.
+    side : int, optional
+        Points along each side; by default a patch is the whole image.
     overlap : float
         Part of its side that a patch shares with its neighbour.
     """
     stride = max(1, round(spacing_mm / float(stack.pixels[:2].mean())))
-    size = stack.images.shape[1:]
-    side = min(side, (min(size) - 1) // stride + 1)
-    reach = (side - 1) * stride
-    step = max(1.0, reach * (1.0 - overlap))
-    starts = [np.unique(np.linspace(0, n - 1 - reach, int((n - 1 - reach) / step) + 1).round()) for n in size]
-    first, second = (start.astype(np.int64) for start in starts)
-    across, down = (start[:, None] + stride * np.arange(side) for start in (first, second))
+    sides, starts, within = [], [], []
+    for size in stack.images.shape[1:]:
+        sides.append(min(side or size, (size - 1) // stride + 1))
+        last = size - 1 - (sides[-1] - 1) * stride
+        count = int(last / max(1.0, (sides[-1] - 1) * stride * (1.0 - overlap))) + 1
+        starts.append(np.unique(np.linspace(0, last, count).round()).astype(np.int64))
+        within.append(starts[-1][:, None] + stride * np.arange(sides[-1]))
+    across, down = within
     kept = []
     for image in images:
         there = np.isfinite(stack.images[image])
         share = there[across[:, :, None, None], down[None, None]].mean(axis=(1, 3))
         a, b = np.nonzero(share > LEAST_SHARE)
-        kept.append(np.column_stack([np.full(len(a), image), first[a], second[b]]))
-    return PatchGrid(np.concatenate(kept).astype(np.int64).reshape(-1, 3), (side, side), stride)
-
-
-def whole_images(stack: Stack, images: IntArray, spacing_mm: float) -> PatchGrid:
-    """One patch over each of some images, its points about `spacing_mm` apart."""
-    stride = max(1, round(spacing_mm / float(stack.pixels[:2].mean())))
-    u, v = ((n - 1) // stride + 1 for n in stack.images.shape[1:])
-    where = np.column_stack([images, np.zeros((len(images), 2), np.int64)]).astype(np.int64)
-    return PatchGrid(where, (u, v), stride)
+        kept.append(np.column_stack([np.full(len(a), image), starts[0][a], starts[1][b]]))
+    return PatchGrid(np.concatenate(kept).astype(np.int64).reshape(-1, 3), (sides[0], sides[1]), stride)
 
 
 @dataclass(frozen=True)
@@ -223,7 +223,7 @@ class CrossingSweeps:
         sigma = level.sigma_mm * self.unit
         thin = self._thinned(sigma, sensor_from_image, level.least_weight)
         patches = [
-            spread_patches(stack, evenly(len(stack), level.images), level.side, sigma, level.overlap)
+            spread_patches(stack, evenly(len(stack), level.images), sigma, level.side, level.overlap)
             for stack in thin
         ]
         return Comparison(thin, (patches[0], patches[1]), self._gap(sigma, thin, sensor_from_image))
@@ -246,7 +246,7 @@ class CrossingSweeps:
         return max(2.25 * sigma_mm, 3.0 * spacing, 2.0 * self.unit)
 
 
-def prepare(first: TrackedImages, second: TrackedImages, progress: Progress | None = None) -> CrossingSweeps:
+def prepare(first: Recording, second: Recording, progress: Progress | None = None) -> CrossingSweeps:
     """Read two crossing sweeps.
 
     Raises
@@ -271,10 +271,9 @@ def prepare(first: TrackedImages, second: TrackedImages, progress: Progress | No
     extent = float(np.sqrt(max(grid.width_mm, 1.0) * (grid.depth_mm - grid.first_sample_depth_mm)))
     unit = float(np.clip(extent / USUAL_EXTENT_MM, 0.5, 4.0))
     (one, numbers), (other, more) = (
-        read_stack(tracked, BASE_PIXEL_MM * unit, progress) for tracked in (first, second)
+        read_stack(sweep, BASE_PIXEL_MM * unit, progress) for sweep in (first, second)
     )
-    pixel_mm = np.array([grid.vector_pitch_mm, grid.sample_spacing_mm])
-    return CrossingSweeps((one, other), (numbers, more), pixel_mm, unit)
+    return CrossingSweeps((one, other), (numbers, more), first.pixel_mm, unit)
 
 
 def evenly(count: int, wanted: int) -> IntArray:

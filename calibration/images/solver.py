@@ -28,7 +28,7 @@ from calibration.images.errors import (
 from calibration.images.fit import LEVERS_MM, refine
 from calibration.images.search import DECIDED, search
 from calibration.images.similarity import CrossingSweeps, Level, prepare
-from calibration.images.stacks import TrackedImages
+from calibration.points import Recording
 from calibration.settings import ImageFit
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
@@ -57,9 +57,8 @@ class ImageCalibration:
     covariance : ndarray, shape (6, 6)
         Of the image's pose in its own frame, at its origin: turns about its x, y, z (tilt, yaw, roll) in rad,
         then displacements along them in mm. From how the answer changes when one part of the scanned tissue,
-        or one stretch of a sweep, after another is left out, from what the tracker may displace one sweep
-        against the other by, and from the scatter of fits that start beside the answer. It does not know of
-        an uncorrected delay of the sensor or a wrong speed of sound.
+        or one stretch of a sweep, after another is left out, and from what the tracker may displace one sweep
+        against the other by. Not of an uncorrected delay of the sensor or a wrong speed of sound.
     condition_number : float
         Of the similarity's curvature with scaled columns, as a root; a large one means that the sweeps
         leave some motion of the image undetermined.
@@ -94,8 +93,8 @@ class ImageCalibration:
 
 
 def calibrate_images(
-    first: TrackedImages,
-    second: TrackedImages,
+    first: Recording,
+    second: Recording,
     start: RigidTransform,
     settings: ImageFit | None = None,
     progress: Progress | None = None,
@@ -148,13 +147,13 @@ def calibrate_from_sweeps(
             "expected sweeps that show the same structure, with a correlation of at least "
             f"{LEAST_SIMILARITY:g} over what both cover, got {got}"
         )
-    angles = angulation(poses[0], poses[1], answer, crossing.stacks[0].corners_mm)
+    angles = angulation(poses[0], poses[1], answer)
     angles.require()
     _, narrow = curvature_of(refined, APART_MM / LEVERS_MM)
     refined = refine(refined.comparison, answer, curvature=narrow)
     answer = refined.sensor_from_image
     tracker = chosen.tracker_mm, float(np.deg2rad(chosen.tracker_deg))
-    covariance, curvature = claimed(refined, angles, crossing, tracker)
+    covariance, curvature = claimed(refined, crossing, tracker)
     require_known(covariance, angles, crossing.centre_mm)
     require_one_answer(decided, answer, rivals, crossing.centre_mm)
     return ImageCalibration(

@@ -15,13 +15,12 @@ import numpy as np
 from scipy.ndimage import gaussian_filter, gaussian_filter1d
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from calibration.points import Recording
 from speckle3d.core.arrays import Float32Array, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, naming
 from speckle3d.core.extras import extra_module
-from speckle3d.core.grid import ImageGrid
-from speckle3d.core.streams import TimedPoses
 from speckle3d.core.threads import in_parallel
-from speckle3d.imaging.images import IndexedImages, PosedImages
+from speckle3d.imaging.images import PosedImages
 
 BASE_PIXEL_MM = 0.35
 """Pixel size to which images are reduced: half the finest blur that comparisons use."""
@@ -36,40 +35,6 @@ _PIXELS_PER_BLUR = 2.0
 
 _SMOOTHED_FRAMES = 3.0
 """Standard deviation, in frames, of the smoothing of positions before the distance travelled is measured."""
-
-
-@dataclass(frozen=True)
-class TrackedImages:
-    """Images of one sweep and the readings of the sensor on the probe.
-
-    Parameters
-    ----------
-    images : indexable
-        Grey images by frame number, shape (vector, sample): B-mode, log-compressed; NaN where there is none.
-    grid : ImageGrid
-    frame_time_s : ndarray, shape (n,)
-    readings : TimedPoses
-        World from sensor.
-    time_offset_s : float
-        A reading at t belongs to image time t + `time_offset_s`.
-    name : str
-        For messages.
-    """
-
-    images: IndexedImages
-    grid: ImageGrid
-    frame_time_s: FloatArray
-    readings: TimedPoses
-    time_offset_s: float = 0.0
-    name: str = "sweep"
-
-    def covered(self) -> IntArray:
-        """Numbers of the frames that the sensor's readings cover."""
-        return np.flatnonzero(self.readings.covers(self.frame_time_s - self.time_offset_s))
-
-    def world_from_sensor(self, frames: IntArray) -> RigidTransform:
-        """Pose of the sensor at frames by number."""
-        return self.readings.at(self.frame_time_s[frames] - self.time_offset_s)
 
 
 @dataclass(frozen=True)
@@ -188,7 +153,7 @@ class Stack:
 
 
 def read_stack(
-    tracked: TrackedImages,
+    recording: Recording,
     pixel_mm: float = BASE_PIXEL_MM,
     progress: Callable[[int, int], None] | None = None,
 ) -> tuple[Stack, IntArray]:
@@ -201,21 +166,21 @@ def read_stack(
     InsufficientDataError
         If readings cover too few frames, or no pixel ever changes.
     """
-    frames = tracked.covered()
+    frames = recording.covered()
     if len(frames) < FEWEST_FRAMES:
         raise InsufficientDataError(
-            f"{tracked.name}: expected at least {FEWEST_FRAMES} frames with readings, got {len(frames)}"
+            f"{recording.name}: expected at least {FEWEST_FRAMES} frames with readings, got {len(frames)}"
         )
-    grid = tracked.grid
-    with naming(tracked.name):
+    grid = recording.grid
+    with naming(recording.name):
         # Images are read here, not placed: their poses do not matter, only how many there are.
-        source = PosedImages(tracked.images, grid, RigidTransform.identity(len(tracked.frame_time_s)))
-    size = np.array([grid.vector_pitch_mm, grid.sample_spacing_mm])
+        source = PosedImages(recording.images, grid, RigidTransform.identity(len(recording.frame_time_s)))
+    size = recording.pixel_mm
     bins = np.minimum(np.maximum(1, np.round(pixel_mm / size)).astype(int), [grid.vectors, grid.samples])
     shape = (len(frames), grid.vectors // bins[0], grid.samples // bins[1])
     if min(shape[1:]) < 8:
         raise InvalidInputError(
-            f"{tracked.name}: expected images of at least 8 pixels of {pixel_mm:g} mm either way, "
+            f"{recording.name}: expected images of at least 8 pixels of {pixel_mm:g} mm either way, "
             f"got {shape[1]} x {shape[2]}"
         )
     transform = extra_module("skimage.transform", "calibrate", "a calibration from images")
@@ -231,8 +196,8 @@ def read_stack(
     still = ~(np.ptp(images, axis=0) > 0)
     if still.all():
         raise InsufficientDataError(
-            f"{tracked.name}: expected images that change, got the same in all frames"
+            f"{recording.name}: expected images that change, got the same in all frames"
         )
     images[:, still & ~np.isnan(images).any(axis=0)] = np.nan
     first = size * (bins - 1) / 2.0 + [grid.first_vector_mm, grid.first_sample_depth_mm]
-    return Stack(images, np.concatenate([size * bins, first]), tracked.world_from_sensor(frames)), frames
+    return Stack(images, np.concatenate([size * bins, first]), recording.world_from_sensor(frames)), frames

@@ -19,12 +19,11 @@ from calibration.motion import require_adequate
 from calibration.nwires import label_by_wires, nwire_errors_mm, trimmed_mean_mm
 from calibration.orientation import calibrate_orientation
 from calibration.plane import calibrate_plane
-from calibration.points import ImagePoints, Seen
+from calibration.points import ImagePoints, Recording, Seen
 from calibration.recording import (
     CHOICE_STEP_S,
     SEARCH_S,
     Outcome,
-    Recording,
     calibrate_recording,
     choose_crossings,
     paired,

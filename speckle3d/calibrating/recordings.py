@@ -4,15 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
-from scipy.spatial.transform import RigidTransform
-
-from calibration.images.stacks import TrackedImages
-from calibration.recording import Recording
+from calibration.points import Recording
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
-from speckle3d.core.grid import ImageGrid
 from speckle3d.core.streams import TimedPoses, TimedRotations
-from speckle3d.core.sweep import BModeSettings, Frames, Sweep
+from speckle3d.core.sweep import BModeSettings, Sweep
 from speckle3d.imaging.voxels.settings import Levels
 from speckle3d.io.import_settings import ImportSettings, MissingSettingsError, settings_for
 from speckle3d.io.load import IMAGE, SIZED, kind_of, load_sweep
@@ -27,8 +22,9 @@ def open_recording(
     images: Path,
     poses: Path | None,
     pixel_mm: tuple[float, float] | None,
-    sensor: str,
+    sensor: str = "tracker",
     transform: str | None = None,
+    outside: float = 0.0,
 ) -> Recording:
     """Open images and the readings of one sensor.
 
@@ -39,65 +35,28 @@ def open_recording(
     sensor : {"tracker", "orientation"}
     transform : str, optional
         Name of the poses in an image sequence, as ``ToolToTracker``.
+    outside : float
+        Grey level outside a fan.
 
     Raises
     ------
     InsufficientDataError
         If there is no such sensor.
     """
-    sweep, pictures, grid, readings, offset_s = _opened(images, poses, pixel_mm, sensor, transform, 0.0)
-    size = np.array([grid.vector_pitch_mm, grid.sample_spacing_mm])
-    first_px = np.array([grid.first_vector_mm, grid.first_sample_depth_mm]) / size
-    return Recording(pictures, size, first_px, sweep.frame_time_s, readings, offset_s)
-
-
-def open_tracked(
-    images: Path,
-    poses: Path | None,
-    pixel_mm: tuple[float, float] | None,
-    time_offset_s: float | None = None,
-    transform: str | None = None,
-) -> tuple[TrackedImages, RigidTransform | None]:
-    """Open tracked images, with the mounting that their file holds, if any.
-
-    Parameters
-    ----------
-    time_offset_s : float, optional
-        In place of the file's own.
-    transform : str, optional
-        See `open_recording`.
-
-    Raises
-    ------
-    InsufficientDataError
-        If there is no tracker.
-    """
-    sweep, pictures, grid, readings, offset_s = _opened(images, poses, pixel_mm, "tracker", transform)
-    assert isinstance(readings, TimedPoses)
-    offset_s = offset_s if time_offset_s is None else time_offset_s
-    mounting = None if sweep.tracker is None else sweep.tracker.sensor_from_image
-    return TrackedImages(pictures, grid, sweep.frame_time_s, readings, offset_s, images.name), mounting
-
-
-def _opened(
-    images: Path,
-    poses: Path | None,
-    pixel_mm: tuple[float, float] | None,
-    sensor: str,
-    transform: str | None,
-    outside: float = np.nan,
-) -> tuple[Sweep, Frames, ImageGrid, TimedPoses | TimedRotations, float]:
-    """A sweep, its grey images and their grid, and one sensor's readings with the offset of their clock."""
     if sensor not in ("tracker", "orientation"):
         raise InvalidInputError(f"--sensor: expected tracker or orientation, got {sensor!r}")
     sweep = _load(images, pixel_mm, transform if poses is None else None)
-    given = _readings(sweep, images, sensor) if poses is None else _readings_of(poses, sensor, transform)
+    readings, offset_s = (
+        _readings(sweep, images, sensor) if poses is None else _readings_of(poses, sensor, transform)
+    )
+    pictures, grid = sweep.frames, sweep.grid
     is_grey = isinstance(sweep.signal, BModeSettings)
-    if is_grey and sweep.grid.fan is None:
-        return sweep, sweep.frames, sweep.grid, *given
-    levels: Levels = "stored" if is_grey else "log"
-    pictures = GreyImages(sweep, DYNAMIC_RANGE_DB, clipped=False, levels=levels, outside=outside)
-    return sweep, pictures, pictures.grid, *given
+    if not is_grey or grid.fan is not None:
+        levels: Levels = "stored" if is_grey else "log"
+        grey = GreyImages(sweep, DYNAMIC_RANGE_DB, clipped=False, levels=levels, outside=outside)
+        pictures, grid = grey, grey.grid
+    mounting = None if sweep.tracker is None else sweep.tracker.sensor_from_image
+    return Recording(pictures, grid, sweep.frame_time_s, readings, offset_s, images.name, mounting)
 
 
 def _load(path: Path, pixel_mm: tuple[float, float] | None, transform: str | None) -> Sweep:

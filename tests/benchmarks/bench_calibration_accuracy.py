@@ -23,7 +23,7 @@ from options import parsed
 from scipy.spatial.transform import RigidTransform
 
 from calibration.detection.lines import detect_lines
-from calibration.recording import Recording
+from calibration.points import Recording
 from speckle3d.calibrating.phantoms import found, solved
 from speckle3d.calibrating.settings import OrientationSettings, PlaneSettings, WireSettings
 from speckle3d.core.errors import InsufficientDataError
@@ -43,9 +43,7 @@ def simulated(preset, seed, frames, **settings):
 
 def recording_of(sweep, sensor):
     images = GreyImages(sweep, 60.0, clipped=False)
-    size = np.array([images.grid.vector_pitch_mm, images.grid.sample_spacing_mm])
-    origin = np.array([0.0, images.grid.first_sample_depth_mm]) / size
-    return Recording(images, size, origin, sweep.frame_time_s, sensor.readings, sensor.time_offset_s)
+    return Recording(images, images.grid, sweep.frame_time_s, sensor.readings, sensor.time_offset_s)
 
 
 def plane(reflector, seed, frames):

@@ -13,7 +13,7 @@ from cache import simulated
 from options import parsed
 
 from calibration.clock.images import delay_from_images
-from calibration.images.stacks import TrackedImages
+from calibration.points import Recording
 from speckle3d.io.load import load_sweep
 from speckle3d.simulation.presets import SimulationSettings
 from speckle3d.study.images import GreyImages
@@ -31,7 +31,7 @@ def main():
         settings = SimulationSettings(preset="reversal", seed=seed, vectors=32, samples=1909, **frames)
         sweep = load_sweep(simulated(settings))
         images, tracker = GreyImages(sweep, 60.0, clipped=False), sweep.tracker
-        tracked = TrackedImages(images, images.grid, sweep.frame_time_s, tracker.readings)
+        tracked = Recording(images, images.grid, sweep.frame_time_s, tracker.readings)
         found = delay_from_images(tracked, tracker.sensor_from_image)
         off_ms, claim_ms = 1e3 * (found.seconds - tracker.time_offset_s), 1e3 * found.standard_error_s
         print(f"seed {seed}: {off_ms:+.1f} ms off, claimed {claim_ms:.1f} ms")

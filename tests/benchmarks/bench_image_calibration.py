@@ -21,7 +21,7 @@ from options import parsed
 
 from calibration.images.similarity import prepare
 from calibration.images.solver import calibrate_from_sweeps
-from calibration.images.stacks import TrackedImages
+from calibration.points import Recording
 from calibration.settings import ImageFit
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.io.load import load_sweep
@@ -39,7 +39,7 @@ def opened(path):
     images = GreyImages(sweep, 60.0, clipped=False)
     held = np.stack([images[k] for k in range(len(sweep))])
     tracker = sweep.tracker
-    return TrackedImages(held, images.grid, sweep.frame_time_s, tracker.readings, tracker.time_offset_s)
+    return Recording(held, images.grid, sweep.frame_time_s, tracker.readings, tracker.time_offset_s)
 
 
 def prepared(seed, frames=160):

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from panel.viewable import Viewable
 
-from calibration.recording import Recording
+from calibration.points import Recording
 from speckle3d.app.folder import Folder
 from speckle3d.app.page import Page
 from speckle3d.app.phantom.lines import LinesViewer

@@ -11,7 +11,7 @@ from bokeh.events import DoubleTap, SelectionGeometry, Tap
 from bokeh.models import ColumnDataSource, HoverTool, Range1d
 from bokeh.plotting import figure
 
-from calibration.recording import Recording
+from calibration.points import Recording
 from calibration.solution import Solution
 
 USED, DROPPED, REGION, LEFT_OUT, UNKNOWN = "#0072B2", "#D55E00", "#F0E442", "#999999", "#e8e8e8"

@@ -13,8 +13,8 @@ import panel as pn
 from bokeh.models import ColumnDataSource, PointDrawTool
 from panel.viewable import Viewable
 
-from calibration.points import Seen
-from calibration.recording import Recording, choose_crossings
+from calibration.points import Recording, Seen
+from calibration.recording import choose_crossings
 from speckle3d.app.folder import Folder
 from speckle3d.app.look import batched
 from speckle3d.app.phantom.plots import DROPPED, FOUND, USED

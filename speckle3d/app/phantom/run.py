@@ -13,8 +13,8 @@ from typing import Any
 import panel as pn
 from panel.viewable import Viewable
 
-from calibration.points import Seen
-from calibration.recording import Outcome, Recording
+from calibration.points import Recording, Seen
+from calibration.recording import Outcome
 from calibration.report import text_report
 from speckle3d.app.folder import Folder
 from speckle3d.app.phantom.plots import DROPPED, USED

@@ -10,8 +10,7 @@ import numpy.typing as npt
 import panel as pn
 from panel.viewable import Viewable
 
-from calibration.points import Seen
-from calibration.recording import Recording
+from calibration.points import Recording, Seen
 from speckle3d.app.folder import Folder
 from speckle3d.app.look import batched
 from speckle3d.app.phantom.plots import DROPPED, USED, WIDTH_PX, FramePlot, FrameStrip

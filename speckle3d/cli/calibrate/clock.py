@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from math import nan
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -60,7 +61,7 @@ def clock(
     from calibration.clock.images import delay_from_images
     from calibration.clock.line import FEWEST_FRAMES, delay_from_lines, line_signal
     from calibration.detection.lines import detect_lines
-    from speckle3d.calibrating.recordings import open_recording, open_tracked
+    from speckle3d.calibrating.recordings import open_recording
     from speckle3d.calibrating.settings import region_of
     from speckle3d.io.calibrations import read_calibration, write_calibration
     from speckle3d.study.results import json_text
@@ -74,20 +75,25 @@ def clock(
         raise MismatchError(
             f"{calibration}: expected a calibration of the {sensor}, got one of {known.sensor}"
         )
+    outside = nan if by == "images" else 0.0
+    recording = open_recording(images, poses, pixel_mm, sensor, transform, outside)
     if by == "images":
-        offset_s = None if known is None else known.time_offset_s
-        tracked, mounting = open_tracked(images, poses, pixel_mm, offset_s, transform)
-        mounting = mounting if known is None else known.sensor_from_image
+        mounting = recording.mounting
+        if known is not None:
+            mounting, offset_s = known.sensor_from_image, known.time_offset_s
+            recording = recording if offset_s is None else replace(recording, time_offset_s=offset_s)
         if mounting is None:
             raise InsufficientDataError(
                 f"{images}: expected --calibration, how the image sits on the sensor, at least roughly; "
                 "got none"
             )
         with progress_bar("trying delays") as progress, naming(str(images)):
-            delay = delay_from_images(tracked, mounting, search_s, progress=progress)
-        frames, words = len(tracked.frame_time_s), f"images of the two ways correlate by {delay.followed:.2f}"
+            delay = delay_from_images(recording, mounting, search_s, progress=progress)
+        frames, words = (
+            len(recording.frame_time_s),
+            f"images of the two ways correlate by {delay.followed:.2f}",
+        )
     else:
-        recording = open_recording(images, poses, pixel_mm, sensor, transform)
         with naming("--region"):
             corners = region_of(region or "")
         with progress_bar(f"finding lines in {images.name}") as progress, naming(str(images)):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -75,11 +76,13 @@ def images(
     --------
     $ speckle3d calibrate images one.h5 across.h5 -o tracker.h5 --start rough.h5
     """
+    import numpy as np
+
     from calibration.images.angulation import angulation
     from calibration.images.report import calibration_from_images, figure_of, notes_of
     from calibration.images.solver import calibrate_images
     from calibration.settings import ImageFit
-    from speckle3d.calibrating.recordings import open_tracked
+    from speckle3d.calibrating.recordings import open_recording
     from speckle3d.calibrating.written import write_with_report
     from speckle3d.io.calibrations import read_calibration
 
@@ -91,15 +94,18 @@ def images(
     known = None if start is None else read_calibration(start)
     offset_s = known.time_offset_s if time_offset_s is None and known is not None else time_offset_s
     readings = poses or (None, None)
-    one, mounting = open_tracked(first, readings[0], pixel_mm, offset_s, transform)
-    other, _ = open_tracked(second, readings[1], pixel_mm, offset_s, transform)
-    if known is not None:
-        mounting = known.sensor_from_image
+    one, other = (
+        open_recording(images, poses, pixel_mm, "tracker", transform, np.nan)
+        for images, poses in zip((first, second), readings, strict=True)
+    )
+    if offset_s is not None:
+        one, other = (replace(sweep, time_offset_s=offset_s) for sweep in (one, other))
+    mounting = one.mounting if known is None else known.sensor_from_image
     begin = _start(start_mm, start_deg, mounting, first)
     sweeps = one, other
     # Half of the limits: a mounting that is off by 20 degrees is good enough for no more.
     posed = [sweep.world_from_sensor(sweep.covered()) for sweep in sweeps]
-    angulation(posed[0], posed[1], begin, one.grid.corners_mm).require(0.5)
+    angulation(posed[0], posed[1], begin).require(0.5)
     with progress_bar("comparing sweeps") as bar:
         found = calibrate_images(one, other, begin, fit, bar)
     if not found.converged:

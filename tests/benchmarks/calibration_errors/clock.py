@@ -9,11 +9,11 @@ from dataclasses import replace
 import numpy as np
 from floor_scenes import Floor
 
-from calibration.points import Seen
-from calibration.recording import Recording
+from calibration.points import Recording, Seen
 from speckle3d.calibrating.phantoms import solved
 from speckle3d.calibrating.settings import PlaneSettings
 from speckle3d.core.errors import Speckle3DError
+from speckle3d.core.grid import ImageGrid
 from speckle3d.core.streams import TimedPoses
 
 from .rows import Row, trials
@@ -36,7 +36,7 @@ def recorded(seed):
         sensor_s = sensor_s[rng.random(sensor_s.size) > 0.05]
     readings = TimedPoses(sensor_s - offset_s, floor.readings(sensor_s, drifts=bool(seed % 2)))
     images, given_mm = np.zeros((len(frame_s), 2, 2), np.uint8), floor.pixel_mm * rng.uniform(0.99, 1.01, 2)
-    recording = Recording(images, given_mm, np.zeros(2), frame_s, readings)
+    recording = Recording(images, ImageGrid(2, 2, *given_mm), frame_s, readings)
     return recording, Seen(np.arange(len(frame_s)), floor.lines(frame_s)), offset_s
 
 

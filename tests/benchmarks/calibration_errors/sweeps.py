@@ -28,7 +28,7 @@ def judged(crossing_deg, seed):
     start, grid = displaced(truth, rng, 1.5, 1.5), first.grid
     poses = [each.world_from_sensor(each.covered()) for each in (first, second)]
     try:  # as the command does it: the motion is judged first at the start
-        angulation(*poses, start, grid.corners_mm).require(0.5)
+        angulation(*poses, start).require(0.5)
         found = calibrate_images(first, second, start, ImageFit(capture_mm=0.0, capture_deg=0.0))
     except InsufficientDataError:
         return None

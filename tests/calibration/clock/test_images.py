@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import RigidTransform
 
 from calibration.clock.images import delay_from_images
-from calibration.images.stacks import TrackedImages
+from calibration.points import Recording
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.streams import TimedPoses
 from speckle3d.io.load import load_sweep
@@ -31,7 +31,7 @@ def tracked(recording, offset_s, jitter_mm=0.0, seed=0):
     true = TimedPoses(sweep.frame_time_s, sweep.truth).at(times)
     jitter = jitter_mm * np.random.default_rng(seed).standard_normal((len(times), 3))
     poses = RigidTransform.from_translation(jitter) * true
-    return TrackedImages(images, grid, sweep.frame_time_s, TimedPoses(times - offset_s, poses))
+    return Recording(images, grid, sweep.frame_time_s, TimedPoses(times - offset_s, poses))
 
 
 # Two milliseconds is the target; the poses here are interpolated between frames 40 ms apart.

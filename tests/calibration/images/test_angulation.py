@@ -4,10 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from calibration.images.angulation import PARAMETERS, angulation
+from calibration.images.angulation import angulation
 from speckle3d.core.errors import InsufficientDataError
-
-CORNERS = np.array([[0.0, 0.0, 0.0], [38.0, 0.0, 0.0], [0.0, 44.0, 0.0], [38.0, 44.0, 0.0]])
 
 
 def fan(frames, degrees, length, heading_deg):
@@ -20,12 +18,18 @@ def fan(frames, degrees, length, heading_deg):
     return RigidTransform.from_rotation(heading) * RigidTransform.from_components(shifts, tilts)
 
 
-@pytest.mark.parametrize("heading_deg", [0.0, 90.0], ids=["parallel", "crossing but not tilted"])
-def test_sweeps_that_cannot_tell_are_refused_with_the_reason(heading_deg):
-    first, second = fan(60, 0.0, 20.0, 0.0), fan(60, 0.0, 20.0, heading_deg)
-    found = angulation(first, second, RigidTransform.identity(), CORNERS)
-    assert found.verdict.startswith("insufficient")
-    # A shift along the beam moves all points alike.
-    assert found.alone[PARAMETERS.index("y")] == pytest.approx(0.0, abs=1e-9)
-    with pytest.raises(InsufficientDataError, match=found.weakest):
+@pytest.mark.parametrize(
+    ("degrees", "heading_deg", "word"),
+    [(40.0, 5.0, "cross"), (15.0, 90.0, "fan"), (25.0, 60.0, "weak"), (40.0, 90.0, "sufficient")],
+)
+def test_sweeps_that_hardly_cross_or_fan_are_refused_with_the_advice(degrees, heading_deg, word):
+    first, second = fan(60, degrees, 20.0, 0.0), fan(60, degrees, 20.0, heading_deg)
+    found = angulation(first, second, RigidTransform.identity())
+    assert found.crossing_deg == pytest.approx(heading_deg, abs=1e-6)
+    assert found.fan_deg == pytest.approx((degrees, degrees))
+    assert word in found.verdict
+    if found.verdict.startswith("insufficient"):
+        with pytest.raises(InsufficientDataError, match=word):
+            found.require()
+    else:
         found.require()
