@@ -34,10 +34,6 @@ FEWEST_FRAMES = 20
 _STILL = 1e-9
 """Range of a line's depth or slope, mm or rad, that is only rounding."""
 
-_TREND = 0.95
-"""Share of the variance that constant speed may explain; more, and the motion fits at any delay."""
-
-_ONE_WAY = "the motion goes one way and does not return: move the probe up and down"
 _IRREGULARLY = "move the probe up and down, irregularly"
 
 
@@ -111,9 +107,7 @@ def delay_from_lines(
             f"the best delay, {tried[misfits.argmin()]:+.3f} s: move the probe up and down, faster; or the "
             "delay lies outside the range searched: --search-s"
         )
-    trend = np.polynomial.Polynomial.fit(times, wanted, 1)(times)
-    one_way = float(np.var(wanted - trend)) <= (1.0 - _TREND) * float(np.var(wanted))
-    best = peak_of(tried, misfits, _ONE_WAY if one_way else "the motion repeats itself; move irregularly")
+    best = peak_of(tried, misfits, f"the motion repeats itself, or does not return: {_IRREGULARLY}")
     seconds, least, curvature = least_between(misfit, tried, best)
     left, rank = fit(seconds)
     # Of few independent values any slow motion explains a line at some delay, which is fitted too: the share
@@ -129,6 +123,6 @@ def delay_from_lines(
     if not error < search_s:
         raise InsufficientDataError(
             f"expected a motion that shows the delay, got {seconds:+.3f} s +- {error:.3g} s, no better than "
-            f"the {search_s:g} s searched: {_ONE_WAY if one_way else _IRREGULARLY}"
+            f"the {search_s:g} s searched: {_IRREGULARLY}"
         )
     return ClockOffset(seconds, error, 1.0 - least)

@@ -14,9 +14,9 @@ from scipy.linalg import eigh
 from scipy.spatial.transform import RigidTransform
 
 from calibration.images.angulation import PARAMETERS, Angulation, point_motion
-from calibration.images.fit import Refined, about_pivot
+from calibration.images.fit import Refined
 from calibration.images.search import apart_mm
-from calibration.images.similarity import Comparison, CrossingSweeps, Similarity, stepped
+from calibration.images.similarity import Comparison, CrossingSweeps, Similarity, about_pivot, stepped
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.geometry import skew
@@ -71,11 +71,11 @@ def curvature_of(refined: Refined, steps: FloatArray) -> tuple[FloatArray, Float
     By differences of the exact slopes; Gauss-Newton's matrix, in which the slopes of speckle count in full,
     is several times too stiff.
     """
-    base, columns = about_pivot(refined.pivot_mm), []
+    pivot_mm, columns = refined.comparison.pivot_mm, []
     for parameter, step in enumerate(np.diag(steps)):
-        places = (stepped(refined.sensor_from_image, sign * step, refined.pivot_mm) for sign in (-1.0, 1.0))
+        places = (stepped(refined.sensor_from_image, sign * step, pivot_mm) for sign in (-1.0, 1.0))
         seen = [refined.comparison.at(place, True) for place in places]
-        columns.append(_fallen(refined, seen) @ base / (2.0 * steps[parameter]))
+        columns.append(_fallen(refined, seen) / (2.0 * steps[parameter]))
     bends = np.stack(columns, axis=2)
     return bends, positive(bends.sum(axis=0), refined.system[0])
 
@@ -106,20 +106,20 @@ def claimed(
     .. [1] A. C. Cameron and D. L. Miller, "A practitioner's guide to cluster-robust inference", Journal of
        Human Resources, 2015 (the jackknife over clusters).
     """
-    unit, base = crossing.unit, about_pivot(refined.pivot_mm)
-    # How far an error of one displaces the sweeps against each other, a shift that shows most by as much.
+    unit, base = crossing.unit, about_pivot(refined.comparison.pivot_mm)
+    # How far an error of one moves sweeps at right angles apart: a shift across or out of the image, root 2.
     stiff, wide = np.diag(refined.system[0]), unit * WIDE_MM
-    shows = np.sqrt(stiff / stiff[3:].max())
+    shows = 2.0 * np.sqrt(stiff / (stiff[3] + stiff[5]))
     farthest = _FARTHEST * np.repeat([1.0, unit], 3)
     bends, curvature = curvature_of(refined, np.minimum(wide / np.maximum(shows, 1e-6), farthest))
-    slopes = (refined.weight[:, None] * refined.similarity.gradient) @ base
+    slopes = refined.weight[:, None] * refined.similarity.gradient
     blocks = _numbered(np.floor(refined.places_mm / (BLOCK_MM * unit)))
     sweep, image = refined.comparison.images.T
     stretches = _numbered(np.column_stack([sweep, _numbered(np.column_stack([sweep, image])) // STRETCH]))
     left_out = [_left_out(slopes, bends, one, curvature) for one in (blocks, stretches)]
     moved = np.linalg.inv(curvature)
     variance = np.repeat(np.square(tracker), 3)
-    wander = moved @ _wandering(refined, _pulls(refined, wide, base), variance) @ moved.T
+    wander = moved @ _wandering(refined, _pulls(refined, wide), variance) @ moved.T
     covariance = base @ (sum(left_out) + wander) @ base.T
     covariance[4, 4] += (DEEP_MM * unit) ** 2
     return np.asarray(covariance), curvature
@@ -182,7 +182,7 @@ def require_one_answer(
             )
 
 
-def _pulls(refined: Refined, step_mm: float, base: FloatArray) -> FloatArray:
+def _pulls(refined: Refined, step_mm: float) -> FloatArray:
     """How each patch's slopes change as the second sweep is displaced along the world's axes, (p, 6, 3)."""
     first, second = refined.comparison.stacks
     columns = []
@@ -192,7 +192,7 @@ def _pulls(refined: Refined, step_mm: float, base: FloatArray) -> FloatArray:
             world = RigidTransform.from_translation(sign * step_mm * axis) * second.world_from_sensor
             moved = replace(refined.comparison, stacks=(first, replace(second, world_from_sensor=world)))
             seen.append(moved.at(refined.sensor_from_image, True))
-        columns.append(_fallen(refined, seen) @ base / (2.0 * step_mm))
+        columns.append(_fallen(refined, seen) / (2.0 * step_mm))
     return np.stack(columns, axis=2)
 
 

@@ -18,7 +18,6 @@ from scipy.spatial.transform import RigidTransform
 
 from calibration.images.similarity import Comparison, Similarity, stepped
 from speckle3d.core.arrays import FloatArray
-from speckle3d.core.geometry import skew
 
 ROBUST = 0.5
 """1 - correlation at which a patch has a quarter of the weight of one that correlates fully."""
@@ -47,15 +46,12 @@ class Refined:
         Of each patch.
     comparison : Comparison
         Where the patches come from.
-    pivot_mm : ndarray, shape (3,)
-        The point of the image that turns leave in place.
     """
 
     sensor_from_image: RigidTransform
     similarity: Similarity
     weight: FloatArray
     comparison: Comparison
-    pivot_mm: FloatArray
     converged: bool = False
 
     @property
@@ -65,10 +61,9 @@ class Refined:
 
     @property
     def system(self) -> tuple[FloatArray, FloatArray]:
-        """Gauss-Newton's matrix and the slope of the similarity, of the parameters at the pivot."""
-        base = about_pivot(self.pivot_mm)
+        """Gauss-Newton's matrix and the slope of the similarity."""
         normal = np.einsum("p,pij->ij", self.weight, self.similarity.normal)
-        return base.T @ normal @ base, base.T @ (self.weight @ self.similarity.gradient)
+        return normal, self.weight @ self.similarity.gradient
 
 
 def refine(
@@ -84,11 +79,10 @@ def refine(
     curvature : ndarray, shape (6, 6), optional
         In place of Gauss-Newton's matrix, for Newton's last steps.
     """
-    pivot = comparison.stacks[0].centre_mm
 
     def look(pose: RigidTransform) -> Refined:
         seen = comparison.at(pose, True)
-        return Refined(pose, seen, weights(seen), comparison, pivot)
+        return Refined(pose, seen, weights(seen), comparison)
 
     now, damping = look(start), 1e-2
     for _ in range(max_steps - 1):
@@ -101,7 +95,7 @@ def refine(
         size = float(np.abs(step * LEVERS_MM).max())
         if curvature is not None:
             step *= min(1.0, LONGEST_MM / max(size, LONGEST_MM))
-        trial = look(stepped(now.sensor_from_image, step, pivot))
+        trial = look(stepped(now.sensor_from_image, step, comparison.pivot_mm))
         if better(now.similarity, trial.similarity, now.weight):
             now, damping = trial, max(0.2 * damping, 1e-5)
         else:
@@ -121,13 +115,6 @@ def weights(similarity: Similarity) -> FloatArray:
     unlike = 1.0 - np.where(valid, similarity.alike, 1.0)
     structure = contrast / (contrast + usual)
     return np.asarray(np.where(valid, structure * (ROBUST / (ROBUST + unlike)) ** 2, 0.0))
-
-
-def about_pivot(pivot_mm: FloatArray) -> FloatArray:
-    """Derivative of the parameters at the image's origin with respect to those at a pivot, shape (6, 6)."""
-    base = np.eye(6)
-    base[3:, :3] = skew(pivot_mm)
-    return base
 
 
 def better(here: Similarity, there: Similarity, weight: FloatArray) -> bool:

@@ -15,6 +15,7 @@ from calibration.images.stacks import BASE_PIXEL_MM, WHOLE, Stack, read_stack
 from calibration.points import Recording
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import MismatchError
+from speckle3d.core.geometry import skew
 from speckle3d.core.progress import Progress
 from speckle3d.core.threads import ahead
 from speckle3d.kernels.slicing import PARAMETERS, PatchGrid, PatchScores, PlacedImages, compare_patches
@@ -41,11 +42,18 @@ def stepped(sensor_from_image: RigidTransform, step: FloatArray, pivot_mm: Float
     return RigidTransform.from_matrix(sensor_from_image.as_matrix() @ matrix)
 
 
+def about_pivot(pivot_mm: FloatArray) -> FloatArray:
+    """Derivative of the parameters at the image's origin with respect to those at a pivot, shape (6, 6)."""
+    base = np.eye(6)
+    base[3:, :3] = skew(pivot_mm)
+    return base
+
+
 class Similarity(PatchScores):
     """Correlations of the first sweep's patches with the second sweep, then of the second's with the first.
 
-    `energy` is in grey levels; `normal` and `gradient` are by the image's turns (rad) and displacements (mm);
-    they are empty if they were not asked for.
+    `energy` is in grey levels; `normal` and `gradient` are by the image's turns (rad) about the pivot and
+    displacements (mm); they are empty if they were not asked for.
     """
 
     @property
@@ -85,7 +93,15 @@ class Comparison:
     def at(self, sensor_from_image: RigidTransform, derivatives: bool = False) -> Similarity:
         """Compare at a calibration."""
         parts = list(ahead(lambda way: self._one_way(way, sensor_from_image, derivatives), (0, 1)))
-        return Similarity(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
+        similarity = Similarity(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
+        base = about_pivot(self.pivot_mm)
+        normal, gradient = base.T @ similarity.normal @ base, similarity.gradient @ base
+        return similarity._replace(normal=normal, gradient=gradient)
+
+    @property
+    def pivot_mm(self) -> FloatArray:
+        """Centre of the first stack's images, which turns leave in place, shape (3,)."""
+        return self.stacks[0].centre_mm
 
     @property
     def images(self) -> IntArray:
@@ -220,30 +236,20 @@ class CrossingSweeps:
 
     def level(self, level: Level, sensor_from_image: RigidTransform) -> Comparison:
         """Comparison of patches all over some images, for calibrations near the given one."""
-        sigma = level.sigma_mm * self.unit
-        thin = self._thinned(sigma, sensor_from_image, level.least_weight)
-        patches = [
-            spread_patches(stack, evenly(len(stack), level.images), sigma, level.side, level.overlap)
-            for stack in thin
-        ]
-        return Comparison(thin, (patches[0], patches[1]), self._gap(sigma, thin, sensor_from_image))
-
-    def _thinned(
-        self, sigma_mm: float, sensor_from_image: RigidTransform, least_weight: float = WHOLE
-    ) -> tuple[Stack, Stack]:
-        stacks = []
+        sigma, stacks = level.sigma_mm * self.unit, list[Stack]()
         for way, stack in enumerate(self.stacks):
-            key, spacing = (way, sigma_mm, least_weight), frame_spacing(stack, sensor_from_image)
+            key, spacing = (way, sigma, level.least_weight), stack.spacing_mm(sensor_from_image)
             if key not in self._blurred:
-                self._blurred[key] = stack.blurred(sigma_mm, least_weight)
-            apart, width = max(0.75 * sigma_mm, spacing), max(0.7 * sigma_mm, 0.5 * spacing)
+                self._blurred[key] = stack.blurred(sigma, level.least_weight)
+            apart, width = max(0.75 * sigma, spacing), max(0.7 * sigma, 0.5 * spacing)
             stacks.append(self._blurred[key].thinned(sensor_from_image, apart, width))
-        return stacks[0], stacks[1]
-
-    def _gap(self, sigma_mm: float, stacks: tuple[Stack, Stack], sensor_from_image: RigidTransform) -> float:
-        """Largest gap that is interpolated across: three times the usual distance between images."""
-        spacing = max(frame_spacing(stack, sensor_from_image) for stack in stacks)
-        return max(2.25 * sigma_mm, 3.0 * spacing, 2.0 * self.unit)
+        first, second = (
+            spread_patches(stack, evenly(len(stack), level.images), sigma, level.side, level.overlap)
+            for stack in stacks
+        )
+        # Interpolated across: three times the usual distance between images.
+        gap = 3.0 * max(stack.spacing_mm(sensor_from_image) for stack in stacks)
+        return Comparison((stacks[0], stacks[1]), (first, second), max(2.25 * sigma, gap, 2.0 * self.unit))
 
 
 def prepare(first: Recording, second: Recording, progress: Progress | None = None) -> CrossingSweeps:
@@ -280,9 +286,3 @@ def evenly(count: int, wanted: int) -> IntArray:
     """Numbers of `wanted` images spread evenly over `count`, without the two at the ends."""
     spread = np.linspace(0.5, count - 1.5, min(wanted, count)).round()
     return np.unique(np.clip(spread, 0, count - 1).astype(np.int64))
-
-
-def frame_spacing(stack: Stack, sensor_from_image: RigidTransform) -> float:
-    """Mean distance between neighbouring images along their normals, mm."""
-    way = stack.travelled(sensor_from_image)
-    return float(way[-1] / max(len(way) - 1, 1))

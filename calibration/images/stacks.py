@@ -121,6 +121,10 @@ class Stack:
             steps += 0.25 * np.abs(np.einsum("ij,ij->i", np.diff(place, axis=0), normal))
         return np.concatenate([[0.0], np.cumsum(steps)])
 
+    def spacing_mm(self, sensor_from_image: RigidTransform) -> float:
+        """Mean distance between neighbouring images along their normals."""
+        return float(self.travelled(sensor_from_image)[-1] / max(len(self) - 1, 1))
+
     def thinned(self, sensor_from_image: RigidTransform, spacing_mm: float, sigma_mm: float) -> Stack:
         """Average neighbouring images and their poses by a Gaussian, at equal distances along the sweep.
 
