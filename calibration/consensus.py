@@ -37,8 +37,8 @@ _MOST_FRAMES = 120
 _BATCHES = (300, *[3000] * 10)
 """Samples drawn at a time. With the right candidate drawn in three frames of ten, one sample in 120 is right;
 in one of ten, one in 10,000. All take some two seconds."""
-_KEPT, _JUDGED = 25, 3
-"""Best samples of a batch that are refined, and best refined ones that are judged."""
+_KEPT = 8
+"""Best samples of a batch that are refined and judged."""
 _SURE = -0.5
 """Logarithm of the false alarms, over the number of frames, at which the search ends: a third of the frames
 agree to within a hundredth of the image, or more to less."""
@@ -116,8 +116,9 @@ def find_consensus(points: ImagePoints, pixel_mm: FloatArray | None = None) -> C
     rng, best = np.random.default_rng(0), (np.inf, GATES_MM[-1], np.zeros(12))
     voters = _Candidates(points.of_some_frames(_MOST_FRAMES), pixel_mm)
     for count in _BATCHES:
-        for model in voters.promising(voters.samples(rng, count)):
-            best = min(best, (*voters.false_alarms(model), model), key=lambda one: one[0])
+        for model in voters.best(voters.samples(rng, count)):
+            refined = voters.refined(model)
+            best = min(best, (*voters.false_alarms(refined), refined), key=lambda one: one[0])
         if best[0] < _SURE * len(voters.frames):
             break
     log_alarms, gate, model = best
@@ -173,12 +174,7 @@ class _Candidates:
         turned = np.swapaxes(matrix, -1, -2)
         return np.asarray(np.linalg.solve(turned @ matrix + self.prior, turned @ wanted[..., None])[..., 0])
 
-    def promising(self, models: FloatArray) -> FloatArray:
-        """Refine the plausible models with which most frames agree; the best of them."""
-        best = [self._refined(model) for model in self._best(models, _KEPT)]
-        return self._best(np.reshape(best, (-1, 12)), _JUDGED)
-
-    def _best(self, models: FloatArray, most: int) -> FloatArray:
+    def best(self, models: FloatArray) -> FloatArray:
         """The plausible models with the least sum of the frames' squared distances, each bounded."""
         axes = models[:, 3:9].reshape(-1, 2, 3)
         length = np.linalg.norm(axes, axis=2)
@@ -186,7 +182,7 @@ class _Candidates:
         sized = np.all((length > self.shortest) & (length < self.longest), axis=1)
         models = models[sized & (cosine < _SQUARE)]
         cost = np.minimum(self._nearest(models), _LOOSE_MM**2).sum(axis=1)
-        return np.asarray(models[np.argsort(cost, kind="stable")[:most]])
+        return np.asarray(models[np.argsort(cost, kind="stable")[:_KEPT]])
 
     def _nearest(self, models: FloatArray) -> FloatArray:
         """Squared distance of each frame's nearest candidate from the point, shape (models, frames)."""
@@ -195,7 +191,8 @@ class _Candidates:
         squares = np.sum(left.reshape(len(models), len(self.of_frame), 3) ** 2, axis=2)
         return np.asarray(np.minimum.reduceat(squares, self.start, axis=1))
 
-    def _refined(self, model: FloatArray) -> FloatArray:
+    def refined(self, model: FloatArray) -> FloatArray:
+        """The model of the candidates that agree with it, within less and less."""
         for gate in _TIGHTER_MM:
             squares = np.sum((self.rows @ model - self.wanted) ** 2, axis=1)
             first = nearest_of_frames(self.of_frame, squares)

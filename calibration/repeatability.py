@@ -71,7 +71,8 @@ def repeatability(
     sensors = sorted({one.sensor for one in calibrations})
     if len(sensors) > 1:
         raise MismatchError(f"expected calibrations of one sensor, got {' and '.join(sensors)}")
-    angles = rotation_errors([one.rotation for one in calibrations])
+    turns = Rotation.concatenate([one.rotation for one in calibrations])
+    angles = (turns.mean().inv() * turns).as_rotvec()[:, ::-1]
     sd = np.sqrt(np.sum(angles**2, axis=0) / (len(calibrations) - 1))
     if size_px is None or any(one.translation_mm is None for one in calibrations):
         return Repeatability(len(calibrations), sd, None, None, None)
@@ -84,12 +85,6 @@ def repeatability(
     shift = np.linalg.norm(places[1:, 0] - places[0, 0], axis=1)
     corners = float(np.sqrt(np.mean(scatter[1:] ** 2)))
     return Repeatability(len(calibrations), sd, float(scatter[0]), corners, shift)
-
-
-def rotation_errors(rotations: Sequence[Rotation]) -> FloatArray:
-    """Deviations from the mean rotation as roll, yaw and tilt, rad, shape (n, 3)."""
-    every = Rotation.concatenate(rotations)
-    return np.asarray((every.mean().inv() * every).as_rotvec()[:, ::-1])
 
 
 def validate(solution: Solution, points: ImagePoints) -> FloatArray:

@@ -195,9 +195,8 @@ def _clear_peak(tried_s: FloatArray, curves: FloatArray, misfit: FloatArray, dou
     peak_of(tried_s, misfit, f"the motion repeats itself, or {doubts}")
     near = np.abs(tried_s - tried_s[best]) < _half_width(tried_s, misfit, best) + 0.5 * STEP_S
     there = curves[:, np.isfinite(curves[best])]
-    agree, count, chance = int(near[np.nanargmax(there, axis=0)].sum()), there.shape[1], float(near.mean())
-    luck = min(1.0, chance + SIGMAS * np.sqrt(chance * (1.0 - chance) / count))
-    if agree < max(LEAST_AGREEING, luck) * count:
+    agree, count = int(near[np.nanargmax(there, axis=0)].sum()), there.shape[1]
+    if agree < LEAST_AGREEING * count:
         raise InsufficientDataError(
             "expected images that show where they were taken, got only "
             f"{agree} of {count} that fit best near {tried_s[best]:+.3f} s, the best delay of all: {doubts}"

@@ -16,6 +16,7 @@ References
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -23,9 +24,10 @@ from numpy.lib.stride_tricks import sliding_window_view
 from scipy import fft, ndimage
 
 from calibration.detection.dots import centred
-from calibration.detection.region import checked_pixel, region_mask, seen_in_frames
+from calibration.detection.region import checked_pixel, finite_grey, region_mask, seen_in_frames
 from calibration.points import Seen
 from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.extras import extra_module
 from speckle3d.core.sweep import Frames
 
@@ -83,9 +85,7 @@ def crossings_in_frames(
     """
     size, standing = checked_pixel(pixel_mm), standing_still(frames)
     inside = None if region_px is None else region_mask(frames.shape[1:], region_px)
-    return seen_in_frames(
-        frames, lambda image: _crossings(image, size, inside, standing), "no lines that cross", progress
-    )
+    return seen_in_frames(frames, lambda image: _crossings(image, size, inside, standing), progress)
 
 
 def standing_still(frames: Frames) -> Float32Array | None:
@@ -101,11 +101,12 @@ def standing_still(frames: Frames) -> Float32Array | None:
 
 
 def _crossings(
-    grey: Float32Array,
+    image: npt.NDArray[Any],
     pixel_mm: FloatArray,
     inside: BoolArray | None,
     standing: Float32Array | None,
 ) -> tuple[FloatArray, FloatArray]:
+    grey = finite_grey(image)
     if standing is not None:
         grey = grey - standing
     if inside is not None:
@@ -128,8 +129,9 @@ def _crossings(
         away = np.linalg.norm((pixels[kept] - pixels[one]) * pixel_mm, axis=1)
         if score[one] > 0 and (away >= _APART_MM).all() and len(kept) < _MOST_CANDIDATES:
             kept.append(int(one))
-    centres = [centred(grey, one, pixel_mm) for one in pixels[kept]]
-    return np.reshape(centres, (-1, 2)), score[kept].astype(float)
+    if not kept:
+        raise InsufficientDataError("no lines that cross")
+    return np.array([centred(grey, one, pixel_mm) for one in pixels[kept]]), score[kept].astype(float)
 
 
 def _resampled(grey: Float32Array, pixel_mm: FloatArray, width_mm: float) -> tuple[Float32Array, FloatArray]:

@@ -8,14 +8,16 @@ above half of its peak.
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
-from calibration.detection.region import checked_pixel, region_mask, seen_in_frames
+from calibration.detection.region import checked_pixel, finite_grey, region_mask, seen_in_frames
 from calibration.points import Seen
 from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.extras import extra_module
 from speckle3d.core.leastsquares import robust_sigma
 from speckle3d.core.sweep import Frames
@@ -65,35 +67,29 @@ def dots_in_frames(
     """
     size = checked_pixel(pixel_mm)
     inside = None if region_px is None else region_mask(frames.shape[1:], region_px)
-    return seen_in_frames(frames, lambda image: _dots(image, size, inside), "no dot", progress)
+    return seen_in_frames(frames, lambda image: _dots(image, size, inside), progress)
 
 
 def _dots(
-    grey: Float32Array, pixel_mm: FloatArray, inside: BoolArray | None
+    image: npt.NDArray[Any], pixel_mm: FloatArray, inside: BoolArray | None
 ) -> tuple[FloatArray, FloatArray]:
+    grey = finite_grey(image)
     contrast = ndimage.gaussian_filter(grey, _DOT_MM / pixel_mm)
     contrast -= ndimage.gaussian_filter(grey, _SURROUND_MM / pixel_mm, truncate=3.0)
-    limit = _limit(contrast if inside is None else contrast[inside])
-    peaks = _maxima(contrast, limit, pixel_mm, inside)
-    score = contrast[tuple(peaks.T)] - _along_lines(contrast, peaks, pixel_mm)
-    best = np.argsort(-score, kind="stable")
-    best = best[score[best] > limit][:_MOST_DOTS]
-    places = [centred(grey, peak.astype(float), pixel_mm) for peak in peaks[best]]
-    return np.reshape(places, (-1, 2)), score[best].astype(float)
-
-
-def _limit(contrast: Float32Array) -> float:
     # Every seventh pixel: enough for the noise, in a seventh of the time.
-    noise = robust_sigma(contrast.ravel()[::7])
-    return max(_NOISE_SDS * noise, _FAINTEST * float(contrast.max()))
-
-
-def _maxima(contrast: Float32Array, limit: float, pixel_mm: FloatArray, inside: BoolArray | None) -> IntArray:
-    """Columns and rows of maxima that are `_APART_MM` apart, shape (n, 2), strongest first."""
+    levels = (contrast if inside is None else contrast[inside]).ravel()
+    limit = max(_NOISE_SDS * robust_sigma(levels[::7]), _FAINTEST * float(levels.max()))
     near = np.ones(2 * np.maximum(np.rint(_APART_MM / pixel_mm), 1).astype(int) + 1, dtype=bool)
     features = extra_module("skimage.feature", "calibrate", "finding dots of wires")
     peaks = features.peak_local_max(contrast, footprint=near, threshold_abs=limit, exclude_border=False)
-    return np.asarray(peaks if inside is None else peaks[inside[tuple(peaks.T)]])
+    peaks = peaks if inside is None else peaks[inside[tuple(peaks.T)]]
+    score = contrast[tuple(peaks.T)] - _along_lines(contrast, peaks, pixel_mm)
+    best = np.argsort(-score, kind="stable")
+    best = best[score[best] > limit][:_MOST_DOTS]
+    if not best.size:
+        raise InsufficientDataError("no dot")
+    places = [centred(grey, peak.astype(float), pixel_mm) for peak in peaks[best]]
+    return np.array(places), score[best].astype(float)
 
 
 def _along_lines(contrast: Float32Array, peaks: IntArray, pixel_mm: FloatArray) -> Float32Array:

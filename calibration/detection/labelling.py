@@ -63,9 +63,10 @@ def label_dots(dots: Seen, phantom: WirePhantom, pixel_mm: npt.ArrayLike) -> See
     Raises
     ------
     InvalidInputError
-        If the phantom has fewer than two N, or they are not parallel.
+        If the phantom has fewer than two N.
     """
-    layers, size, score = _layers(phantom), np.asarray(pixel_mm, dtype=float), _scores(dots)
+    layers, size, score = _layers(phantom), np.asarray(pixel_mm, dtype=float), dots.score
+    assert score is not None
     wires = np.concatenate([layer.wires for layer in layers])
     found: dict[int, FloatArray] = {}
     dropped = dict(dots.dropped)
@@ -107,7 +108,8 @@ def label_by_calibration(
     """
     image_from_phantom = (chain.target_from_world * world_from_sensor * chain.sensor_from_image).inv()
     kept: list[tuple[int, int, int]] = []
-    dropped, score = dict(dots.dropped), _scores(dots)
+    dropped, score = dict(dots.dropped), dots.score
+    assert score is not None
     for frame in np.unique(dots.frame):
         here = np.flatnonzero(dots.frame == frame)
         expected_mm = _seen_at(phantom, image_from_phantom[int(frame)])
@@ -117,10 +119,6 @@ def label_by_calibration(
             dropped[int(frame)] = "no dot where the calibration expects a wire"
     frames, index, wires = np.array(kept, dtype=np.int64).reshape(-1, 3).T
     return Seen(frames, dots.pixels[index], wires, dropped)
-
-
-def _scores(dots: Seen) -> FloatArray:
-    return np.ones(len(dots)) if dots.score is None else dots.score
 
 
 @dataclass(frozen=True)
@@ -134,25 +132,16 @@ class _Layer:
 
 
 def _layers(phantom: WirePhantom) -> list[_Layer]:
-    shapes = phantom.n_shapes
-    if len(shapes) < 2:
-        raise InvalidInputError(f"phantom: expected two N of wires or more, got {len(shapes)}")
-    along = phantom.directions[shapes[0][0]]
-    first, layers = None, []
-    for shape, crossings in zip(shapes, phantom.crossings_mm(), strict=True):
-        between = phantom.points_mm[shape[2]] - phantom.points_mm[shape[0]]
-        across = between - (between @ along) * along
-        width = float(np.linalg.norm(across))
-        first = across / width if first is None else first
-        straight = float(across @ first) / width
-        if abs(straight) < _PARALLEL_COSINE or abs(phantom.directions[shape[0]] @ along) < _PARALLEL_COSINE:
-            raise InvalidInputError(
-                f"phantom: expected parallel N, got one askew ({phantom.names[shape[0]]})"
-            )
-        above = crossings[0] - phantom.points_mm[shapes[0][0]]
-        height = float(above @ np.cross(along, first))
-        layers.append(_Layer(np.array(shape), width, height, float(np.sign(straight))))
-    return layers
+    if len(phantom.n_shapes) < 2:
+        raise InvalidInputError(f"phantom: expected two N of wires or more, got {len(phantom.n_shapes)}")
+    shapes = np.array(phantom.n_shapes)
+    along, begins = phantom.directions[shapes[0, 0]], phantom.points_mm[shapes[:, 0]]
+    across = phantom.points_mm[shapes[:, 2]] - begins
+    across -= np.outer(across @ along, along)
+    widths = np.linalg.norm(across, axis=1)
+    axis = across[0] / widths[0]
+    heights, turned = (begins - begins[0]) @ np.cross(along, axis), np.sign(across @ axis)
+    return [_Layer(*one) for one in zip(shapes, widths, heights, turned, strict=True)]
 
 
 def _label(dots_mm: FloatArray, score: FloatArray, layers: list[_Layer], phantom: WirePhantom) -> IntArray:

@@ -11,14 +11,21 @@ References
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import gaussian_filter1d
 
-from calibration.detection.region import DENSELY, Columns, checked_pixel, lay_columns, without_standing
+from calibration.detection.region import (
+    DENSELY,
+    Columns,
+    checked_pixel,
+    lay_columns,
+    seen_in_frames,
+    without_standing,
+)
 from calibration.points import Seen
 from calibration.settings import LineSettings, Place
 from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
@@ -227,18 +234,13 @@ def detect_lines(
         If an argument is not what it must be.
     """
     finder = LineFinder.of_frames(frames, pixel_mm, settings, region_px)
-    found: dict[int, FloatArray] = {}
-    dropped: dict[int, str] = {}
-    count = frames.shape[0]
-    for index in range(count):
-        try:
-            found[index] = finder.line(frames[index]).points_px
-        except NoLineError as error:
-            dropped[index] = str(error)
-        if progress:
-            progress(index + 1, count)
-    points = np.reshape(list(found.values()), (-1, 2, 2))
-    return Seen(np.array(list(found), dtype=np.int64), points, dropped=dropped)
+
+    def find(image: npt.NDArray[Any]) -> tuple[FloatArray, FloatArray]:
+        line = finder.line(image)
+        return line.points_px[None], np.array([line.strength])
+
+    seen = seen_in_frames(frames, find, progress)
+    return replace(seen, pixels=seen.pixels.reshape(-1, 2, 2))
 
 
 def consensus_line(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -12,7 +13,7 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter1d
 
 from calibration.points import Seen
 from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
-from speckle3d.core.errors import InvalidInputError, naming
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError, naming
 from speckle3d.core.geometry import require_finite
 from speckle3d.core.region import polygon_mask
 from speckle3d.core.sweep import Frames
@@ -151,35 +152,39 @@ def checked_pixel(pixel_mm: npt.ArrayLike) -> FloatArray:
     return pixel
 
 
+def finite_grey(image: npt.NDArray[Any]) -> Float32Array:
+    """Grey levels of a frame, all finite."""
+    grey = np.asarray(image, dtype=np.float32)
+    require_finite(grey, "image")
+    return grey
+
+
 def seen_in_frames(
     frames: Frames,
-    find: Callable[[Float32Array], tuple[FloatArray, FloatArray]],
-    nothing: str,
+    find: Callable[[npt.NDArray[Any]], tuple[FloatArray, FloatArray]],
     progress: Callable[[int, int], None] | None = None,
 ) -> Seen:
-    """Apply a detector of dots to every frame, read one at a time; an error names the frame.
+    """Apply a detector to every frame, read one at a time; an error names the frame.
 
     Parameters
     ----------
     frames : Frames, shape (n, column, row)
     find : callable
-        Returns places, shape (k, 2), and their scores, the best first.
-    nothing : str
-        Why a frame shows nothing.
+        Returns places, shape (k, 2) of dots or (k, 2, 2) of lines, and their scores, the best first; or
+        raises `InsufficientDataError`, saying why a frame shows nothing.
     progress : callable, optional
         Called with the number of frames done and their total.
     """
-    count, pixels, scores = frames.shape[0], [np.zeros((0, 2))], [np.zeros(0)]
+    count, numbers, dropped = frames.shape[0], list[int](), dict[int, str]()
+    shown = list[tuple[FloatArray, FloatArray]]()
     for index in range(count):
         with naming(f"frame {index}"):
-            grey = np.asarray(frames[index], dtype=np.float32)
-            require_finite(grey, "image")
-            places, score = find(grey)
-        pixels.append(places)
-        scores.append(score)
+            try:
+                shown.append(find(frames[index]))
+                numbers += [index] * len(shown[-1][1])
+            except InsufficientDataError as error:
+                dropped[index] = str(error)
         if progress:
             progress(index + 1, count)
-    held = [len(score) for score in scores[1:]]
-    dropped = {index: nothing for index, number in enumerate(held) if number == 0}
-    frame = np.repeat(np.arange(count), held)
-    return Seen(frame, np.concatenate(pixels), None, dropped, np.concatenate(scores))
+    pixels, scores = map(np.concatenate, zip(*shown, strict=True)) if shown else np.zeros((2, 0, 2))
+    return Seen(np.array(numbers, dtype=np.int64), pixels, None, dropped, scores)

@@ -60,9 +60,9 @@ LEAST_SIMILARITY = 0.3
 below which sweeps are taken to show too little in common. Of sweeps of different tissue the best found is
 0.1 to 0.2; of the same, 0.35 in the heaviest speckle and shadow tried, to 0.9."""
 
-RIVAL_MM, CLEAR_LEAD = 3.0, 2.0
+RIVAL_MM, CLEAR_LEAD = 3.0, 0.02
 """Distance at which another place found by the search is another answer and not the same one unrefined; and
-the lead over it, in standard errors of their difference, that an answer must have."""
+the lead in correlation that an answer must have: twice what varies between answers from different starts."""
 
 
 def curvature_of(refined: Refined, steps: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -148,12 +148,7 @@ def require_known(covariance: FloatArray, angulation: Angulation, centre_mm: Flo
     )
 
 
-def require_one_answer(
-    comparison: Comparison,
-    answer: RigidTransform,
-    rivals: list[RigidTransform],
-    centre_mm: FloatArray,
-) -> None:
+def require_one_answer(comparison: Comparison, answer: RigidTransform, rivals: list[RigidTransform]) -> None:
     """Refuse an answer if another that the search found, far from it, is as good for all that is known.
 
     Raises
@@ -161,24 +156,14 @@ def require_one_answer(
     InsufficientDataError
         Saying how far off the other is.
     """
-    here = comparison.at(answer)
+    score = comparison.at(answer).score
     for rival in rivals:
-        apart = apart_mm(rival, answer, centre_mm)
-        if apart < RIVAL_MM:
-            continue
-        there = comparison.at(rival)
-        if there.score < LEAST_SIMILARITY:
-            continue
-        both = here.valid & there.valid
-        lead = here.score - there.score
-        blocks = _numbered(np.floor(comparison.places_mm(answer)[both] / BLOCK_MM))
-        gain = np.bincount(blocks, here.alike[both] - there.alike[both]) / max(int(both.sum()), 1)
-        noise = float(np.sqrt(np.square(gain - gain.mean()).sum())) if both.any() else 0.0
-        if lead < CLEAR_LEAD * noise:
+        apart, other = apart_mm(rival, answer, comparison.pivot_mm), comparison.at(rival).score
+        if apart >= RIVAL_MM and other >= max(LEAST_SIMILARITY, score - CLEAR_LEAD):
             raise InsufficientDataError(
                 f"expected one mounting that fits the sweeps best, got another {apart:.0f} mm from it that "
-                f"fits as well (correlation {there.score:.3f} and {here.score:.3f}, +- {noise:.3f}): tissue "
-                "with more structure, or a better start with a smaller --capture-mm, would tell them apart"
+                f"fits as well (correlation {other:.3f} and {score:.3f}): tissue with more structure, or a "
+                "better start with a smaller --capture-mm, would tell them apart"
             )
 
 

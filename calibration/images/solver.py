@@ -155,7 +155,7 @@ def calibrate_from_sweeps(
     tracker = chosen.tracker_mm, float(np.deg2rad(chosen.tracker_deg))
     covariance, curvature = claimed(refined, crossing, tracker)
     require_known(covariance, angles, crossing.centre_mm)
-    require_one_answer(decided, answer, rivals, crossing.centre_mm)
+    require_one_answer(decided, answer, rivals)
     return ImageCalibration(
         settings=chosen,
         start=start,
