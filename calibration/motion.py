@@ -25,18 +25,18 @@ if TYPE_CHECKING:
 MAX_CONDITION = 1000.0
 """Robot calibration asks for 100 (TR 303, section 4.2); its bare-wall trials were at 211 and 448."""
 _TWO_SIDED = 1.96
-REFUSED_MM, REFUSED_RAD = 5.0 / _TWO_SIDED, np.deg2rad(5.0) / _TWO_SIDED
+REFUSED = np.array([5.0, np.deg2rad(5.0)]) / _TWO_SIDED
 """Standard error of the image's worst corner, and about its worst axis, above which a solution is refused:
 95 % intervals of 5 mm and 5 degrees, which a ruler and a protractor on the probe achieve."""
-WEAK_MM, WEAK_RAD = 1.0, np.deg2rad(1.0)
+WEAK = np.array([1.0, np.deg2rad(1.0)])
 """Standard error of a weakly determined solution; 1 degree is the published precision (Housden 2008)."""
-MISFIT_MM, MISFIT_RAD = 3.0, np.deg2rad(5.0)
+MISFIT = np.array([3.0, np.deg2rad(5.0)])
 """Root mean square residual above which the phantom does not explain the images: the worst published is 3.5
 mm as a distance, with early magnetic trackers (TR 303, section 5), 2 mm in each component."""
 TIE = 25.0
 """Evidence of a rival below which two answers are not told apart: five standard deviations."""
 
-_LEAST_SIGMA_MM, _LEAST_SIGMA_RAD = 0.1, np.deg2rad(0.1)
+_LEAST_SIGMA = np.array([0.1, np.deg2rad(0.1)])
 """Lines are not found more exactly; residuals of exact data would make every motion look sufficient."""
 _ALLOWED_LACKING = 0.65
 """Share of what is allowed where a motion is absent: the standard error is itself uncertain, and three of
@@ -125,13 +125,12 @@ def judge(solution: Solution) -> Adequacy:
     angular, condition = solution.angular, solution.condition_number
     white = _errors(solution, _bounded(solution))
     errors = np.maximum(white, _errors(solution, solution.full_covariance))
-    refused_at, weak_at = np.array([REFUSED_MM, REFUSED_RAD]), np.array([WEAK_MM, WEAK_RAD])
-    excess, weak = float((errors / refused_at).max()), bool((errors / weak_at).max() > 1)
-    error = float(errors[1 if angular else 0])
-    share = (MISFIT_RAD if angular else MISFIT_MM) / max(solution.rms, np.finfo(float).tiny)
+    excess, weak = float((errors / REFUSED).max()), bool((errors > WEAK).any())
+    error = float(errors[int(angular)])
+    share = MISFIT[int(angular)] / max(solution.rms, np.finfo(float).tiny)
     # Where even a phantom that fits would not determine the answer, the misfit comes from the motion: the
     # solver runs away in the direction left open.
-    if share < 1 and share * float((white / refused_at).max()) <= _LET_PASS:
+    if share < 1 and share * float((white / REFUSED).max()) <= _LET_PASS:
         misfit = (
             f"the phantom does not explain the images (they miss it by {_size(solution.rms, angular)}): do "
             "the images and the sensor readings belong together, and are the phantom, its wires and their "
@@ -151,16 +150,16 @@ def judge(solution: Solution) -> Adequacy:
     # If none is absent, the one that was there and not far enough.
     missing = tuple(lacking or [min(extent_of, key=lambda one: extent_of[one])]) if weak or refused else ()
     state = f"standard error {_size(error, angular)}" + ("" if angular else " at the image's corners")
-    if not angular and errors[1] / REFUSED_RAD > errors[0] / REFUSED_MM:
+    if not angular and np.argmax(errors / REFUSED) == 1:
         state += f" and {_size(errors[1], True)}"
     state += f", condition number {condition:.3g}"
     verdict = "the motion was sufficient"
     if tied and excess <= allowed:
         verdict = "two answers explain the images equally well, one of them mirrored"
-    elif refused or weak:
-        verdict = (
-            "the motion " + ("does not determine" if refused else "weakly determines") + " the calibration"
-        )
+    elif refused:
+        verdict = "the motion does not determine the calibration"
+    elif weak:
+        verdict = "the motion weakly determines the calibration"
     advice = f": {'; and '.join(missing)}; weakest is {weakest_of(solution)}" if missing else ""
     verdict += f" ({state}){advice}"
     verdict += f"; {solution.assumed}" if solution.assumed else ""
@@ -225,9 +224,8 @@ def _bounded(solution: Solution) -> FloatArray:
         size = solution.prior.pixel_mm * solution.prior.error
     widths = dict(zip(("s_x", "s_y"), size, strict=True))
     before = [widths.get(name, _UNKNOWN_MM if name[0] in "xyz" else _UNKNOWN_RAD) for name in solution.free]
-    least = _LEAST_SIGMA_RAD if solution.angular else _LEAST_SIGMA_MM
-    measured = solution.jacobian.T @ solution.jacobian / max(solution.sigma, least) ** 2
-    information = measured + np.diag(np.array(before) ** -2.0)
+    sigma = max(solution.sigma, _LEAST_SIGMA[int(solution.angular)])
+    information = solution.jacobian.T @ solution.jacobian / sigma**2 + np.diag(np.array(before) ** -2.0)
     columns = columns_of(solution.free)
     full = np.zeros((len(CHAIN), len(CHAIN)))
     full[np.ix_(columns, columns)] = np.linalg.inv(information)

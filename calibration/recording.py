@@ -82,7 +82,7 @@ def calibrate_recording(
         points, dropped = paired(recording, seen, offset_s)
     solution = (with_clock or calibrate)(points)
     if offset is not None:
-        solution = with_uncertain_offset(solution, recording.readings, offset_s)
+        solution = with_uncertain_offset(solution, points, recording.readings, offset_s)
     frames = FramesUsed(recording.images.shape[0], (), dropped)
     stated = time_offset_s is not None or offset_s != 0.0
     calibration = as_calibration(solution, method, frames, offset_s if stated else None)

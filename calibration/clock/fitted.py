@@ -11,7 +11,6 @@ from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform
 
 from calibration.clock.offset import ClockOffset, covered, delays_around, peak_of
 from calibration.clock.smoothing import SmoothReadings
@@ -91,12 +90,11 @@ def estimate_offset(
 
 
 def with_uncertain_offset(
-    solution: Solution, readings: TimedPoses | TimedRotations, seconds: float
+    solution: Solution, points: ImagePoints, readings: TimedPoses | TimedRotations, seconds: float
 ) -> Solution:
-    """Return a solution whose covariance includes that of the clock offset it was made with."""
-    there = covered(readings, solution.points.times, seconds, _DERIVATIVE_S)
-    shown = replace(solution, points=solution.points[there], used=solution.used[there])
-    _, joint = _joint_fit(shown, _reader(shown.points, readings), seconds)
+    """Return a solution from some points whose covariance includes that of the clock offset it was made with."""
+    there = covered(readings, points.times, seconds, _DERIVATIVE_S)
+    _, joint = _joint_fit(solution, _reader(points[there], readings), seconds)
     along, variance = joint[:-1, -1], joint[-1, -1]
     return replace(solution, covariance=solution.covariance + np.outer(along, along) / variance)
 
@@ -116,26 +114,17 @@ def _joint_fit(
     The covariance is that of the free parameters, in frames that lie on the image and on the phantom, and of
     the offset after them.
     """
-    used, phantom, chain = solution.used, solution.phantom, solution.chain
-    here, later, sooner = (
-        _as_seen(solution, points_at(at))[used]
-        for at in (seconds, seconds + _DERIVATIVE_S, seconds - _DERIVATIVE_S)
-    )
-    change = phantom.equations(later).residuals(chain) - phantom.equations(sooner).residuals(chain)
-    column = change.reshape(-1, 1) / (2.0 * _DERIVATIVE_S)
-    equations, seen_as = phantom.equations(here), phantom.seen_as
-    _, further, joint = fit_noise(equations, chain, solution.free, seen_as, solution.prior, column)
+    phantom, chain, frames = solution.phantom, solution.chain, solution.points_used.frames
+    equations = []
+    for step in (-_DERIVATIVE_S, 0.0, _DERIVATIVE_S):
+        points = points_at(seconds + step)
+        points = points[np.isin(points.frame, frames)]
+        seen = as_directions(points, chain.pixel_mm) if solution.angular else points
+        equations.append(phantom.equations(seen))
+    sooner, now, later = equations
+    column = (later.residuals(chain) - sooner.residuals(chain)).reshape(-1, 1) / (2.0 * _DERIVATIVE_S)
+    _, further, joint = fit_noise(now, chain, solution.free, phantom.seen_as, solution.prior, column)
     return float(further[-1]), joint
-
-
-def _as_seen(solution: Solution, points: ImagePoints) -> ImagePoints:
-    """The points, or their directions without places for a solution that knows no more."""
-    if not solution.angular:
-        return points
-    if points.pixels.shape == solution.points.pixels.shape:
-        turns = RigidTransform.from_rotation(points.world_from_sensor.rotation)
-        return replace(points, world_from_sensor=turns)
-    return as_directions(points, solution.chain.pixel_mm)
 
 
 def _misfit(calibrate: Calibrate, points: ImagePoints) -> float:

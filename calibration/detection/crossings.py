@@ -20,13 +20,13 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from numpy.lib.stride_tricks import sliding_window_view
 from scipy import fft, ndimage
 
 from calibration.detection.dots import centred
+from calibration.detection.lines import peak_between
 from calibration.detection.region import checked_pixel, finite_grey, region_mask, seen_in_frames
 from calibration.points import Seen
-from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.extras import extra_module
 from speckle3d.core.sweep import Frames
@@ -118,7 +118,8 @@ def _crossings(
         response = _two_lines(coarse, step_px * pixel_mm, width)
         near = max(1, int(_APART_MM / 2.0 / float((step_px * pixel_mm).max())))
         peaks = features.peak_local_max(response, near, num_peaks=_PEAKS, exclude_border=False)
-        places.append((peaks + _between(response, peaks)) * step_px)
+        between = [peak_between(response.T, *peaks.T[::-1]), peak_between(response, *peaks.T)]
+        places.append((peaks + np.clip(between, -0.5, 0.5).T) * step_px)
         scores.append(response[tuple(peaks.T)])
     pixels, score = np.concatenate(places), np.concatenate(scores)
     if inside is not None:
@@ -174,12 +175,3 @@ def _two_lines(grey: Float32Array, step_mm: FloatArray, width_mm: float) -> Floa
         np.maximum(second, lines[number], out=second, where=apart)
     first = np.maximum(lines.max(axis=0), 0.0)
     return np.asarray(np.sqrt(first * np.maximum(second - _LEAK * first, 0.0)))
-
-
-def _between(response: Float32Array, peaks: IntArray) -> FloatArray:
-    """How far from a sample each maximum lies along both axes, by parabolas through its neighbours."""
-    padded = np.pad(response, 1, mode="edge")
-    window = sliding_window_view(padded, (3, 3))[tuple(peaks.T)].astype(float)
-    before, here, after = np.stack([window[:, :, 1], window[:, 1]]).transpose(2, 1, 0)
-    bend = np.maximum(2.0 * here - before - after, np.finfo(np.float32).tiny)
-    return np.asarray(np.clip(0.5 * (after - before) / bend, -0.5, 0.5))

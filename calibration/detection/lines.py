@@ -306,7 +306,7 @@ def _placed(
 ) -> FloatArray:
     """Where on the echo behind each column's edge the line is put, rows; NaN without an echo."""
     column = np.arange(len(edge))
-    steepest = edge + _between(slope, column, edge)
+    steepest = edge + peak_between(slope, column, edge)
     if place == "slope":
         return steepest
     rows = edge[:, None] + np.arange(-int(2.5 * sigma) - 2, int(2.0 * sigma) + 3)
@@ -328,7 +328,7 @@ def _placed(
     bright = level[column, at] > half
     top = rows[column, at]
     if place == "peak":
-        return np.where(bright, top + _between(levels, column, top), np.nan)
+        return np.where(bright, top + peak_between(levels, column, top), np.nan)
     below = window & (level < half[:, None]) & (np.arange(level.shape[1]) < at[:, None])
     last = level.shape[1] - 1 - below[:, ::-1].argmax(axis=1)
     after = np.minimum(last + 1, level.shape[1] - 1)
@@ -337,7 +337,7 @@ def _placed(
     return np.where(bright & below.any(axis=1), front, np.nan)
 
 
-def _between(values: Float32Array, column: IntArray, row: IntArray) -> FloatArray:
+def peak_between(values: Float32Array, column: IntArray, row: IntArray) -> FloatArray:
     """How far from a row its maximum lies, by the parabola through its neighbours; zero without one."""
     row = np.clip(row, 1, values.shape[1] - 2)
     before, here, after = (values[column, row + step].astype(float) for step in (-1, 0, 1))
