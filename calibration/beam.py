@@ -39,11 +39,6 @@ class BeamBias:
     rms_mm: float
 
 
-def depth_error_mm(normal_in_image: FloatArray, width_mm: float) -> FloatArray:
-    """How much too shallow lines appear, (w / 2) |n_z / n_y|, for normals of the wall in images, (m, 3)."""
-    return np.asarray(width_mm / 2.0 * np.abs(normal_in_image[:, 2] / normal_in_image[:, 1]))
-
-
 def predict_bias(solution: Solution, width_mm: float) -> BeamBias:
     """Predict the bias of a calibration with a bare wall, by simulation of its own motions.
 
@@ -61,7 +56,8 @@ def predict_bias(solution: Solution, width_mm: float) -> BeamBias:
     normal = near.rotation.as_matrix()[:, 2]
     columns = points.pixels[:, 0] * chain.pixel_mm[0]
     exact = -(near.translation[:, 2] + normal[:, 0] * columns) / normal[:, 1]
-    rows = (exact - depth_error_mm(normal, width_mm)) / chain.pixel_mm[1]
+    too_shallow = width_mm / 2.0 * np.abs(normal[:, 2] / normal[:, 1])
+    rows = (exact - too_shallow) / chain.pixel_mm[1]
     thick = replace(points, pixels=np.column_stack([points.pixels[:, 0], rows]))
     probe = tuple(name for name in solution.free if name not in solution.phantom.determined)
     seen = Problem(solution.phantom, probe, np.inf).solve(thick, chain)

@@ -203,7 +203,11 @@ class _Candidates:
         return model
 
     def false_alarms(self, model: FloatArray) -> tuple[float, float]:
-        """Logarithm of the number of false alarms at the gate where it is least, and that gate, mm."""
+        """Logarithm of the number of false alarms at the gate where it is least, and that gate, mm.
+
+        (n - 4) C(n, k) C(k, 4) m^4 p^(k - 4): sizes of the agreeing set, sets, samples in a set with m
+        candidates in each frame, and the chance that the rest of the set agrees (reference 2, equation 2).
+        """
         n, each = len(self.frames), float(self.count.mean())
         if n <= _SAMPLE:
             return np.inf, GATES_MM[-1]
@@ -219,19 +223,8 @@ class _Candidates:
             # Few frames have few pairs to count: at least what candidates all over the image would give.
             least = np.pi * gate**2 * each / max(area, np.pi * gate**2)
             chance = min(max(float(np.mean(exchanged < gate)), least), 1.0)
-            tried.append(_log_false_alarms(n, int(np.sum(away < gate)), chance, each))
+            agreeing = max(int(np.sum(away < gate)), _SAMPLE)
+            sets = (n - _SAMPLE) * binom(n, agreeing) * binom(agreeing, _SAMPLE)
+            tried.append(np.log10(sets * each**_SAMPLE) + (agreeing - _SAMPLE) * np.log10(chance))
         best = int(np.argmin(tried))
         return tried[best] + np.log10(len(GATES_MM)), GATES_MM[best]
-
-
-def _log_false_alarms(frames: int, agreeing: int, chance: float, candidates: float) -> float:
-    """Expected number, as a logarithm to base ten, of samples with which as many chance frames agree.
-
-    (n - 4) C(n, k) C(k, 4) m^4 p^(k - 4): sizes of the agreeing set, sets, samples in a set with m candidates
-    in each frame, and the chance that the rest of the set agrees (reference 2, equation 2).
-    """
-    if agreeing <= _SAMPLE:
-        return np.inf
-    sets = binom(frames, agreeing) * binom(agreeing, _SAMPLE)
-    total = np.log10(frames - _SAMPLE) + np.log10(sets) + _SAMPLE * np.log10(candidates)
-    return float(total + (agreeing - _SAMPLE) * np.log10(chance))

@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from calibration.points import SCALES, SeenAs, columns_of
+from calibration.points import SeenAs, columns_of
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.threads import ahead
 from speckle3d.kernels.wander import innovations
@@ -213,7 +213,7 @@ def fit_noise(
     equations : Equations
         Without outliers, frames ascending.
     free : sequence of str, length p
-        The parameters estimated.
+        The parameters estimated; `SCALES` first where the prior says something of them.
     more : ndarray, shape (n r, k), optional
         Derivatives of the residuals by further parameters, which are zero so far.
 
@@ -244,7 +244,11 @@ def fit_noise(
         residuals = values.ravel() + expected + beside @ further
         jacobian = np.hstack([slopes.reshape(len(beside), -1)[:, columns], beside])
         effects = sensor_effects(corrected, chain).reshape(len(beside), 6) @ axes.T
-        known = _known(prior, chain, free, count + len(further))
+        certainty, excess = np.zeros((2, count + len(further)))
+        if prior is not None:
+            certainty[:2] = (prior.pixel_mm * prior.error) ** -2.0
+            excess[:2] = chain.pixel_mm - prior.pixel_mm
+        known = certainty, excess
         noise, grid = fit_wandering(jacobian, residuals, effects, starts, frame_time_s, grid, *known)
         sensor, image = _divided(residuals + jacobian @ noise.step, effects, starts, noise)
         step = np.zeros(slopes.shape[-1])
@@ -254,18 +258,6 @@ def fit_noise(
         if number > 0 and (np.abs(noise.step) <= _SETTLED * np.sqrt(np.diag(noise.covariance))).all():
             break
     return chain, further, noise.covariance
-
-
-def _known(
-    prior: PixelPrior | None, chain: Chain, free: Sequence[str], count: int
-) -> tuple[FloatArray, FloatArray]:
-    """Inverse variances of what is known of the pixel size, and by how much the parameters exceed it."""
-    certainty, excess = np.zeros((2, count))
-    if prior is not None:
-        columns = [list(free).index(name) for name in SCALES]
-        certainty[columns] = (prior.pixel_mm * prior.error) ** -2.0
-        excess[columns] = chain.pixel_mm - prior.pixel_mm
-    return certainty, excess
 
 
 def _divided(

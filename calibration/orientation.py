@@ -68,7 +68,13 @@ def calibrate_orientation(
     side = "down (plane seen from above)" if s.viewed_from == "above" else "up (plane seen from below)"
     assumed = f"assumed, as no image tells it: the beam points {side}"
     solution = require_adequate(replace(problem.best(directions, starts), assumed=assumed))
-    _require_floor(solution)
+    certain = np.diag(solution.image_covariance(("beta_c", "gamma_c"))).max() < _CERTAIN_RAD**2
+    slope = float(np.arccos(min(abs(solution.chain.target[2, 2]), 1.0)))
+    if certain and slope > STEEPEST_PLANE:
+        raise InsufficientDataError(
+            f"expected a plane within {np.rad2deg(STEEPEST_PLANE):.0f} degrees of level, got one at "
+            f"{np.rad2deg(slope):.0f}: is the world's z axis up, and are the lines those of the floor?"
+        )
     return _upright(solution, s.viewed_from)
 
 
@@ -90,14 +96,3 @@ def _upright(solution: Solution, viewed_from: str) -> Solution:
     if (down > 0) == (viewed_from == "above"):
         return solution
     return replace(solution, chain=solution.chain.mirrored(), residuals=-solution.residuals)
-
-
-def _require_floor(solution: Solution) -> None:
-    """Refuse a plane that is certainly not a floor; `judge` names what leaves one undetermined."""
-    certain = np.diag(solution.image_covariance(("beta_c", "gamma_c"))).max() < _CERTAIN_RAD**2
-    slope = float(np.arccos(min(abs(solution.chain.target[2, 2]), 1.0)))
-    if certain and slope > STEEPEST_PLANE:
-        raise InsufficientDataError(
-            f"expected a plane within {np.rad2deg(STEEPEST_PLANE):.0f} degrees of level, got one at "
-            f"{np.rad2deg(slope):.0f}: is the world's z axis up, and are the lines those of the floor?"
-        )

@@ -67,8 +67,11 @@ def estimate_offset(
         )
     points_at = _reader(points[there], readings)
     tried = delays_around(around_s, search_s, STEP_S)
-    some = [points_at(float(offset)).of_some_frames(SOME_FRAMES) for offset in tried]
-    misfit = np.array([_misfit(calibrate, one) for one in some]) ** 2
+    misfit = np.full(len(tried), np.nan)
+    for number, offset in enumerate(tried):
+        with suppress(InsufficientDataError):
+            some = points_at(float(offset)).of_some_frames(SOME_FRAMES)
+            misfit[number] = sigma_of(_adequate_or_not(calibrate, some).residuals) ** 2
     if not np.isfinite(misfit).any():
         raise InsufficientDataError(
             f"expected a clock offset that gives a calibration, got none of {len(tried)}"
@@ -92,7 +95,7 @@ def estimate_offset(
 def with_uncertain_offset(
     solution: Solution, points: ImagePoints, readings: TimedPoses | TimedRotations, seconds: float
 ) -> Solution:
-    """Return a solution from some points whose covariance includes that of the clock offset it was made with."""
+    """Return a solution whose covariance includes that of the clock offset that its points were read with."""
     there = covered(readings, points.times, seconds, _DERIVATIVE_S)
     _, joint = _joint_fit(solution, _reader(points[there], readings), seconds)
     along, variance = joint[:-1, -1], joint[-1, -1]
@@ -125,13 +128,6 @@ def _joint_fit(
     column = (later.residuals(chain) - sooner.residuals(chain)).reshape(-1, 1) / (2.0 * _DERIVATIVE_S)
     _, further, joint = fit_noise(now, chain, solution.free, phantom.seen_as, solution.prior, column)
     return float(further[-1]), joint
-
-
-def _misfit(calibrate: Calibrate, points: ImagePoints) -> float:
-    """Robust standard deviation of all residuals of a calibration with some frames; NaN without one."""
-    with suppress(InsufficientDataError):
-        return sigma_of(_adequate_or_not(calibrate, points).residuals)
-    return np.nan
 
 
 def _adequate_or_not(calibrate: Calibrate, points: ImagePoints) -> Solution:

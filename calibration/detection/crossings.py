@@ -114,7 +114,10 @@ def _crossings(
     features = extra_module("skimage.feature", "calibrate", "finding crossings")
     places, scores = [], []
     for width in _WIDTH_MM * np.array(_WIDTHS):
-        coarse, step_px = _resampled(grey, pixel_mm, width)
+        # On a grid fit for filters of this width.
+        step_px = np.maximum(np.floor(width / _STEPS / pixel_mm), 1.0).astype(int)
+        smooth = ndimage.gaussian_filter(grey, np.where(step_px > 1, 0.4 * step_px, 0.0))
+        coarse = smooth[:: step_px[0], :: step_px[1]]
         response = _two_lines(coarse, step_px * pixel_mm, width)
         near = max(1, int(_APART_MM / 2.0 / float((step_px * pixel_mm).max())))
         peaks = features.peak_local_max(response, near, num_peaks=_PEAKS, exclude_border=False)
@@ -133,15 +136,6 @@ def _crossings(
     if not kept:
         raise InsufficientDataError("no lines that cross")
     return np.array([centred(grey, one, pixel_mm) for one in pixels[kept]]), score[kept].astype(float)
-
-
-def _resampled(grey: Float32Array, pixel_mm: FloatArray, width_mm: float) -> tuple[Float32Array, FloatArray]:
-    """The image on a grid fit for filters of this width, and its steps in pixels; never finer than it was."""
-    step = np.maximum(width_mm / _STEPS / pixel_mm, 1.0)
-    smooth = ndimage.gaussian_filter(grey, np.where(step > 1.2, 0.4 * step, 0.0))
-    places = [np.arange(int((n - 1) / one) + 1) * one for n, one in zip(grey.shape, step, strict=True)]
-    grid = np.meshgrid(*places, indexing="ij")
-    return ndimage.map_coordinates(smooth, grid, order=1, mode="nearest", output=np.float32), step
 
 
 def _two_lines(grey: Float32Array, step_mm: FloatArray, width_mm: float) -> Float32Array:

@@ -42,6 +42,7 @@ _RIDGE_MM2 = 1e-3
 """Holds axes that the wires leave open near zero; a dot 10 mm off the centre weighs 100 mm^2."""
 _GATE_MM = 1.5
 """How far from where a calibration says it is a wire's dot may be."""
+_TINY = 1e-12
 _WIDTHS, _GAPS = (0.9, 1.1 * _STEEPEST), (0.85, 1.1 * _STEEPEST)
 """Distances in the image over the phantom's: of a layer's outer wires, and between layers."""
 
@@ -112,7 +113,11 @@ def label_by_calibration(
     assert score is not None
     for frame in np.unique(dots.frame):
         here = np.flatnonzero(dots.frame == frame)
-        expected_mm = _seen_at(phantom, image_from_phantom[int(frame)])
+        into = image_from_phantom[int(frame)]
+        place, along = into.apply(phantom.points_mm), into.rotation.apply(phantom.directions)
+        # Where the image cuts each wire: far away, where it hardly does.
+        steps = -place[:, 2] / np.where(along[:, 2] == 0, _TINY, along[:, 2])
+        expected_mm = (place + steps[:, None] * along)[:, :2]
         pairs = _nearest(dots.pixels[here] * chain.pixel_mm, score[here], expected_mm)
         kept += [(int(frame), int(here[dot]), wire) for dot, wire in pairs]
         if not pairs:
@@ -164,14 +169,10 @@ def _label(dots_mm: FloatArray, score: FloatArray, layers: list[_Layer], phantom
     like = np.flatnonzero(rms_mm <= best + _LIKE_MM)
     # Rounded, so that where the same dots fit either way round, the usual one is chosen.
     strength = np.round(score[chosen[like]].sum(axis=1) / score.max(), 6)
-    usual = [-_unusual(dots_mm[chosen[i]]) for i in like]
+    # As usual: the first wire on the side of the last columns, the first layer uppermost.
+    first, last = (dots_mm[chosen[like]].reshape(len(like), -1, 3, 2)[:, k] for k in (0, -1))
+    usual = (first[:, 0, 0] >= first[:, 2, 0]) * 1 + (first[..., 1].mean(axis=1) <= last[..., 1].mean(axis=1))
     return np.asarray(chosen[like[np.lexsort((usual, strength))[-1]]])
-
-
-def _unusual(labelled_mm: FloatArray) -> int:
-    """How many usual rules a labelling breaks: first wire at the last columns, first layer uppermost."""
-    layers = labelled_mm.reshape(-1, 3, 2)
-    return int(layers[0, 0, 0] < layers[0, 2, 0]) + int(layers[0, :, 1].mean() > layers[-1, :, 1].mean())
 
 
 def _triples(dots_mm: FloatArray, layer: _Layer, phantom: WirePhantom) -> IntArray:
@@ -254,16 +255,6 @@ def misfits_mm(dots_mm: FloatArray, wires: IntArray, phantom: WirePhantom) -> Fl
     normal = np.swapaxes(matrix, 1, 2) @ matrix + _RIDGE_MM2 * np.eye(9)
     image = np.linalg.solve(normal, (wanted @ matrix)[..., None])
     return np.asarray(np.sqrt(np.mean(((matrix @ image)[..., 0] - wanted) ** 2, axis=1)))
-
-
-def _seen_at(phantom: WirePhantom, image_from_phantom: RigidTransform) -> FloatArray:
-    """Where an image cuts each wire, mm, shape (k, 2); NaN where it does not."""
-    place = image_from_phantom.apply(phantom.points_mm)
-    along = image_from_phantom.rotation.apply(phantom.directions)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        steps = -place[:, 2] / along[:, 2]
-    steps[~np.isfinite(steps)] = np.nan
-    return np.asarray(place[:, :2] + steps[:, None] * along[:, :2])
 
 
 def _nearest(dots_mm: FloatArray, score: FloatArray, expected_mm: FloatArray) -> list[tuple[int, int]]:

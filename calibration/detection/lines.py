@@ -24,6 +24,7 @@ from calibration.detection.region import (
     checked_pixel,
     lay_columns,
     seen_in_frames,
+    spread,
     without_standing,
 )
 from calibration.points import Seen
@@ -131,7 +132,10 @@ class LineFinder:
         columns = lay_columns(frames.shape[1:], s.columns, region_px)
         if region_px is None and frames.shape[0] > 0:
             dense = lay_columns(frames.shape[1:], DENSELY * s.columns, None)
-            columns = without_standing(dense, frames, s.smoothing_mm / pixel[1]).thinned(s.columns)
+            dense = without_standing(dense, frames, s.smoothing_mm / pixel[1])
+            place = np.flatnonzero(dense.inside.any(axis=1))
+            place = place[spread(place.size, s.columns)] if place.size else place
+            columns = Columns(dense.column[place], dense.inside[place])
         return cls(pixel, s, columns)
 
     def line(self, image: npt.NDArray[Any]) -> EchoLine:
@@ -158,13 +162,13 @@ class LineFinder:
         peak[:, 1:-1] = inside[:, :-2] & inside[:, 1:-1] & inside[:, 2:]
         peak[:, 1:-1] &= (slope[:, 1:-1] > slope[:, :-2]) & (slope[:, 1:-1] >= slope[:, 2:])
         if s.threshold is None:
-            column, at = np.nonzero(peak & (slope > _LEAST * _typical(slope)))
+            column, at = np.nonzero(peak & (slope > _LEAST * np.median(slope.max(axis=1))))
             below = at[:, None] + np.arange(int(np.ceil(_AHEAD * sigma)) + 1)
             bright = levels[column[:, None], np.minimum(below, levels.shape[1] - 1)].max(axis=1)
             score = np.zeros_like(levels)
             # Every third row: enough for a median, in a third of the time.
             score[column, at] = np.maximum(bright - np.median(levels[:, ::3][inside[:, ::3]]), 0.0)
-            usual = _typical(score)
+            usual = float(np.median(score.max(axis=1)))
             thresholds = [part * usual for part in _PARTS]
         else:
             score, thresholds = np.where(peak, slope, np.float32(0.0)), [s.threshold * row_mm]
@@ -294,11 +298,6 @@ def consensus_line(
         if np.array_equal(agree, before):
             break
     return agree, int(could.sum()), start, slope
-
-
-def _typical(score: Float32Array) -> float:
-    """Median of the columns' largest scores."""
-    return float(np.median(score.max(axis=1)))
 
 
 def _placed(

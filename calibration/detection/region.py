@@ -55,16 +55,6 @@ class Columns:
             return samples
         return np.take_along_axis(samples, self._nearest, axis=1)
 
-    def thinned(self, count: int) -> Columns:
-        """At most `count` of the columns with rows in the region, evenly spread."""
-        place = np.flatnonzero(self.inside.any(axis=1))
-        place = place[_spread(place.size, count)] if place.size else place
-        return Columns(self.column[place], self.inside[place])
-
-    def narrowed(self, inside: BoolArray) -> Columns:
-        """The same columns with only those of their rows that are `inside`, shape (n, r), too."""
-        return Columns(self.column, self.inside & inside)
-
 
 def region_mask(shape: tuple[int, ...], region_px: npt.ArrayLike) -> BoolArray:
     """Which pixels of an image are in a polygon, its sides included.
@@ -105,12 +95,12 @@ def lay_columns(shape: tuple[int, ...], count: int, region_px: npt.ArrayLike | N
         If the region is not a polygon, or covers nothing.
     """
     if region_px is None:
-        column = _spread(shape[0], count)
+        column = spread(shape[0], count)
         return Columns(column, np.ones((column.size, shape[1]), dtype=bool))
     mask = region_mask(shape, region_px)
     reach = np.asarray(region_px, dtype=float)[:, 0]
     first, last = max(0, int(np.ceil(reach.min()))), min(shape[0] - 1, int(np.floor(reach.max())))
-    column = first + _spread(last - first + 1, count)
+    column = first + spread(last - first + 1, count)
     column = column[mask[column].any(axis=1)]
     return Columns(column, mask[column])
 
@@ -135,10 +125,10 @@ def without_standing(columns: Columns, frames: Frames, smoothing_rows: float) ->
     lively = change > limit
     standing = (level > limit) & ~np.logical_or.accumulate(lively, axis=1)
     under = ~np.logical_or.accumulate(standing[:, ::-1], axis=1)[:, ::-1]
-    return columns.narrowed(under & lively.any(axis=1)[:, None])
+    return Columns(columns.column, columns.inside & under & lively.any(axis=1)[:, None])
 
 
-def _spread(size: int, count: int) -> IntArray:
+def spread(size: int, count: int) -> IntArray:
     """About `count` of the numbers below `size`, at regular intervals and symmetric about the middle."""
     left = np.rint(np.linspace(0, size - 1, count)[: (count + 1) // 2]).astype(np.int64)
     return np.unique(np.concatenate([left, size - 1 - left]))

@@ -92,7 +92,31 @@ class Comparison:
 
     def at(self, sensor_from_image: RigidTransform, derivatives: bool = False) -> Similarity:
         """Compare at a calibration."""
-        parts = list(ahead(lambda way: self._one_way(way, sensor_from_image, derivatives), (0, 1)))
+        matrix, size = sensor_from_image.as_matrix(), int(derivatives)
+
+        def one_way(way: int) -> PatchScores:
+            sample, patches, source = self.stacks[way], self.patches[way], self.stacks[1 - way]
+            count = len(patches.where)
+            scores = PatchScores(
+                np.empty(count),
+                np.empty((count, 2)),
+                np.empty(count),
+                np.empty((size * count, PARAMETERS, PARAMETERS)),
+                np.empty((size * count, PARAMETERS)),
+            )
+            world_from_sample = np.ascontiguousarray((sample.sensor_matrices @ matrix)[:, :3])
+            source_from_world = np.ascontiguousarray(np.linalg.inv(source.sensor_matrices @ matrix)[:, :3])
+            compare_patches(
+                PlacedImages(sample.images, world_from_sample, sample.pixels),
+                PlacedImages(source.images, source_from_world, source.pixels),
+                patches,
+                self.max_gap_mm,
+                self.least_share,
+                scores,
+            )
+            return scores
+
+        parts = list(ahead(one_way, (0, 1)))
         similarity = Similarity(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
         base = about_pivot(self.pivot_mm)
         normal, gradient = base.T @ similarity.normal @ base, similarity.gradient @ base
@@ -121,30 +145,6 @@ class Comparison:
             poses = stack.sensor_matrices[patches.where[:, 0]] @ sensor_from_image.as_matrix()
             rows.append(np.einsum("pij,pj->pi", poses, local)[:, :3])
         return np.concatenate(rows)
-
-    def _one_way(self, way: int, sensor_from_image: RigidTransform, derivatives: bool) -> PatchScores:
-        sample, patches, source = self.stacks[way], self.patches[way], self.stacks[1 - way]
-        matrix = sensor_from_image.as_matrix()
-        count = len(patches.where)
-        size = count if derivatives else 0
-        found = PatchScores(
-            np.empty(count),
-            np.empty((count, 2)),
-            np.empty(count),
-            np.empty((size, PARAMETERS, PARAMETERS)),
-            np.empty((size, PARAMETERS)),
-        )
-        world_from_sample = np.ascontiguousarray((sample.sensor_matrices @ matrix)[:, :3])
-        source_from_world = np.ascontiguousarray(np.linalg.inv(source.sensor_matrices @ matrix)[:, :3])
-        compare_patches(
-            PlacedImages(sample.images, world_from_sample, sample.pixels),
-            PlacedImages(source.images, source_from_world, source.pixels),
-            patches,
-            self.max_gap_mm,
-            self.least_share,
-            found,
-        )
-        return found
 
 
 def spread_patches(

@@ -144,16 +144,14 @@ class Stack:
         weight /= weight.sum(axis=1, keepdims=True)
         turns = Rotation.concatenate([centre.rotation.mean(one) for one in weight])
         held = RigidTransform.from_components(weight @ centre.translation, turns)
-        return Stack(self._weighted(weight), self.pixels, held * to_centre.inv())
-
-    def _weighted(self, weight: FloatArray) -> Float32Array:
-        """Weighted means over images, shape (k, u, v); NaN where the images that count most are."""
         flat, share = self.images.reshape(len(self), -1), weight.astype(np.float32)
         there = np.isfinite(flat)
         seen = share @ there.astype(np.float32)
         total = share @ np.where(there, flat, np.float32(0.0))
+        # Nothing where the images that count most show nothing.
         mean = np.where(seen > 0.5, total / np.maximum(seen, np.float32(1e-6)), np.float32(np.nan))
-        return np.asarray(mean.reshape(len(weight), *self.images.shape[1:]), dtype=np.float32)
+        images = mean.reshape(count, *self.images.shape[1:]).astype(np.float32)
+        return Stack(images, self.pixels, held * to_centre.inv())
 
 
 def read_stack(
