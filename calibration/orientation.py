@@ -20,8 +20,6 @@ from calibration.solution import Problem, Solution
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError
 
-FEWEST_LINES = 6
-
 MIRROR_LIMIT = 0.2
 """Mean vertical component of the beam direction below which gravity cannot tell the image from its mirror:
 below 12 degrees from level, on average, the hand and the floor may be tilted as much."""
@@ -57,10 +55,6 @@ def calibrate_orientation(
     s = settings or OrientationFit()
     size = np.array([pixel_mm[0] / pixel_mm[1], 1.0])
     directions = as_directions(lines, size) if len(lines) == 2 * len(lines.frames) else lines
-    if len(directions) < FEWEST_LINES:
-        raise InsufficientDataError(
-            f"expected lines in at least {FEWEST_LINES} frames, got {len(directions)}"
-        )
     normals = hemisphere()
     normals = normals[:1] if s.level else normals[normals[:, 2] > np.cos(STEEPEST_PLANE)]
     starts = angle_starts(directions.of_some_frames(SOME_FRAMES), size, normals, s.level)

@@ -27,13 +27,11 @@ from calibration.motion import OBLONG, require_adequate
 from calibration.points import ANGLES, CHAIN, SOME_FRAMES, ImagePoints, SeenAs, as_directions, columns_of
 from calibration.robust import absolute_weights, robust_linear
 from calibration.settings import PlaneFit
-from calibration.solution import Problem, Solution, apart, probe_parameters
+from calibration.solution import Problem, Solution, apart
 from speckle3d.core.arrays import BoolArray, FloatArray
-from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.geometry import nearest_rotation, roll_yaw_tilt
 
-_FEWEST_LINES = 6
-"""Two equations each: the fewest for eleven unknowns."""
 _NORMALS = 30
 """About 26 degrees apart: refinement converges from further away."""
 _MOST_STEPS = 100
@@ -321,25 +319,20 @@ def calibrate_plane(
         determine the answer; then the missing motions are named.
     """
     s = settings or PlaneFit()
-    if len(lines) < 2 * _FEWEST_LINES:
-        raise InsufficientDataError(
-            f"expected lines in at least {_FEWEST_LINES} frames, got {len(lines) // 2}"
-        )
-    probe, fixed_mm = probe_parameters(s.fixed_pixels, pixel_mm)
-    prior = None
-    if fixed_mm is None and pixel_mm is not None and np.isfinite(s.pixel_error):
+    problem, prior = Problem.of(Plane(), pixel_mm, s), None
+    if problem.held_mm is None and pixel_mm is not None and np.isfinite(s.pixel_error):
         prior = PixelPrior(np.asarray(pixel_mm, dtype=float), s.pixel_error)
-    solution = _from_stages(lines, Problem(Plane(), probe, s.outlier_sigma, prior), fixed_mm)
+    solution = _from_stages(lines, replace(problem, prior=prior))
     if prior is not None and np.abs(prior.deviation(solution.chain.pixel_mm)).max() > _CONTRADICTS:
         # Lines that contradict the pixel size given are believed if they determine it by themselves.
-        solution = _from_stages(lines, Problem(Plane(), probe, s.outlier_sigma), None)
+        solution = _from_stages(lines, problem)
     return _facing_up(require_adequate(solution))
 
 
-def _from_stages(lines: ImagePoints, problem: Problem, fixed_mm: FloatArray | None) -> Solution:
+def _from_stages(lines: ImagePoints, problem: Problem) -> Solution:
     """Angles from line directions, then distances, then all."""
     few = lines.of_some_frames(SOME_FRAMES)
-    pixel_mm = fixed_mm if problem.prior is None else problem.prior.pixel_mm
+    pixel_mm = problem.held_mm if problem.prior is None else problem.prior.pixel_mm
     directions = as_directions(few, np.ones(2) if pixel_mm is None else pixel_mm)
     angles = angle_starts(directions, pixel_mm, hemisphere())
     return problem.best(lines, [_with_distances(few, one, pixel_mm) for one in angles])

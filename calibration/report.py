@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from textwrap import fill
 from typing import Any
 
@@ -41,8 +41,6 @@ class Shot:
         Column and row of points on a line, or of dots; none if nothing was found.
     note : str
         Why the frame was dropped; empty if it was used.
-    candidates_px : ndarray, shape (c, 2)
-        Column and row of all places among which the mark was chosen.
     """
 
     frame: int
@@ -50,7 +48,6 @@ class Shot:
     marks_px: FloatArray
     as_line: bool
     note: str = ""
-    candidates_px: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
 
 
 def as_calibration(
@@ -184,10 +181,7 @@ def figure_report(solution: Solution, calibration: Calibration, shots: Sequence[
     for axes in panels[1]:
         axes.grid(alpha=0.3)
     figure.suptitle(fill(calibration.verdict, 150), fontsize=9)
-    figure.supxlabel(
-        "blue: found in the image, and used; red: left out (residuals: x); red +: where lines may cross",
-        fontsize=8,
-    )
+    figure.supxlabel("blue: found in the image, and used; red: left out (residuals: x)", fontsize=8)
     return figure
 
 
@@ -195,7 +189,6 @@ def _draw_shot(axes: Axes, shot: Shot, aspect: float) -> None:
     """An image, with the line or the dots found in it."""
     axes.imshow(np.asarray(shot.image).T, cmap="gray", aspect=aspect)
     colour = DROPPED if shot.note else USED
-    axes.plot(*shot.candidates_px.T, "+", color=DROPPED, ms=5, mew=0.7)
     if shot.as_line and len(shot.marks_px):
         axes.axline(shot.marks_px[0], shot.marks_px[-1], color=colour, lw=1.0)
     else:

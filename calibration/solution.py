@@ -15,7 +15,7 @@ from calibration.motion import Adequacy, judge
 from calibration.noise import fit_noise
 from calibration.points import CHAIN, POSE, PROBE, SCALES, SOME_FRAMES, ImagePoints, columns_of
 from calibration.robust import autocorrelation_time
-from calibration.settings import OUTLIER_SIGMA
+from calibration.settings import OUTLIER_SIGMA, PixelSettings
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.geometry import skew
@@ -28,7 +28,9 @@ if TYPE_CHECKING:
 _SMALLEST_SIGMA = 1e-7
 """Residuals of exact data are rounding; nothing in them is an outlier."""
 _ROUNDS = 12
-"""In the second half frames may be left out but not taken back, so that the rounds end."""
+"""Most rounds of leaving out frames: they may come and go without an end."""
+_FEWEST_FRAMES = 6
+"""Of lines, two equations each: the fewest for eleven unknowns."""
 _RUNAWAY, _RESIZED = 2.0, 0.1
 """A fit with wandering errors that doubles the residuals or changes pixel sizes by a tenth has run away along
 what the motion leaves open."""
@@ -142,12 +144,32 @@ class Problem:
         Frames whose largest residual exceeds so many robust standard deviations are left out.
     prior : PixelPrior, optional
         Counts where the pixel size is estimated.
+    held_mm : ndarray, shape (2,), optional
+        The pixel size where it is not.
     """
 
     phantom: Phantom
     probe: tuple[str, ...] = PROBE
     outlier_sigma: float = OUTLIER_SIGMA
     prior: PixelPrior | None = None
+    held_mm: FloatArray | None = None
+
+    @classmethod
+    def of(cls, phantom: Phantom, pixel_mm: FloatArray | None, settings: PixelSettings) -> Problem:
+        """The problem of a phantom as settings say, with the scanner's pixel size if that is known.
+
+        Raises
+        ------
+        InvalidInputError
+            If the pixel size is neither fitted nor given.
+        """
+        if not settings.fixed_pixels:
+            return cls(phantom, PROBE, settings.outlier_sigma)
+        if pixel_mm is None:
+            raise InvalidInputError(
+                "pixel_mm: expected the scanner's pixel size unless it is fitted, got none"
+            )
+        return cls(phantom, POSE, settings.outlier_sigma, held_mm=np.asarray(pixel_mm, dtype=float))
 
     @property
     def free(self) -> tuple[str, ...]:
@@ -185,7 +207,7 @@ class Problem:
         chain = equations.least_absolute(start, first)
         residuals = equations.residuals(chain)
         used = _within(residuals, points.frame, self.outlier_sigma * sigma_of(residuals))
-        for number in range(_ROUNDS):
+        for _ in range(_ROUNDS):
             frames, agreeing = len(points.frames), len(np.unique(points.frame[used]))
             if 2 * agreeing <= frames:
                 raise InsufficientDataError(
@@ -196,8 +218,6 @@ class Problem:
             chain = equations[used].least_squares(chain, self.free, self.prior, sigma)
             residuals = equations.residuals(chain)
             now = _within(residuals, points.frame, self.outlier_sigma * sigma_of(residuals[used]))
-            if 2 * number >= _ROUNDS:
-                now &= used
             if (now == used).all():
                 break
             used = now
@@ -208,7 +228,16 @@ class Problem:
 
         Where a motion is missing, an image turned by half about one of its axes shows nearly the same: the
         lines of a plane that is always equally deep do not tell the image from its in-plane mirror.
+
+        Raises
+        ------
+        InsufficientDataError
+            If there are too few frames, or fewer than half of them agree.
         """
+        if len(points.frames) < _FEWEST_FRAMES:
+            raise InsufficientDataError(
+                f"expected the phantom in at least {_FEWEST_FRAMES} frames, got {len(points.frames)}"
+            )
         few = points.of_some_frames(SOME_FRAMES)
         chains = self._ends(few, starts)
         if not chains:
@@ -302,20 +331,3 @@ def _corners(points: ImagePoints) -> FloatArray:
     """Corners of the image, pixels, taken to reach as far as points are in it, shape (4, 2)."""
     shares = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
     return np.asarray(shares * points.pixels.max(axis=0))
-
-
-def probe_parameters(
-    fixed_pixels: bool, pixel_mm: FloatArray | None
-) -> tuple[tuple[str, ...], FloatArray | None]:
-    """Which of `PROBE` to estimate, and the pixel size to hold, if any.
-
-    Raises
-    ------
-    InvalidInputError
-        If the pixel size is neither fitted nor given.
-    """
-    if not fixed_pixels:
-        return PROBE, None
-    if pixel_mm is None:
-        raise InvalidInputError("pixel_mm: expected the scanner's pixel size unless it is fitted, got none")
-    return POSE, np.asarray(pixel_mm, dtype=float)

@@ -29,7 +29,7 @@ from calibration.plane import Chain, Phantom
 from calibration.points import POSE, SOME_FRAMES, TARGET, ImagePoints, SeenAs, affine_equations
 from calibration.robust import robust_linear
 from calibration.settings import WireFit
-from calibration.solution import Problem, Solution, probe_parameters
+from calibration.solution import Problem, Solution
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.geometry import nearest_rotation
@@ -40,7 +40,6 @@ _ESTIMATED: dict[str, tuple[str, ...]] = {"held": (), "turned": TARGET[3:], "fre
 _FOLDS = 8
 """Blocks of successive frames, each left out once: a tracker's error wanders over seconds, and frames beside
 each other would vouch for each other."""
-_FEWEST_FRAMES = 6
 _STARTS = 6
 _TINY, _LEAST_PIXEL_MM = np.finfo(float).tiny, 1e-6
 _AS_IT_IS = Rotation.identity()
@@ -102,14 +101,14 @@ def calibrate_cross_wire(
         not determine the answer.
     """
     s, phantom = settings or WireFit(), CrossWire()
-    problem, held_mm = _problem(points, phantom, pixel_mm, s)
+    problem = Problem.of(phantom, pixel_mm, s)
     consensus = find_consensus(points, pixel_mm)
     if not consensus.believed and len(points) == len(points.frames):
         # Poor motion, too, can leave no consensus; then that is said.
-        require_adequate(problem.best(points, [wire_start(points, phantom, _AS_IT_IS, held_mm)[0]]))
+        require_adequate(problem.best(points, [wire_start(points, phantom, _AS_IT_IS, problem.held_mm)[0]]))
     consensus.require()
     agreeing = points[consensus.nearest[consensus.agreed]]
-    first = problem.solve(agreeing, wire_start(agreeing, phantom, _AS_IT_IS, held_mm)[0])
+    first = problem.solve(agreeing, wire_start(agreeing, phantom, _AS_IT_IS, problem.held_mm)[0])
     # The rigid chain, from all that agree, tells candidates better than the sample did.
     away_mm = np.linalg.norm(phantom.equations(points).residuals(first.chain), axis=1)
     nearest = nearest_of_frames(points.frame, away_mm)
@@ -209,24 +208,12 @@ def solve_wires(
     # In a frame whose origin is the wires' middle, about which the phantom may be turned.
     centred = replace(geometry, ends_mm=geometry.ends_mm - middle, world_from_phantom=place)
     phantom = Wires(centred, TARGET if place is None else _ESTIMATED[registration])
-    problem, held_mm = _problem(points, phantom, pixel_mm, s)
+    problem = Problem.of(phantom, pixel_mm, s)
     few = points.of_some_frames(SOME_FRAMES)
     # Without a place, the rotations of an icosahedron, 36 degrees apart.
     tried = Rotation.create_group("I") if place is None else [place.inv()]
-    starts = sorted((wire_start(few, phantom, one, held_mm) for one in tried), key=lambda one: one[1])
+    starts = sorted((wire_start(few, phantom, one, problem.held_mm) for one in tried), key=lambda one: one[1])
     return problem.best(points, [chain for chain, _ in starts[:_STARTS]])
-
-
-def _problem(
-    points: ImagePoints, phantom: Phantom, pixel_mm: FloatArray | None, s: WireFit
-) -> tuple[Problem, FloatArray | None]:
-    """What is solved, and the pixel size to hold, if any."""
-    if len(points.frames) < _FEWEST_FRAMES:
-        raise InsufficientDataError(
-            f"expected the wires in at least {_FEWEST_FRAMES} frames, got {len(points.frames)}"
-        )
-    probe, held_mm = probe_parameters(s.fixed_pixels, pixel_mm)
-    return Problem(phantom, probe, s.outlier_sigma), held_mm
 
 
 def wire_start(

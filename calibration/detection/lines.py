@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.ndimage import gaussian_filter1d
+from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 
 from calibration.detection.region import (
     DENSELY,
@@ -149,10 +149,8 @@ class LineFinder:
         s, columns = self.settings, self.columns
         samples, inside = np.asarray(image[columns.column], np.float32), columns.inside
         levels = samples[inside]
-        if not np.isfinite(levels).all():
-            raise NoLineError("no line: the image holds values that are not finite")
-        if levels.size == 0 or np.ptp(levels) == 0:
-            raise NoLineError("no line: the image is of one level all over")
+        if not (levels.size and 0 < np.ptp(levels) < np.inf):
+            raise NoLineError("no line: the image is of one level all over, or its values are not finite")
         row_mm = float(self.pixel_mm[1])
         tolerance, sigma, samples = s.tolerance_mm / row_mm, s.smoothing_mm / row_mm, columns.filled(samples)
         levels = gaussian_filter1d(samples, _FINE * sigma, truncate=_REACH, mode="nearest")
@@ -162,14 +160,13 @@ class LineFinder:
         peak[:, 1:-1] = inside[:, :-2] & inside[:, 1:-1] & inside[:, 2:]
         peak[:, 1:-1] &= (slope[:, 1:-1] > slope[:, :-2]) & (slope[:, 1:-1] >= slope[:, 2:])
         if s.threshold is None:
-            column, at = np.nonzero(peak & (slope > _LEAST * np.median(slope.max(axis=1))))
-            below = at[:, None] + np.arange(int(np.ceil(_AHEAD * sigma)) + 1)
-            bright = levels[column[:, None], np.minimum(below, levels.shape[1] - 1)].max(axis=1)
-            score = np.zeros_like(levels)
+            peak &= slope > _LEAST * np.median(slope.max(axis=1))
+            size = int(np.ceil(_AHEAD * sigma)) + 1
+            bright = maximum_filter1d(levels, size, mode="nearest", origin=-(size // 2))
             # Every third row: enough for a median, in a third of the time.
-            score[column, at] = np.maximum(bright - np.median(levels[:, ::3][inside[:, ::3]]), 0.0)
-            usual = float(np.median(score.max(axis=1)))
-            thresholds = [part * usual for part in _PARTS]
+            usual = np.median(levels[:, ::3][inside[:, ::3]])
+            score = np.where(peak, np.maximum(bright - usual, np.float32(0.0)), np.float32(0.0))
+            thresholds = [part * float(np.median(score.max(axis=1))) for part in _PARTS]
         else:
             score, thresholds = np.where(peak, slope, np.float32(0.0)), [s.threshold * row_mm]
         tried: list[EchoLine] = []

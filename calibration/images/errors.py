@@ -1,4 +1,4 @@
-"""Claimed errors of a calibration from two sweeps: the jackknife over tissue and images, and the tracker's.
+"""Claimed errors of a calibration from two sweeps: the jackknife over tissue, and the tracker's.
 
 An answer sits on a bump of speckle, where the similarity falls more steeply than it would without speckle. So
 the curvature behind the standard errors is taken over displacements wider than speckle; from its place on the
@@ -29,8 +29,6 @@ taken: over twice the blur, beyond which speckle is no longer like itself. In 15
 _FARTHEST = np.array([0.25, 0.25, 0.25, 5.0, 5.0, 5.0])
 """Largest steps, rad and mm: of an error that hardly shows no step would be wide enough."""
 
-APART_MM = 0.3
-"""Displacement of the image's edge for the curvature with which last steps are taken: less than speckle."""
 LEAST_CURVATURE = 0.01
 """Least curvature in any direction, as a share of Gauss-Newton's. Layers have 0.01 to 0.06, other tissue 0.07
 and more: below, the standard errors are so large that the answer is refused."""
@@ -38,9 +36,6 @@ and more: below, the standard errors are so large that the answer is refused."""
 BLOCK_MM = 10.0
 """Side of the blocks of tissue whose patches have correlated errors, in units of the images' size: two
 patches, since neighbours show the same speckle and reflections."""
-
-STRETCH = 3
-"""Consecutive compared images whose errors are correlated: a tracker's error lasts from one to the next."""
 
 WANDERS = 1.0
 """Time over which a tracker's error is like itself, in lengths of a sweep: seconds."""
@@ -86,7 +81,7 @@ def claimed(
     """Covariance of an answer's turns and displacements at the image's origin, (6, 6).
 
     Errors of tissue (speckle, reflections) and of poses are told by how the answer changes when one block of
-    tissue, or one stretch of images, after another is left out. An error of the tracker that lasts for
+    tissue after another is left out. An error of the tracker that lasts for
     seconds displaces one sweep against the other and shows in no such change; its effect is computed.
 
     Parameters
@@ -113,14 +108,13 @@ def claimed(
     farthest = _FARTHEST * np.repeat([1.0, unit], 3)
     bends, curvature = curvature_of(refined, np.minimum(wide / np.maximum(shows, 1e-6), farthest))
     slopes = refined.weight[:, None] * refined.similarity.gradient
-    blocks = _numbered(np.floor(refined.places_mm / (BLOCK_MM * unit)))
-    sweep, image = refined.comparison.images.T
-    stretches = _numbered(np.column_stack([sweep, _numbered(np.column_stack([sweep, image])) // STRETCH]))
-    left_out = [_left_out(slopes, bends, one, curvature) for one in (blocks, stretches)]
+    cells = np.floor(refined.places_mm / (BLOCK_MM * unit))
+    blocks = np.unique(cells, axis=0, return_inverse=True)[1].ravel()
+    left_out = _left_out(slopes, bends, blocks, curvature)
     moved = np.linalg.inv(curvature)
     variance = np.repeat(np.square(tracker), 3)
     wander = moved @ _wandering(refined, _pulls(refined, wide), variance) @ moved.T
-    covariance = base @ (sum(left_out) + wander) @ base.T
+    covariance = base @ (left_out + wander) @ base.T
     covariance[4, 4] += (DEEP_MM * unit) ** 2
     return np.asarray(covariance), curvature
 
@@ -228,11 +222,6 @@ def _left_out(slopes: FloatArray, bends: FloatArray, cluster: IntArray, curvatur
     moves = np.array([np.linalg.solve(rest, s) for rest, s in zip(rests, slope, strict=True)])
     moves -= moves.mean(axis=0)
     return np.asarray((count - 1.0) / count * moves.T @ moves)
-
-
-def _numbered(cells: FloatArray) -> IntArray:
-    """Number of each patch's cell, from zero."""
-    return np.asarray(np.unique(cells, axis=0, return_inverse=True)[1], dtype=np.int64).ravel()
 
 
 def positive(found: FloatArray, normal: FloatArray, least: float = LEAST_CURVATURE) -> FloatArray:

@@ -1,12 +1,8 @@
-"""The optimiser: Gauss-Newton on the correlation of patches, and Newton's last steps.
+"""The optimiser: Gauss-Newton on the correlation of patches.
 
 The patch and its cut, both without their mean and of unit length, differ by a vector whose squared length is
 2 (1 - correlation); its derivative gives Gauss-Newton its matrix, and the exact derivative of the correlation
 its gradient. A patch that stays unlike, or has little structure, counts less (Geman and McClure).
-
-Gauss-Newton's matrix is made of the images' squared slopes, in which the slopes of speckle count in full
-although the similarity does not fall off by them: where speckle is strong it is several times too stiff, its
-steps too short. Differences of the exact slopes are free of that, so they give the last steps.
 """
 
 from __future__ import annotations
@@ -29,9 +25,6 @@ LEVERS_MM = np.array([30.0, 30.0, 30.0, 1.0, 1.0, 1.0])
 
 CLOSE_MM = 2e-3
 """Step of the image's edge, mm, at which the fit has converged: a hundredth of speckle's error."""
-
-LONGEST_MM = 1.0
-"""How far a step with a given curvature may move the image's edge: over speckle's blur it changes."""
 
 
 @dataclass(frozen=True)
@@ -66,19 +59,8 @@ class Refined:
         return normal, self.weight @ self.similarity.gradient
 
 
-def refine(
-    comparison: Comparison,
-    start: RigidTransform,
-    max_steps: int = MAX_STEPS,
-    curvature: FloatArray | None = None,
-) -> Refined:
-    """Levenberg-Marquardt steps until they are too small to matter.
-
-    Parameters
-    ----------
-    curvature : ndarray, shape (6, 6), optional
-        In place of Gauss-Newton's matrix, for Newton's last steps.
-    """
+def refine(comparison: Comparison, start: RigidTransform, max_steps: int = MAX_STEPS) -> Refined:
+    """Levenberg-Marquardt steps until they are too small to matter."""
 
     def look(pose: RigidTransform) -> Refined:
         seen = comparison.at(pose, True)
@@ -89,12 +71,9 @@ def refine(
         if now.similarity.valid.sum() < 3 or damping > 1e6:
             break
         matrix, slope = now.system
-        matrix = matrix if curvature is None else curvature
         lift = damping * np.diag(matrix) + 1e-9 * np.trace(matrix)
         step = np.asarray(np.linalg.solve(matrix + np.diag(lift), slope), dtype=np.float64)
         size = float(np.abs(step * LEVERS_MM).max())
-        if curvature is not None:
-            step *= min(1.0, LONGEST_MM / max(size, LONGEST_MM))
         trial = look(stepped(now.sensor_from_image, step, comparison.pivot_mm))
         if better(now.similarity, trial.similarity, now.weight):
             now, damping = trial, max(0.2 * damping, 1e-5)
@@ -120,9 +99,5 @@ def weights(similarity: Similarity) -> FloatArray:
 def better(here: Similarity, there: Similarity, weight: FloatArray) -> bool:
     """Whether patches supported at both places correlate better; others would reward losing bad patches."""
     both = here.valid & there.valid
-    if both.sum() < 0.5 * here.valid.sum():
-        return False
-    loss = [(1.0 - one.alike[both]) / (ROBUST + 1.0 - one.alike[both]) for one in (here, there)]
-    # The weight of contrast alone, since the loss accounts for the correlation.
-    base = weight[both] * ((ROBUST + 1.0 - here.alike[both]) / ROBUST) ** 2
-    return bool(base @ loss[1] < base @ loss[0])
+    gain = weight[both] @ (there.alike[both] - here.alike[both])
+    return bool(gain > 0 and both.sum() >= 0.5 * here.valid.sum())

@@ -18,14 +18,12 @@ from scipy.spatial.transform import RigidTransform
 
 from calibration.images.angulation import Angulation, angulation, point_motion
 from calibration.images.errors import (
-    APART_MM,
     LEAST_SIMILARITY,
     claimed,
-    curvature_of,
     require_known,
     require_one_answer,
 )
-from calibration.images.fit import LEVERS_MM, refine
+from calibration.images.fit import refine
 from calibration.images.search import DECIDED, search
 from calibration.images.similarity import CrossingSweeps, Level, prepare
 from calibration.points import Recording
@@ -82,7 +80,6 @@ class ImageCalibration:
     alike: float
     before: float
     after: float
-    converged: bool
     angulation: Angulation
     sweeps: CrossingSweeps = field(repr=False)
 
@@ -149,9 +146,10 @@ def calibrate_from_sweeps(
         )
     angles = angulation(poses[0], poses[1], answer)
     angles.require()
-    _, narrow = curvature_of(refined, APART_MM / LEVERS_MM)
-    refined = refine(refined.comparison, answer, curvature=narrow)
-    answer = refined.sensor_from_image
+    if not refined.converged:
+        raise InsufficientDataError(
+            "no solution: expected a better start, or longer sweeps of more structure"
+        )
     tracker = chosen.tracker_mm, float(np.deg2rad(chosen.tracker_deg))
     covariance, curvature = claimed(refined, crossing, tracker)
     require_known(covariance, angles, crossing.centre_mm)
@@ -166,7 +164,6 @@ def calibrate_from_sweeps(
         alike=alike,
         before=decided.at(start).mean,
         after=decided.at(answer).mean,
-        converged=refined.converged,
         angulation=angles,
         sweeps=crossing,
     )

@@ -17,10 +17,9 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from calibration.points import Recording
 from speckle3d.core.arrays import Float32Array, FloatArray, IntArray
-from speckle3d.core.errors import InsufficientDataError, InvalidInputError, naming
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.extras import extra_module
 from speckle3d.core.threads import in_parallel
-from speckle3d.imaging.images import PosedImages
 
 BASE_PIXEL_MM = 0.35
 """Pixel size to which images are reduced: half the finest blur that comparisons use."""
@@ -174,9 +173,6 @@ def read_stack(
             f"{recording.name}: expected at least {FEWEST_FRAMES} frames with readings, got {len(frames)}"
         )
     grid = recording.grid
-    with naming(recording.name):
-        # Images are read here, not placed: their poses do not matter, only how many there are.
-        source = PosedImages(recording.images, grid, RigidTransform.identity(len(recording.frame_time_s)))
     size = recording.pixel_mm
     bins = np.minimum(np.maximum(1, np.round(pixel_mm / size)).astype(int), [grid.vectors, grid.samples])
     shape = (len(frames), grid.vectors // bins[0], grid.samples // bins[1])
@@ -189,9 +185,8 @@ def read_stack(
     images = np.empty(shape, np.float32)
     for n, frame in enumerate(frames):
         # Whole blocks; a block is NaN where any of its pixels is.
-        whole = np.array(source.read_as_stored(int(frame)), np.float32, order="C")[
-            : shape[1] * bins[0], : shape[2] * bins[1]
-        ]
+        whole = np.asarray(recording.images[int(frame)], np.float32)
+        whole = whole[: shape[1] * bins[0], : shape[2] * bins[1]]
         images[n] = transform.downscale_local_mean(whole, tuple(bins))
         if progress:
             progress(n + 1, len(frames))

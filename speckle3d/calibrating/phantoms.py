@@ -146,10 +146,15 @@ def picked(recording: Recording, points: PickedPoints, settings: ScanSettings) -
 
 def solved(recording: Recording, seen: Seen, settings: ScanSettings) -> Outcome:
     """Calibrate with what was found; for errors see `calibrate_recording`."""
-    size = recording.pixel_mm
+    size, clock = recording.pixel_mm, settings.time_offset_s
 
-    def with_(method: str, calibrate: Callable[[ImagePoints], Solution]) -> Outcome:
-        return calibrate_recording(recording, seen, method, calibrate, settings.time_offset_s)
+    def with_(
+        method: str,
+        calibrate: Callable[[ImagePoints], Solution],
+        with_clock: Callable[[ImagePoints], Solution] | None = None,
+        seen: Seen = seen,
+    ) -> Outcome:
+        return calibrate_recording(recording, seen, method, calibrate, clock, with_clock)
 
     if isinstance(settings, OrientationSettings):
         return with_("orientation", lambda points: calibrate_orientation(points, size, settings))
@@ -164,32 +169,15 @@ def solved(recording: Recording, seen: Seen, settings: ScanSettings) -> Outcome:
     assert isinstance(settings, WireSettings)
     phantom = Wired.of(settings.phantom).phantom
     if phantom is None:
-        return _with_crossings(recording, seen, settings)
-    return _with_wires(recording, seen, settings, phantom)
-
-
-def _with_crossings(recording: Recording, seen: Seen, settings: WireSettings) -> Outcome:
-    """Choose among the candidates of each frame, and calibrate."""
-    clock, size = settings.time_offset_s, recording.pixel_mm
-    around = clock if isinstance(clock, float) else recording.time_offset_s
-    offsets = delays_around(around, SEARCH_S, CHOICE_STEP_S).tolist() if clock == "estimate" else [around]
-    chosen = choose_crossings(recording, seen, offsets) if len(seen) else seen
-    outcome = calibrate_recording(
-        recording, chosen, "cross-wire", lambda points: calibrate_cross_wire(points, size, settings), clock
-    )
-    shots = [replace(s, candidates_px=seen.pixels[seen.frame == s.frame]) for s in outcome.shots]
-    return replace(outcome, shots=tuple(shots))
-
-
-def _with_wires(recording: Recording, seen: Seen, settings: WireSettings, phantom: WirePhantom) -> Outcome:
-    """Calibrate; the clock is sought with what depends least on the place and yet is determined."""
-    size = recording.pixel_mm
-    return calibrate_recording(
-        recording,
-        seen,
+        offsets = [clock if isinstance(clock, float) else recording.time_offset_s]
+        if clock == "estimate":
+            offsets = delays_around(offsets[0], SEARCH_S, CHOICE_STEP_S).tolist()
+        chosen = choose_crossings(recording, seen, offsets) if len(seen) else seen
+        return with_("cross-wire", lambda points: calibrate_cross_wire(points, size, settings), seen=chosen)
+    # The clock is sought with what depends least on the phantom's place and yet is determined.
+    return with_(
         "n-wire" if phantom.n_shapes else "three-wire",
         lambda points: require_adequate(solve_wires(points, phantom, size, settings)),
-        settings.time_offset_s,
         lambda points: calibrate_wires(points, phantom, size, settings),
     )
 

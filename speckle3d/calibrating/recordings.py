@@ -43,8 +43,6 @@ def open_recording(
     InsufficientDataError
         If there is no such sensor.
     """
-    if sensor not in ("tracker", "orientation"):
-        raise InvalidInputError(f"--sensor: expected tracker or orientation, got {sensor!r}")
     sweep = _load(images, pixel_mm, transform if poses is None else None)
     readings, offset_s = (
         _readings(sweep, images, sensor) if poses is None else _readings_of(poses, sensor, transform)
@@ -90,12 +88,11 @@ def require_unsaid(path: Path, given: ImportSettings) -> None:
 def _readings(sweep: Sweep, path: Path, sensor: str) -> tuple[TimedPoses | TimedRotations, float]:
     found = sweep.orientation if sensor == "orientation" else sweep.tracker
     if found is None:
-        held = lacking_poses(path) if kind_of(path) == IMAGE else "none"
-        others = "a tracker (--sensor tracker uses its orientation)" if sweep.tracker else held
+        others = lacking_poses(path) if kind_of(path) == IMAGE else "none"
+        if sweep.tracker is not None:
+            others = "a tracker (--sensor tracker uses its orientation)"
         raise InsufficientDataError(
-            f"{path}: expected readings of the {sensor} sensor there or in --poses, got {others}"
-            if sensor == "orientation"
-            else f"{path}: expected readings of a tracker there or in --poses, got {others}"
+            f"{path}: expected readings of the {sensor} there or in --poses, got {others}"
         )
     return found.readings, found.time_offset_s
 

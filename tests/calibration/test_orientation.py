@@ -57,16 +57,6 @@ def test_the_mirror_is_never_wrong(trials):
         assert np.linalg.norm(tilt_yaw_roll_deg(solution, mounting)) < 20.0, trial
 
 
-@pytest.mark.parametrize("level", [True, False])
-@pytest.mark.parametrize(
-    "missing", [{"tilt_deg": 0.0}, {"roll_deg": 0.0}, {"tilt_deg": 3.0, "roll_deg": 3.0}]
-)
-def test_a_missing_motion_is_named_and_nothing_returned(level, missing):
-    directions, readings, _ = line_directions(np.random.default_rng(0), 100, **missing)
-    with pytest.raises(InsufficientDataError, match=r"tilt|roll|rotate"):
-        calibrate(directions, readings, level=level)
-
-
 def test_beams_that_are_level_on_average_cannot_be_told_from_their_mirror():
     rng = np.random.default_rng(0)
     above = line_directions(rng, 60, noise_deg=0.05, mounting=Rotation.identity())

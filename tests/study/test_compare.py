@@ -14,7 +14,6 @@ from speckle3d.io.load import load_sweep
 from speckle3d.io.reconstructions import read_reconstruction
 from speckle3d.io.sweep_writer import write_sweep
 from speckle3d.study.compare import compare_sweeps
-from speckle3d.study.schedulers import Scheduler
 
 MODES = ["image", "consistent-subset", "orientation", "pose", "fused", "tracker"]
 
@@ -88,13 +87,6 @@ def test_a_second_start_does_nothing_again_but_what_is_missing(study, sweeps, tm
     changed = compare_sweeps(sweeps[:1], tmp_path / "again", config=other)
     assert not changed.outcomes[0].skipped
     assert stored(tmp_path / "again")["modes"] == ["image", "orientation", "pose", "fused", "tracker"]
-
-
-@pytest.mark.slow
-def test_worker_processes_give_the_same_bits(study, sweeps, tmp_path):
-    again = compare_sweeps(sweeps, tmp_path / "out", scheduler=Scheduler(2))
-    assert [each.summary is not None for each in again.outcomes] == [True, False, True]
-    assert numbers(again.directory) == numbers(study.directory)
 
 
 def test_a_mode_that_a_sweep_has_no_sensor_for_is_its_reason(sweeps, tmp_path):

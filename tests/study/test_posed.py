@@ -7,14 +7,13 @@ from image_examples import grey, text_of, tracked, write_mha
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.calibration import Calibration, FramesUsed
-from speckle3d.core.errors import InvalidInputError, MismatchError
+from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.reconstruction import CalibrationFile, Provenance, Reconstruction
 from speckle3d.io.calibrations import write_calibration
 from speckle3d.io.load import recording_sha256
-from speckle3d.io.reconstructions import write_reconstruction
 from speckle3d.io.sweep_writer import write_sweep
-from speckle3d.study.images import open_reconstruction, sweep_of
-from speckle3d.study.posed import open_posed, pose_mark, require_made_at
+from speckle3d.study.images import sweep_of
+from speckle3d.study.posed import open_posed
 
 PIXELS = np.diag([0.1, 0.2, 0.15, 1.0])
 LEANING = PIXELS.copy()
@@ -67,25 +66,3 @@ def test_a_reconstruction_is_opened_with_the_calibrations_it_was_made_with(tmp_p
         Reconstruction(sweep.frame_time_s, sweep.grid, {"image": sweep.truth}, made), tmp_path / "s.h5"
     )
     np.testing.assert_allclose(opened.tracker.sensor_from_image.as_matrix(), mounting.as_matrix())
-
-
-@pytest.mark.parametrize("stored", ["s.h5", "mine/s.h5"], ids=["beside the results", "in them"])
-def test_a_sweep_given_by_a_relative_path_is_found_from_elsewhere(tmp_path, monkeypatch, stored):
-    (tmp_path / "mine").mkdir()
-    sweep = sweep_examples.rf_sweep()
-    write_sweep(tmp_path / stored, sweep)
-    made = Provenance(stored, recording_sha256(tmp_path / stored), "1")
-    held = Reconstruction(sweep.frame_time_s, sweep.grid, {"image": sweep.truth}, made)
-    write_reconstruction(tmp_path / "mine" / "r.h5", held)
-    (tmp_path / "elsewhere").mkdir()
-    monkeypatch.chdir(tmp_path / "elsewhere")
-    assert len(open_reconstruction(tmp_path / "mine" / "r.h5")[1]) == len(sweep)
-
-
-def test_what_was_made_at_other_poses_is_refused_and_older_files_are_not():
-    poses = RigidTransform.from_translation([[0.0, 0.0, z] for z in (0.0, 0.3)])
-    own, other = pose_mark(poses), pose_mark(RigidTransform.from_translation([0.0, 0.0, 1e-3]) * poses)
-    for mark in (own, ""):
-        require_made_at(mark, own, "v.nrrd")
-    with pytest.raises(MismatchError):
-        require_made_at(other, own, "v.nrrd")

@@ -1,11 +1,8 @@
 """Tables and JSON of one sweep and of a study."""
 
-import csv
-import io
 import json
 from dataclasses import replace
 
-import numpy as np
 import sweep_examples
 
 from speckle3d.core.doubts import Doubt
@@ -16,8 +13,6 @@ from speckle3d.study.results import (
     Study,
     Summary,
     SweepOutcome,
-    csv_text,
-    json_text,
     read_summary,
     write_study,
     write_summary,
@@ -38,16 +33,6 @@ def row(mode="image", **changes):
 
 def summary(reference="tracker", rows=None, **more):
     return Summary("beef, 1", reference, 100, 0.95, rows or [row(), row("orientation")], **more)
-
-
-def test_json_and_csv_hold_every_number_and_nothing_where_there_is_none():
-    details = {"spread": np.array([1.0, np.nan]), "best": np.float64(2.5)}
-    of = summary(details=details)
-    (sweep,) = json.loads(json_text({"sweeps": [of]}))["sweeps"]
-    assert sweep["rows"][0]["tilt_error_deg"] == -1.254
-    assert sweep["details"] == {"spread": [1.0, None], "best": 2.5}
-    line, _ = csv.DictReader(io.StringIO(csv_text(of.records())))
-    assert (line["sweep"], line["mode"], float(line["tilt_error_deg"])) == ("beef, 1", "image", -1.254)
 
 
 def test_a_doubt_is_of_the_modes_that_rest_on_what_is_doubted():

@@ -108,11 +108,6 @@ def images(
     angulation(posed[0], posed[1], begin).require(0.5)
     with progress_bar("comparing sweeps") as bar:
         found = calibrate_images(one, other, begin, fit, bar)
-    if not found.converged:
-        raise InsufficientDataError(
-            f"{first.name} and {second.name}: the solution did not converge: expected a better start, or "
-            "longer sweeps with more structure; nothing is written"
-        )
     notes = notes_of(found)
     made = calibration_from_images(found, sweeps)
     written = write_with_report(made, (first, second), out, lambda _: figure_of(found, sweeps), notes)

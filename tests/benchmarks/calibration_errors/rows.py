@@ -20,10 +20,16 @@ class Row:
 
 
 def coverage_row(case, ratio):
-    """Coverage of 68 % and 95 % intervals by errors over claims, against 62 to 74 and 92 to 98 %."""
-    one, two = (100.0 * np.mean(np.abs(ratio) < limit) for limit in (1.0, 1.96))
-    found = f"{one:.0f} / {two:.0f} %, RMS z {np.sqrt(np.mean(ratio**2)):.2f}, {ratio.size} figures"
-    return Row(case, found, "62-74 / 92-98 %", bool(62.0 <= one <= 74.0 and 92.0 <= two <= 98.0))
+    """Coverage of 68 % and 95 % intervals by errors over claims, against 62 to 74 and 92 to 98 %.
+
+    It is missed where it is outside by two standard errors: few trials tell little.
+    """
+    shares = np.array([np.mean(np.abs(ratio) < limit) for limit in (1.0, 1.96)])
+    slack = 2.0 * np.sqrt(np.array([0.68 * 0.32, 0.95 * 0.05]) / len(ratio))
+    found = "{:.0f} / {:.0f} %".format(*(100.0 * shares))
+    found += f", RMS z {np.sqrt(np.mean(ratio**2)):.2f}, {ratio.size} figures of {len(ratio)} trials"
+    reached = (shares >= np.array([0.62, 0.92]) - slack) & (shares <= np.array([0.74, 0.98]) + slack)
+    return Row(case, found, "62-74 / 92-98 %", bool(reached.all()))
 
 
 def trials(run, todo):
