@@ -171,9 +171,8 @@ def weakest_of(solution: Solution) -> str:
     jacobian, free = solution.jacobian, solution.free
     scaled = jacobian / np.maximum(np.linalg.norm(jacobian, axis=0), np.finfo(float).tiny)
     part = np.abs(np.linalg.eigh(scaled.T @ scaled)[1][:, 0])
-    named = [name for name, share in zip(free, part, strict=True) if share > _TAKES_PART * part.max()]
-    first, *rest = (_WORDS[name] for name in named)
-    return f"{first} (with {' and '.join(rest)})" if rest else first
+    named = (name for name, share in zip(free, part, strict=True) if share > _TAKES_PART * part.max())
+    return " with ".join(_WORDS[name] for name in named)
 
 
 def extents(solution: Solution) -> dict[str, float]:

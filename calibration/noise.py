@@ -250,28 +250,31 @@ def fit_noise(
             excess[:2] = chain.pixel_mm - prior.pixel_mm
         known = certainty, excess
         noise, grid = fit_wandering(jacobian, residuals, effects, starts, frame_time_s, grid, *known)
-        sensor, image = _divided(residuals + jacobian @ noise.step, effects, starts, noise)
+        residuals += jacobian @ noise.step
         step = np.zeros(slopes.shape[-1])
         step[columns] = noise.step[:count]
         chain, further = chain.displaced(step), further + noise.step[count:]
-        corrected, expected = _corrected(equations, chain, sensor @ axes, image)
+        corrected, expected = _corrected(equations, chain, residuals, effects, axes, starts, noise)
         if number > 0 and (np.abs(noise.step) <= _SETTLED * np.sqrt(np.diag(noise.covariance))).all():
             break
     return chain, further, noise.covariance
 
 
-def _divided(
-    residuals: FloatArray, effects: FloatArray, starts: IntArray, noise: Noise
-) -> tuple[FloatArray, FloatArray]:
-    """Divide residuals between the sensor and the image, each frame by itself: their expected errors.
+def _corrected(
+    equations: Equations,
+    chain: Chain,
+    residuals: FloatArray,
+    effects: FloatArray,
+    axes: FloatArray,
+    starts: IntArray,
+    noise: Noise,
+) -> tuple[Equations, FloatArray]:
+    """Take expected errors out of poses and pixels; return also what that takes out of the residuals.
 
-    Returns
-    -------
-    sensor : ndarray, shape (m, k)
-        Error of the sensor in the frame of each residual.
-    image : ndarray, shape (m,)
-        What is left for the image.
+    Residuals, shape (m,), are divided between the sensor, whose error along `axes` has these effects, and the
+    image, each frame by itself.
     """
+    points, (n, several) = equations.points, equations.offsets.shape
     size = np.diff(starts)
     frame = np.repeat(np.arange(len(size)), size)
     place = np.arange(len(residuals)) - starts[frame]
@@ -280,26 +283,21 @@ def _divided(
     white = max(noise.white, _SMALLEST) ** 2
     covariance = (moved * noise.spread) @ np.swapaxes(moved, 1, 2) + white * np.eye(size.max())
     pull = np.linalg.solve(covariance, left[..., None])[..., 0]
-    sensor = noise.spread * np.einsum("fa,fak->fk", pull, moved)
-    return sensor[frame], white * pull[frame, place]
-
-
-def _corrected(
-    equations: Equations, chain: Chain, sensor: FloatArray, image: FloatArray
-) -> tuple[Equations, FloatArray]:
-    """Take expected errors out of poses and pixels; return also what that takes out of the residuals."""
-    points, (n, several) = equations.points, equations.offsets.shape
+    sensor = ((noise.spread * np.einsum("fa,fak->fk", pull, moved)) @ axes)[frame]
     error = sensor[::several]
-    moved = points.world_from_sensor.as_matrix()
-    moved[:, :3, :3] = Rotation.from_rotvec(-error[:, :3]).as_matrix() @ points.turns
-    moved[:, :3, 3] -= error[:, 3:]
+    poses = points.world_from_sensor.as_matrix()
+    poses[:, :3, :3] = Rotation.from_rotvec(-error[:, :3]).as_matrix() @ points.turns
+    poses[:, :3, 3] -= error[:, 3:]
     in_image = equations.rows @ chain.target[:3, :3] @ points.turns @ chain.probe[:3, :2]
     # The smallest displacement in the image, mm, that explains what is left to it.
     square = in_image @ np.swapaxes(in_image, 1, 2) + 1e-9 * np.eye(several)
-    pull = np.linalg.solve(square, image.reshape(n, several, 1))[..., 0]
-    moved_mm = np.einsum("nr,nri->ni", pull, in_image)
-    poses = RigidTransform(moved, normalize=False)
-    shown = replace(points, world_from_sensor=poses, pixels=points.pixels - moved_mm / chain.pixel_mm)
+    image = (white * pull[frame, place]).reshape(n, several, 1)
+    moved_mm = np.einsum("nr,nri->ni", np.linalg.solve(square, image)[..., 0], in_image)
+    shown = replace(
+        points,
+        world_from_sensor=RigidTransform(poses, normalize=False),
+        pixels=points.pixels - moved_mm / chain.pixel_mm,
+    )
     corrected = replace(equations, points=shown)
-    effects = sensor_effects(corrected, chain).reshape(-1, 6)
-    return corrected, np.sum(effects * sensor, axis=1) + np.einsum("nri,ni->nr", in_image, moved_mm).ravel()
+    by_sensor = np.sum(sensor_effects(corrected, chain).reshape(-1, 6) * sensor, axis=1)
+    return corrected, by_sensor + np.einsum("nri,ni->nr", in_image, moved_mm).ravel()

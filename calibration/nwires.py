@@ -20,22 +20,22 @@ from calibration.detection.labelling import label_by_calibration, label_dots
 from calibration.points import ImagePoints, Seen
 from calibration.wires import Wires, solve_wires
 from speckle3d.core.arrays import FloatArray
-from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.wires import WirePhantom
 
 _PLUS_SHARE = 0.95
 """Share of the errors of which PLUS reports mean and standard deviation, the least ones."""
 
 
-def trimmed_mean_mm(errors_mm: FloatArray, share: float = _PLUS_SHARE) -> tuple[float, float]:
-    """Mean and standard deviation of the least `share` of the errors, mm, as PLUS reports them.
+def trimmed_mean_mm(errors_mm: FloatArray) -> tuple[float, float]:
+    """Mean and standard deviation of the least 95 % of the errors, mm, as PLUS reports them.
 
     Raises
     ------
     InsufficientDataError
         If there are none.
     """
-    kept = np.sort(errors_mm)[: round(share * len(errors_mm))]
+    kept = np.sort(errors_mm)[: round(_PLUS_SHARE * len(errors_mm))]
     if kept.size == 0:
         raise InsufficientDataError("expected an N with all three dots, got none")
     return float(kept.mean()), float(kept.std())
@@ -127,8 +127,6 @@ def label_by_wires(
     InsufficientDataError, InvalidInputError
         See `label_dots` and `solve_wires`.
     """
-    if len(dots.frame) and dots.frame[-1] >= len(world_from_sensor):
-        raise MismatchError(f"expected a pose for frame {dots.frame[-1]}, got {len(world_from_sensor)} poses")
     alone = label_dots(dots, phantom, pixel_mm)
     if len(alone) == 0:
         reasons = sorted(set(alone.dropped.values())) or ["no frames"]

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
@@ -157,9 +156,17 @@ def figure_report(solution: Solution, calibration: Calibration, shots: Sequence[
     panels = figure.subplots(2, 3)
     for axes in panels[0]:
         axes.set_axis_off()
+    # For an orientation sensor, only the ratio of the pixel sizes is known; no more is needed.
+    aspect = float(solution.chain.pixel_mm[1] / solution.chain.pixel_mm[0])
     for axes, shot in zip(panels[0], shots, strict=False):
-        # For an orientation sensor, only the ratio of the pixel sizes is known; no more is needed.
-        _draw_shot(axes, shot, float(solution.chain.pixel_mm[1] / solution.chain.pixel_mm[0]))
+        axes.imshow(np.asarray(shot.image).T, cmap="gray", aspect=aspect)
+        colour = DROPPED if shot.note else USED
+        if shot.as_line and len(shot.marks_px):
+            axes.axline(shot.marks_px[0], shot.marks_px[-1], color=colour, lw=1.0)
+        else:
+            axes.plot(*shot.marks_px.T, "o", mfc="none", color=colour, ms=8)
+        axes.set(xlim=(0, shot.image.shape[0] - 1), ylim=(shot.image.shape[1] - 1, 0))
+        axes.set_title(f"frame {shot.frame}" + (f"\n{shot.note[:60]}" if shot.note else ""), fontsize=8)
     worst = np.abs(solution.residuals).argmax(axis=1)
     values = solution.residuals[np.arange(len(worst)), worst]
     values, unit = (np.rad2deg(values), "deg") if solution.angular else (values, "mm")
@@ -183,15 +190,3 @@ def figure_report(solution: Solution, calibration: Calibration, shots: Sequence[
     figure.suptitle(fill(calibration.verdict, 150), fontsize=9)
     figure.supxlabel("blue: found in the image, and used; red: left out (residuals: x)", fontsize=8)
     return figure
-
-
-def _draw_shot(axes: Axes, shot: Shot, aspect: float) -> None:
-    """An image, with the line or the dots found in it."""
-    axes.imshow(np.asarray(shot.image).T, cmap="gray", aspect=aspect)
-    colour = DROPPED if shot.note else USED
-    if shot.as_line and len(shot.marks_px):
-        axes.axline(shot.marks_px[0], shot.marks_px[-1], color=colour, lw=1.0)
-    else:
-        axes.plot(*shot.marks_px.T, "o", mfc="none", color=colour, ms=8)
-    axes.set(xlim=(0, shot.image.shape[0] - 1), ylim=(shot.image.shape[1] - 1, 0))
-    axes.set_title(f"frame {shot.frame}" + (f"\n{shot.note[:60]}" if shot.note else ""), fontsize=8)

@@ -165,16 +165,15 @@ def calibrate_wires(
     s = settings or WireFit()
     if geometry.world_from_phantom is None or s.registration != "auto":
         return require_adequate(solve_wires(points, geometry, pixel_mm, s))
-    solutions, missed, refusal = dict[str, Solution](), dict[str, FloatArray](), list[InsufficientDataError]()
+    solutions, missed = dict[str, Solution](), dict[str, FloatArray]()
     for name in _ESTIMATED:
+        chosen = s.model_copy(update={"registration": name})
         try:
-            chosen = s.model_copy(update={"registration": name})
             solutions[name] = require_adequate(solve_wires(points, geometry, pixel_mm, chosen))
             missed[name] = _missed_mm(solutions[name])
-        except InsufficientDataError as error:
-            refusal.append(error)
-    if not solutions:
-        raise refusal[0]
+        except InsufficientDataError:
+            if name == "free" and not solutions:
+                raise
     best = min(missed.values(), key=lambda one: float(one.mean()))
     worse = {name: one - best for name, one in missed.items()}
     simplest = next(n for n, one in worse.items() if one.mean() <= np.std(one, ddof=1) / np.sqrt(len(one)))

@@ -3,8 +3,8 @@
 Two thin, slightly bent wires are met by a beam that is thickest away from its focus: each is bright where it
 lies in the beam and across it, so that a frame shows an X, one long line with a short faint one on it, or two
 short strokes. Each point of a wire is blurred by pulse and beam and leaves an arc of side lobes. Added are
-speckle, scatterers fixed in the phantom, the skin's reverberations, a step of gain, compression to 8 bits.
-Nothing is drawn by a line filter.
+speckle, scatterers fixed in the phantom, the skin's reverberations, a step of gain, compression to 8 bits
+and lettering. Nothing is drawn by a line filter.
 """
 
 from dataclasses import dataclass
@@ -129,8 +129,13 @@ def crossing_world(seed, frames=54):
     best = int(np.argmax([one.sum() for one in seen]))
     wires = _wires(rng, base, centre, drawn[best])
     points = _scatterers(rng, look, centre)
-    texture = _skin(rng, probe, look)
-    images = np.stack([_frame(rng, probe, look, pose, wires, points, texture) for pose in world_from_image])
+    texture, letters = _skin(rng, probe, look), _lettering(rng, probe)
+    images = np.stack(
+        [
+            np.maximum(_frame(rng, probe, look, pose, wires, points, texture), letters)
+            for pose in world_from_image
+        ]
+    )
     mounting = RigidTransform.from_components(rng.uniform(-120, 120, 3), Rotation.random(rng=rng))
     readings = world_from_image * mounting.inv() * _errors(rng, frames)
     shown = (np.abs(away) < 1.2 * look.elevation_mm) & probe.inside(pixels) & seen[best]
@@ -304,6 +309,19 @@ def _skin(rng, probe, look):
     fade = np.exp(-depth / (look.skin_mm / 2)) * 10 ** (look.skin_db / 20.0)
     uneven = 1 + 0.3 * gaussian_filter1d(rng.standard_normal(probe.beams), 12) / 0.15
     return np.abs(uneven)[:, None] * (stripes * fade)
+
+
+def _lettering(rng, probe):
+    """Lines of letters and a grey wedge, as scanners burn in."""
+    picture = np.zeros(probe.shape)
+    columns, rows = probe.shape
+    for _ in range(rng.integers(3, 9)):
+        block = np.kron(rng.random((rng.integers(20, 90), 7)) < 0.45, np.ones((1, rng.integers(1, 3))))
+        u, v = rng.integers(0, columns - len(block)), rng.choice([2, rows - 18])
+        part = picture[u : u + len(block), v : v + block.shape[1]]
+        part[:] = np.maximum(part, 230 * block)
+    picture[6:14, 30 : 30 + rows // 4] = np.linspace(255, 5, rows // 4)
+    return picture
 
 
 def _errors(rng, frames):

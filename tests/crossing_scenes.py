@@ -106,13 +106,13 @@ def _path(rng, frames, fan_deg, turn_deg, grid, size_mm):
 
 
 def _frames(grey, poses, grid):
-    u, v = np.meshgrid(np.arange(grid.vectors), np.arange(grid.samples), indexing="ij")
-    points = np.stack([u * grid.vector_pitch_mm, v * grid.sample_spacing_mm, 0.0 * u], axis=-1).reshape(-1, 3)
+    flat = grid.mm(*np.indices((grid.vectors, grid.samples))).reshape(-1, 2)
+    points = np.column_stack([flat, np.zeros(len(flat))])
     low, high = np.percentile(grey, [2.0, 99.9])
     images = np.empty((len(poses), grid.vectors, grid.samples), np.uint8)
     for n, pose in enumerate(poses):
         cut = map_coordinates(grey, pose.apply(points).T / VOXEL_MM, order=1, mode="nearest")
-        images[n] = np.clip(255.0 * (cut - low) / (high - low), 0, 255).reshape(u.shape)
+        images[n] = np.clip(255.0 * (cut - low) / (high - low), 0, 255).reshape(images.shape[1:])
     return images
 
 

@@ -119,8 +119,15 @@ def delay_from_images(
     # Where fewer than half of the images meet the other way, nothing is alike.
     alike = np.where(2 * count >= curves.shape[1], np.nansum(curves, axis=1) / np.maximum(count, 1), 0.0)
     misfit = 1.0 - alike
-    best = _clear_peak(tried, curves, misfit, doubts)
+    best = peak_of(tried, misfit, f"the motion repeats itself, or {doubts}")
     width = _half_width(tried, misfit, best)
+    near = np.abs(tried - tried[best]) < width + 0.5 * STEP_S
+    votes = near[np.nanargmax(curves[:, np.isfinite(curves[best])], axis=0)]
+    if votes.mean() < LEAST_AGREEING:
+        raise InsufficientDataError(
+            "expected images that show where they were taken, got only "
+            f"{votes.sum()} of {len(votes)} that fit best near {tried[best]:+.3f} s, the best: {doubts}"
+        )
     low, high = max(tried[best] - width, tried[0]), min(tried[best] + width, tried[-1])
     places = np.linspace(low, high, _PLACES)
     fine = np.array([correlations(FINE, float(one)) for one in places])
@@ -182,21 +189,6 @@ def _from_jitter(
     path = float(np.abs(np.diff(smooth @ along)).sum())
     sigma = float(np.std((raw - smooth) @ along) / np.sqrt(used.sum()))
     return sigma * float(times_s[-1] - times_s[0]) / path if path > 0.0 else np.inf
-
-
-def _clear_peak(tried_s: FloatArray, curves: FloatArray, misfit: FloatArray, doubts: str) -> int:
-    """Index of the best delay, if it is inside the range and most images agree."""
-    best = int(np.argmin(misfit))
-    peak_of(tried_s, misfit, f"the motion repeats itself, or {doubts}")
-    near = np.abs(tried_s - tried_s[best]) < _half_width(tried_s, misfit, best) + 0.5 * STEP_S
-    there = curves[:, np.isfinite(curves[best])]
-    agree, count = int(near[np.nanargmax(there, axis=0)].sum()), there.shape[1]
-    if agree < LEAST_AGREEING * count:
-        raise InsufficientDataError(
-            "expected images that show where they were taken, got only "
-            f"{agree} of {count} that fit best near {tried_s[best]:+.3f} s, the best delay of all: {doubts}"
-        )
-    return best
 
 
 def _half_width(tried_s: FloatArray, misfit: FloatArray, best: int) -> float:

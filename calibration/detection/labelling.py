@@ -73,9 +73,24 @@ def label_dots(dots: Seen, phantom: WirePhantom, pixel_mm: npt.ArrayLike) -> See
     dropped = dict(dots.dropped)
     for frame in np.unique(dots.frame):
         here = dots.frame == frame
+        seen_mm, strength = dots.pixels[here] * size, score[here]
         try:
-            chosen = _label(dots.pixels[here] * size, score[here], layers, phantom)
-            found[int(frame)] = dots.pixels[here][chosen]
+            triples = [_triples(seen_mm, layer, phantom) for layer in layers]
+            chosen = _combined(triples, seen_mm, strength, layers)
+            rms_mm = misfits_mm(seen_mm[chosen], wires, phantom)
+            best = float(rms_mm.min())
+            if best > _RESIDUAL_MM:
+                raise InsufficientDataError(
+                    f"no dots fit the wires: the nearest miss by {best:.2f} mm RMS, {_RESIDUAL_MM} allowed"
+                )
+            chosen = chosen[rms_mm <= best + _LIKE_MM]
+            # Rounded, so that where the same dots fit either way round, the usual one is chosen: the first
+            # wire on the side of the last columns, the first layer uppermost.
+            together = np.round(strength[chosen].sum(axis=1) / strength.max(), 6)
+            first, last = (seen_mm[chosen].reshape(len(chosen), -1, 3, 2)[:, k] for k in (0, -1))
+            usual = (first[:, 0, 0] >= first[:, 2, 0]) * 1
+            usual += first[..., 1].mean(axis=1) <= last[..., 1].mean(axis=1)
+            found[int(frame)] = dots.pixels[here][chosen[np.lexsort((usual, together))[-1]]]
         except InsufficientDataError as error:
             few = here.sum() < wires.size
             dropped[int(frame)] = f"{error}" + (f" ({here.sum()} dots for {wires.size} wires)" if few else "")
@@ -118,9 +133,13 @@ def label_by_calibration(
         # Where the image cuts each wire: far away, where it hardly does.
         steps = -place[:, 2] / np.where(along[:, 2] == 0, _TINY, along[:, 2])
         expected_mm = (place + steps[:, None] * along)[:, :2]
-        pairs = _nearest(dots.pixels[here] * chain.pixel_mm, score[here], expected_mm)
-        kept += [(int(frame), int(here[dot]), wire) for dot, wire in pairs]
-        if not pairs:
+        # Each dot of one wire at most; a stronger dot may be farther away.
+        apart = np.linalg.norm((dots.pixels[here] * chain.pixel_mm)[:, None] - expected_mm, axis=2)
+        worth = np.where(apart < _GATE_MM, score[here, None] * np.exp(-2.0 * (apart / _GATE_MM) ** 2), 0.0)
+        dot, wire = linear_sum_assignment(worth, maximize=True)
+        near = sorted((int(w), int(here[d])) for d, w in zip(dot, wire, strict=True) if worth[d, w] > 0)
+        kept += [(int(frame), number, w) for w, number in near]
+        if not near:
             dropped[int(frame)] = "no dot where the calibration expects a wire"
     frames, index, wires = np.array(kept, dtype=np.int64).reshape(-1, 3).T
     return Seen(frames, dots.pixels[index], wires, dropped)
@@ -147,32 +166,6 @@ def _layers(phantom: WirePhantom) -> list[_Layer]:
     axis = across[0] / widths[0]
     heights, turned = (begins - begins[0]) @ np.cross(along, axis), np.sign(across @ axis)
     return [_Layer(*one) for one in zip(shapes, widths, heights, turned, strict=True)]
-
-
-def _label(dots_mm: FloatArray, score: FloatArray, layers: list[_Layer], phantom: WirePhantom) -> IntArray:
-    """Which dot shows each wire of the layers, shape (3 layers,), of one frame.
-
-    Raises
-    ------
-    InsufficientDataError
-        Saying which rule failed, and by how much.
-    """
-    wires = np.concatenate([layer.wires for layer in layers])
-    triples = [_triples(dots_mm, layer, phantom) for layer in layers]
-    chosen = _combined(triples, dots_mm, score, layers)
-    rms_mm = misfits_mm(dots_mm[chosen], wires, phantom)
-    best = float(rms_mm.min())
-    if best > _RESIDUAL_MM:
-        raise InsufficientDataError(
-            f"no dots fit the wires: the nearest miss them by {best:.2f} mm RMS, {_RESIDUAL_MM:g} allowed"
-        )
-    like = np.flatnonzero(rms_mm <= best + _LIKE_MM)
-    # Rounded, so that where the same dots fit either way round, the usual one is chosen.
-    strength = np.round(score[chosen[like]].sum(axis=1) / score.max(), 6)
-    # As usual: the first wire on the side of the last columns, the first layer uppermost.
-    first, last = (dots_mm[chosen[like]].reshape(len(like), -1, 3, 2)[:, k] for k in (0, -1))
-    usual = (first[:, 0, 0] >= first[:, 2, 0]) * 1 + (first[..., 1].mean(axis=1) <= last[..., 1].mean(axis=1))
-    return np.asarray(chosen[like[np.lexsort((usual, strength))[-1]]])
 
 
 def _triples(dots_mm: FloatArray, layer: _Layer, phantom: WirePhantom) -> IntArray:
@@ -255,11 +248,3 @@ def misfits_mm(dots_mm: FloatArray, wires: IntArray, phantom: WirePhantom) -> Fl
     normal = np.swapaxes(matrix, 1, 2) @ matrix + _RIDGE_MM2 * np.eye(9)
     image = np.linalg.solve(normal, (wanted @ matrix)[..., None])
     return np.asarray(np.sqrt(np.mean(((matrix @ image)[..., 0] - wanted) ** 2, axis=1)))
-
-
-def _nearest(dots_mm: FloatArray, score: FloatArray, expected_mm: FloatArray) -> list[tuple[int, int]]:
-    """Pairs of dot and wire, each in one pair at most; a stronger dot may be farther away."""
-    apart = np.linalg.norm(dots_mm[:, None] - expected_mm[None], axis=2)
-    worth = np.where(apart < _GATE_MM, score[:, None] * np.exp(-2.0 * (apart / _GATE_MM) ** 2), 0.0)
-    pairs = zip(*linear_sum_assignment(worth, maximize=True), strict=True)
-    return sorted(((int(d), int(w)) for d, w in pairs if worth[d, w] > 0), key=lambda pair: pair[1])

@@ -30,7 +30,7 @@ from calibration.detection.region import (
 from calibration.points import Seen
 from calibration.settings import LineSettings, Place
 from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
-from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.sweep import Frames
 
 _ROUNDS = 20
@@ -123,11 +123,6 @@ class LineFinder:
     ) -> LineFinder:
         """Choose the columns from all frames; see `detect_lines`."""
         s = settings or LineSettings()
-        if len(frames.shape) != 3 or np.issubdtype(frames.dtype, np.complexfloating):
-            raise InvalidInputError(
-                f"frames: expected real values of shape (n, column, row), got {frames.dtype} of "
-                f"{frames.shape}"
-            )
         pixel = checked_pixel(pixel_mm)
         columns = lay_columns(frames.shape[1:], s.columns, region_px)
         if region_px is None and frames.shape[0] > 0:

@@ -128,17 +128,19 @@ def require_known(covariance: FloatArray, angulation: Angulation, centre_mm: Flo
         With what would help: other motion, or other tissue.
     """
     moved = point_motion(centre_mm[None])[0]
-    turns = np.rad2deg(np.sqrt(np.diag(covariance)[:3]))
-    shifts = np.sqrt(np.diag(moved @ covariance @ moved.T))
-    if turns.max() <= MOST_DEG and shifts.max() <= MOST_MM:
+    turns, shifts = (
+        np.rad2deg(np.sqrt(np.diag(covariance)[:3])),
+        np.sqrt(np.diag(moved @ covariance @ moved.T)),
+    )
+    errors, limits = np.concatenate([turns, shifts]), np.repeat([MOST_DEG, MOST_MM], 3)
+    worst = int(np.argmax(errors / limits))
+    if errors[worst] <= limits[worst]:
         return
-    worst = int(np.argmax(np.concatenate([turns / MOST_DEG, shifts / MOST_MM])))
-    got = f"{turns[worst]:.1f} degrees" if worst < 3 else f"{shifts[worst - 3]:.1f} mm"
-    sufficient = angulation.verdict == "sufficient"
+    sufficient, unit = angulation.verdict == "sufficient", "degrees" if worst < 3 else "mm"
     help_by = "scan tissue with more structure in all directions" if sufficient else angulation.advice
-    limit = f"{MOST_DEG:g} degrees" if worst < 3 else f"{MOST_MM:g} mm"
     raise InsufficientDataError(
-        f"expected sweeps that tell {PARAMETERS[worst]} to {limit} (standard error), got {got}; {help_by}"
+        f"expected sweeps that tell {PARAMETERS[worst]} to {limits[worst]:g} {unit} (standard error), got "
+        f"{errors[worst]:.1f} {unit}; {help_by}"
     )
 
 
@@ -196,10 +198,11 @@ def _wandering(refined: Refined, pulls: FloatArray, variance: FloatArray) -> Flo
     arms = refined.places_mm - share @ refined.places_mm / max(float(share.sum()), 1e-300)
     each = 2.0 * np.concatenate([pulls, pulls @ -skew(arms)], axis=2)
     found = np.zeros((pulls.shape[1],) * 2)
-    for sweep, stack in enumerate(refined.comparison.stacks):
-        ours, image = refined.comparison.images.T
+    comparison = refined.comparison
+    parts = np.split(each, [len(comparison.patches[0].where)])
+    for stack, patches, part in zip(comparison.stacks, comparison.patches, parts, strict=True):
         sums = np.zeros((len(stack), *each.shape[1:]))
-        np.add.at(sums, image[ours == sweep], each[ours == sweep])
+        np.add.at(sums, patches.where[:, 0], part)
         lag = np.arange(len(stack)) / (WANDERS * len(stack))
         alike = np.exp(-np.abs(lag[:, None] - lag))
         # Half of the variance is this sweep's.

@@ -14,11 +14,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from scipy.spatial.transform import RigidTransform
 
 from calibration.images.solver import SPECKLED_SIMILARITY, ImageCalibration
 from calibration.points import Recording
-from speckle3d.core.arrays import Float32Array
 from speckle3d.core.calibration import Calibration, FramesUsed, Parameter
 from speckle3d.imaging.cuts.planes import image_plane
 from speckle3d.imaging.cuts.reslice import reslice_at
@@ -84,18 +82,6 @@ def figure_of(result: ImageCalibration, sweeps: tuple[Recording, Recording]) -> 
     return figure
 
 
-def cut_of(shown: Recording, other: Recording, frame: int, sensor_from_image: RigidTransform) -> Float32Array:
-    """Cut the plane of one image out of the other sweep; shape (rows, columns), NaN where nothing is."""
-    frames = other.covered()
-    poses = other.world_from_sensor(frames) * sensor_from_image
-    sensor = shown.world_from_sensor(np.array([frame]))[0]
-    plane = image_plane(sensor * sensor_from_image, shown.grid, PIXEL_MM)
-    # A little more than the distance between frames deep in a fan.
-    steps = np.linalg.norm(np.diff(poses.apply([0.0, 40.0, 0.0]), axis=0), axis=1)
-    reach = max(_REACH_MM, 1.5 * float(np.percentile(steps, 98)))
-    return reslice_at(ChosenImages(other.images, frames), other.grid, [(poses, plane)], reach)[0]
-
-
 def _draw_images(
     row: Sequence[Axes], result: ImageCalibration, shown: Recording, other: Recording, frame: int
 ) -> None:
@@ -104,11 +90,19 @@ def _draw_images(
     grey = own[np.isfinite(own)]
     low, high = np.percentile(grey, [2.0, 99.5]) if grey.size else (0.0, 1.0)
     extent = (0.0, grid.width_mm, grid.depth_mm - grid.first_sample_depth_mm, 0.0)
-    drawn = {f"{shown.name}, frame {frame}": own} | {
-        f"the other sweep there, {when} (blue-grey: no frame)": cut_of(shown, other, frame, pose)
-        for when, pose in (("before", result.start), ("after", result.sensor_from_image))
-    }
-    for axes, (title, image) in zip(row, drawn.items(), strict=True):
+    frames = other.covered()
+    sensors, sensor = other.world_from_sensor(frames), shown.world_from_sensor(np.array([frame]))[0]
+    cuts = []
+    for pose in (result.start, result.sensor_from_image):
+        poses = sensors * pose
+        # A little more than the distance between frames deep in a fan.
+        steps = np.linalg.norm(np.diff(poses.apply([0.0, 40.0, 0.0]), axis=0), axis=1)
+        reach = max(_REACH_MM, 1.5 * float(np.percentile(steps, 98)))
+        plane = image_plane(sensor * pose, grid, PIXEL_MM)
+        cuts += reslice_at(ChosenImages(other.images, frames), other.grid, [(poses, plane)], reach)
+    beside = (f"the other sweep there, {when} (blue-grey: no frame)" for when in ("before", "after"))
+    titles = [f"{shown.name}, frame {frame}", *beside]
+    for axes, title, image in zip(row, titles, (own, *cuts), strict=True):
         axes.set_facecolor(_UNSEEN)
         axes.imshow(image, cmap="gray", vmin=low, vmax=high, extent=extent)
         axes.set_title(title, fontsize=8)

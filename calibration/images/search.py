@@ -50,7 +50,11 @@ def search(
     InsufficientDataError
         If the sweeps show nothing in common anywhere.
     """
-    centre_mm = crossing.centre_mm
+    # As far as the box's corners, and a fifth more.
+    centre_mm, far_mm = (
+        crossing.centre_mm,
+        1.2 * np.sqrt(3.0) * np.hypot(capture_mm, 20.0 * capture_rad) + 1.0,
+    )
 
     def best_of(count: int, most: int) -> list[RigidTransform]:
         """The best of many places in the box: those from which an increment leads to the start."""
@@ -74,22 +78,12 @@ def search(
         ends = ahead(lambda place: refine(comparison, place, max_steps=_STEPS), starts)
         return sorted(ends, key=lambda one: -one.similarity.score)
 
-    def inside(ends: list[Refined]) -> list[Refined]:
-        """Keep those within 1.2 times the distance of the box's corners from the start."""
-        far = np.sqrt(3.0) * 1.2
-        steps = [one.sensor_from_image.inv() * start for one in ends]
-        return [
-            one
-            for one, step in zip(ends, steps, strict=True)
-            if np.linalg.norm(step.translation) <= far * capture_mm + 1.0
-            and step.rotation.magnitude() <= far * capture_rad + 0.02
-        ]
-
     followed: list[Refined] = []
     for count, most in ((_GLANCES, _FOLLOWED), (_MORE_GLANCES, 2 * _FOLLOWED)):
         if not followed:
             best = best_of(count, most)
-            followed = inside(refined(FOLLOWED, best))
+            ends = refined(FOLLOWED, best)
+            followed = [one for one in ends if apart_mm(one.sensor_from_image, start, centre_mm) <= far_mm]
     if not followed:
         got = "none but farther off" if best else "no overlap anywhere"
         raise InsufficientDataError(

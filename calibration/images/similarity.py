@@ -127,14 +127,6 @@ class Comparison:
         """Centre of the first stack's images, which turns leave in place, shape (3,)."""
         return self.stacks[0].centre_mm
 
-    @property
-    def images(self) -> IntArray:
-        """Which sweep, and which image of its stack, each patch is on, shape (p, 2)."""
-        rows = [
-            np.column_stack([np.full(len(p.where), n), p.where[:, 0]]) for n, p in enumerate(self.patches)
-        ]
-        return np.concatenate(rows)
-
     def places_mm(self, sensor_from_image: RigidTransform) -> FloatArray:
         """Where the patches' centres lie in the world, shape (p, 3)."""
         rows = []

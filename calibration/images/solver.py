@@ -29,7 +29,7 @@ from calibration.images.similarity import CrossingSweeps, Level, prepare
 from calibration.points import Recording
 from calibration.settings import ImageFit
 from speckle3d.core.arrays import FloatArray
-from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.leastsquares import condition_number
 from speckle3d.core.progress import Progress
 from speckle3d.core.shown import shown
@@ -123,8 +123,6 @@ def calibrate_from_sweeps(
     progress: Progress | None = None,
 ) -> ImageCalibration:
     """Calibrate as `calibrate_images`, from sweeps that are prepared already: for many starts."""
-    if not start.single:
-        raise InvalidInputError("start: expected a single transform, got a row of them")
     chosen = settings or ImageFit()
     answer, rivals = start, list[RigidTransform]()
     if chosen.capture_mm > 0.0 or chosen.capture_deg > 0.0:
@@ -147,9 +145,7 @@ def calibrate_from_sweeps(
     angles = angulation(poses[0], poses[1], answer)
     angles.require()
     if not refined.converged:
-        raise InsufficientDataError(
-            "no solution: expected a better start, or longer sweeps of more structure"
-        )
+        raise InsufficientDataError("expected a better start, or longer sweeps with more structure")
     tracker = chosen.tracker_mm, float(np.deg2rad(chosen.tracker_deg))
     covariance, curvature = claimed(refined, crossing, tracker)
     require_known(covariance, angles, crossing.centre_mm)

@@ -114,10 +114,9 @@ class Stack:
         """
         poses = self.world_from_sensor * sensor_from_image
         normal = poses.rotation.apply([0.0, 0.0, 1.0])[1:]
-        steps = np.zeros(len(normal))
-        for corner in self.corners_mm:
-            place = gaussian_filter1d(poses.apply(corner), _SMOOTHED_FRAMES, axis=0, mode="nearest")
-            steps += 0.25 * np.abs(np.einsum("ij,ij->i", np.diff(place, axis=0), normal))
+        places = np.stack([poses.apply(corner) for corner in self.corners_mm])
+        places = gaussian_filter1d(places, _SMOOTHED_FRAMES, axis=1, mode="nearest")
+        steps = np.abs(np.einsum("cij,ij->ci", np.diff(places, axis=1), normal)).mean(axis=0)
         return np.concatenate([[0.0], np.cumsum(steps)])
 
     def spacing_mm(self, sensor_from_image: RigidTransform) -> float:

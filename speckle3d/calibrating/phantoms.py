@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -30,7 +31,6 @@ from calibration.recording import (
 )
 from calibration.repeatability import validate
 from calibration.report import figure_report
-from calibration.solution import Solution
 from calibration.wires import CrossWire, Wires, calibrate_cross_wire, calibrate_wires, solve_wires
 from speckle3d.calibrating.recordings import open_recording
 from speckle3d.calibrating.settings import (
@@ -147,23 +147,17 @@ def picked(recording: Recording, points: PickedPoints, settings: ScanSettings) -
 def solved(recording: Recording, seen: Seen, settings: ScanSettings) -> Outcome:
     """Calibrate with what was found; for errors see `calibrate_recording`."""
     size, clock = recording.pixel_mm, settings.time_offset_s
-
-    def with_(
-        method: str,
-        calibrate: Callable[[ImagePoints], Solution],
-        with_clock: Callable[[ImagePoints], Solution] | None = None,
-        seen: Seen = seen,
-    ) -> Outcome:
-        return calibrate_recording(recording, seen, method, calibrate, clock, with_clock)
-
+    calibrated = partial(calibrate_recording, recording)
     if isinstance(settings, OrientationSettings):
-        return with_("orientation", lambda points: calibrate_orientation(points, size, settings))
+        return calibrated(
+            seen, "orientation", lambda points: calibrate_orientation(points, size, settings), clock
+        )
     if not isinstance(recording.readings, TimedPoses):
         raise InvalidInputError(
             "expected a position sensor (tracker), got an orientation sensor: speckle3d calibrate orientation"
         )
     if isinstance(settings, PlaneSettings):
-        outcome = with_("plane", lambda points: calibrate_plane(points, size, settings))
+        outcome = calibrated(seen, "plane", lambda points: calibrate_plane(points, size, settings), clock)
         widths = () if settings.reflector == "bar" else settings.beam_mm or _BEAM_MM
         return replace(outcome, beam=tuple(predict_bias(outcome.solution, width) for width in widths))
     assert isinstance(settings, WireSettings)
@@ -173,11 +167,15 @@ def solved(recording: Recording, seen: Seen, settings: ScanSettings) -> Outcome:
         if clock == "estimate":
             offsets = delays_around(offsets[0], SEARCH_S, CHOICE_STEP_S).tolist()
         chosen = choose_crossings(recording, seen, offsets) if len(seen) else seen
-        return with_("cross-wire", lambda points: calibrate_cross_wire(points, size, settings), seen=chosen)
+        return calibrated(
+            chosen, "cross-wire", lambda points: calibrate_cross_wire(points, size, settings), clock
+        )
     # The clock is sought with what depends least on the phantom's place and yet is determined.
-    return with_(
+    return calibrated(
+        seen,
         "n-wire" if phantom.n_shapes else "three-wire",
         lambda points: require_adequate(solve_wires(points, phantom, size, settings)),
+        clock,
         lambda points: calibrate_wires(points, phantom, size, settings),
     )
 
@@ -223,10 +221,7 @@ def write_outcome(
     """Write a calibration with its report, the settings that made it, and the dots it was made from."""
     dots = outcome.seen
     names = Wired.of(settings.phantom).names if isinstance(settings, WireSettings) else ()
-
-    def write_dots(path: Path) -> None:
-        write_points(path, PickedPoints(dots.frame, dots.pixels, dots.wire), names)
-
+    picked = PickedPoints(dots.frame, dots.pixels, dots.wire)
     return write_with_report(
         outcome.calibration,
         [images],
@@ -234,7 +229,7 @@ def write_outcome(
         lambda calibration: figure_report(outcome.solution, calibration, outcome.shots),
         [*notes, f"made by: {command_line(settings, images, out)}"],
         outcome.beam,
-        None if dots.are_lines else write_dots,
+        None if dots.are_lines else lambda path: write_points(path, picked, names),
         settings.model_dump_json(exclude_defaults=True),
     )
 

@@ -58,13 +58,11 @@ def open_recording(
 
 
 def _load(path: Path, pixel_mm: tuple[float, float] | None, transform: str | None) -> Sweep:
-    given = ImportSettings(dynamic_range_db=DYNAMIC_RANGE_DB, tracker_transform=transform)
-    if pixel_mm is not None:
-        column, row = pixel_mm
-        given = given.model_copy(update={"column_pitch_mm": column, "row_spacing_mm": row})
-    require_unsaid(path, given.model_copy(update={"dynamic_range_db": None}))
+    column, row = pixel_mm or (None, None)
+    given = ImportSettings(tracker_transform=transform, column_pitch_mm=column, row_spacing_mm=row)
+    require_unsaid(path, given)
     try:
-        return load_sweep(path, given)
+        return load_sweep(path, given.model_copy(update={"dynamic_range_db": DYNAMIC_RANGE_DB}))
     except MissingSettingsError as error:
         raise InvalidInputError(
             f"{path}: the recording does not say its {', '.join(error.settings)}: give --pixel-mm COLUMN "
@@ -101,7 +99,7 @@ def _readings_of(path: Path, sensor: str, transform: str | None) -> tuple[TimedP
     if kind_of(path) != IMAGE:
         return _readings(load_sweep(path), path, sensor)
     tracker = read_poses(path, settings_for(path, ImportSettings(tracker_transform=transform)))
+    readings: TimedPoses | TimedRotations = tracker.readings
     if sensor == "orientation":
-        turned = tracker.readings.world_from_sensor.rotation
-        return TimedRotations(tracker.readings.time_s, turned), tracker.time_offset_s
-    return tracker.readings, tracker.time_offset_s
+        readings = TimedRotations(readings.time_s, tracker.readings.world_from_sensor.rotation)
+    return readings, tracker.time_offset_s

@@ -36,7 +36,7 @@ class Written:
     table : str
         Its report.
     files : tuple of Path
-        The calibration file, the table and the pictures, and the dots if there are any.
+        The calibration file, the table and the pictures.
     """
 
     calibration: Calibration
@@ -81,4 +81,4 @@ def write_with_report(
         save_figure(figure(named), part / pictures.name)
         if dots:
             dots(part / points.name)
-    return Written(named, table, (out, text, pictures, *([points] if dots else [])))
+    return Written(named, table, (out, text, pictures))

@@ -75,7 +75,7 @@ def report_written(
         emit_json(json_report(written.calibration, beam) | {"notes": list(notes)})
     else:
         emit(written.table)
-    out, text, pictures = written.files[:3]
+    out, text, pictures = written.files
     note(f"calibration in {out}, report in {text} and {pictures}")
 
 
