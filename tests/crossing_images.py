@@ -137,7 +137,7 @@ def crossing_world(seed, frames=54):
         ]
     )
     mounting = RigidTransform.from_components(rng.uniform(-120, 120, 3), Rotation.random(rng=rng))
-    readings = world_from_image * mounting.inv() * _errors(rng, frames)
+    readings = world_from_image * mounting.inv() * _errors(rng, len(images))
     shown = (np.abs(away) < 1.2 * look.elevation_mm) & probe.inside(pixels) & seen[best]
     return World(images, probe.pixel_mm, readings, pixels, shown, mounting)
 
@@ -324,7 +324,7 @@ def _lettering(rng, probe):
     return picture
 
 
-def _errors(rng, frames):
+def _errors(rng, len(images)):
     """A tracker's jitter, and a wander by 0.3 mm that takes some ten frames to change."""
     keep = np.exp(-1 / 12.0)
     wander = np.zeros((frames, 3))
