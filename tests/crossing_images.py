@@ -130,12 +130,8 @@ def crossing_world(seed, frames=54):
     wires = _wires(rng, base, centre, drawn[best])
     points = _scatterers(rng, look, centre)
     texture, letters = _skin(rng, probe, look), _lettering(rng, probe)
-    images = np.stack(
-        [
-            np.maximum(_frame(rng, probe, look, pose, wires, points, texture), letters)
-            for pose in world_from_image
-        ]
-    )
+    frames = (_frame(rng, probe, look, pose, wires, points, texture) for pose in world_from_image)
+    images = np.stack([np.maximum(frame, letters.astype(np.uint8)) for frame in frames])
     mounting = RigidTransform.from_components(rng.uniform(-120, 120, 3), Rotation.random(rng=rng))
     readings = world_from_image * mounting.inv() * _errors(rng, len(images))
     shown = (np.abs(away) < 1.2 * look.elevation_mm) & probe.inside(pixels) & seen[best]
@@ -324,7 +320,7 @@ def _lettering(rng, probe):
     return picture
 
 
-def _errors(rng, len(images)):
+def _errors(rng, frames):
     """A tracker's jitter, and a wander by 0.3 mm that takes some ten frames to change."""
     keep = np.exp(-1 / 12.0)
     wander = np.zeros((frames, 3))
