@@ -37,7 +37,7 @@ _MOST_FRAMES = 120
 _BATCHES = (300, *[3000] * 10)
 """Samples drawn at a time. With the right candidate drawn in three frames of ten, one sample in 120 is right;
 in one of ten, one in 10,000. All take some two seconds."""
-_KEPT = 8
+_KEPT = 25
 """Best samples of a batch that are refined and judged."""
 _SURE = -0.5
 """Logarithm of the false alarms, over the number of frames, at which the search ends: a third of the frames

@@ -35,11 +35,13 @@ from speckle3d.core.geometry import nearest_rotation, roll_yaw_tilt
 _NORMALS = 30
 """About 26 degrees apart: refinement converges from further away."""
 _MOST_STEPS = 100
-_TOLERANCE, _ROUGHLY = 1e-12, 1e-3
+_TOLERANCE, _ROUGHLY = 1e-9, 1e-3
 """Relative decrease of the sum of squares that a last step promises; of a sum that is weighted anew."""
 _REWEIGHTINGS = 8
 _REFINED, _KEPT, _ANGLE_FRAMES, _ROUNDS = 6, 3, 30, 4
 """Normals whose angles are refined, from so many frames with so many reweightings, and those that go on."""
+_HOPELESS = 3.0
+"""Ends whose mean absolute residual is as many times the least are not looked at again."""
 _TINY = 1e-12
 """Of a normal matrix's diagonal, where residuals do not depend on a parameter at all."""
 _CONTRADICTS = 3.0
@@ -402,8 +404,9 @@ def angle_starts(
         ends.append((float(np.abs(equations.residuals(end)).mean()), end))
     ends.sort(key=lambda one: one[0])
     kept = list[Chain]()
-    for _, end in ends:
-        if all(apart(end, one, directions, phantom) for one in kept):
+    for cost, end in ends:
+        likely = cost < _HOPELESS * ends[0][0] + _TINY
+        if likely and all(apart(end, one, directions, phantom) for one in kept):
             kept.append(end)
     return kept[:_KEPT]
 

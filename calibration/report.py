@@ -107,9 +107,7 @@ def text_report(calibration: Calibration, beam: Sequence[BeamBias] = (), notes: 
     lines = text_rows(calibration.rows()).splitlines()
     if dropped := sorted(calibration.frames.dropped.items()):
         named = [f"  {number}: {reason}" for number, reason in dropped[:_MOST_NAMED]]
-        more = len(dropped) - _MOST_NAMED
-        lines += ["", "Frames left out:", *named]
-        lines += [f"  and {more} more, which the calibration file names"] if more > 0 else []
+        lines += ["", f"Frames left out (the first {_MOST_NAMED}; the calibration file names all):", *named]
     if calibration.translation_mm is not None and calibration.pixel_mm is not None:
         lines += ["", "ImageToProbe (pixels to mm, as PLUS and 3D Slicer have it):"]
         lines += ["  " + " ".join(f"{value:12.6f}" for value in row) for row in calibration.pixel_matrix()]

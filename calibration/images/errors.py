@@ -1,4 +1,4 @@
-"""Claimed errors of a calibration from two sweeps: the jackknife over tissue, and the tracker's.
+"""Claimed errors of a calibration from two sweeps: jackknife over tissue, tracker's, and fits started again.
 
 An answer sits on a bump of speckle, where the similarity falls more steeply than it would without speckle. So
 the curvature behind the standard errors is taken over displacements wider than speckle; from its place on the
@@ -14,9 +14,9 @@ from scipy.linalg import eigh
 from scipy.spatial.transform import RigidTransform
 
 from calibration.images.angulation import PARAMETERS, Angulation, point_motion
-from calibration.images.fit import Refined
+from calibration.images.fit import Refined, refine
 from calibration.images.search import apart_mm
-from calibration.images.similarity import Comparison, CrossingSweeps, Similarity, about_pivot, stepped
+from calibration.images.similarity import Comparison, CrossingSweeps, Level, Similarity, about_pivot, stepped
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.geometry import skew
@@ -45,7 +45,16 @@ DEEP_MM = 0.1
 between its parts show it, in units of the images' size: a thick beam displays echoes from beside the image
 plane too deep. The root mean square over six simulated pairs of sweeps."""
 
-MOST_MM, MOST_DEG = 1.0, 2.5
+RESTARTED = Level(1.0, images=8, overlap=0.25)
+"""Resolution of the fits started again: at finer ones speckle holds them halfway for tens of steps."""
+_RESTART_STEPS = 14
+_BESIDE_DEG, _BESIDE_MM = 2.0, 1.5
+"""Turns about the image's centre and displacements, in units of the images' size, from which fits start
+again: over speckle's size, and within reach of the fit."""
+_SIDES = np.array([[1, 1, 1, 1, 1, 1], [1, -1, 1, -1, -1, 1]])
+"""Signs of turns and displacements; each side has its opposite."""
+
+MOST = np.array([2.5, 2.5, 2.5, 1.0, 1.0, 1.0])
 """Largest standard errors of the image's centre and turns: 95 % intervals of 2 mm, within which the published
 method agreed with phantoms in vivo (Wein and Khamene 2008), and 5 degrees. It agreed within 4 degrees;
 simulated sweeps of good motion over tissue of low contrast claim up to 2.1 degrees of standard error."""
@@ -82,7 +91,8 @@ def claimed(
 
     Errors of tissue (speckle, reflections) and of poses are told by how the answer changes when one block of
     tissue after another is left out. An error of the tracker that lasts for
-    seconds displaces one sweep against the other and shows in no such change; its effect is computed.
+    seconds displaces one sweep against the other and shows in no such change; its effect is computed. To
+    their sum comes the scatter of fits started beside the answer.
 
     Parameters
     ----------
@@ -116,6 +126,7 @@ def claimed(
     wander = moved @ _wandering(refined, _pulls(refined, wide), variance) @ moved.T
     covariance = base @ (left_out + wander) @ base.T
     covariance[4, 4] += (DEEP_MM * unit) ** 2
+    covariance += _scatter(refined, crossing)
     return np.asarray(covariance), curvature
 
 
@@ -128,18 +139,15 @@ def require_known(covariance: FloatArray, angulation: Angulation, centre_mm: Flo
         With what would help: other motion, or other tissue.
     """
     moved = point_motion(centre_mm[None])[0]
-    turns, shifts = (
-        np.rad2deg(np.sqrt(np.diag(covariance)[:3])),
-        np.sqrt(np.diag(moved @ covariance @ moved.T)),
-    )
-    errors, limits = np.concatenate([turns, shifts]), np.repeat([MOST_DEG, MOST_MM], 3)
-    worst = int(np.argmax(errors / limits))
-    if errors[worst] <= limits[worst]:
+    variances = np.concatenate([np.diag(covariance)[:3], np.diag(moved @ covariance @ moved.T)])
+    errors = np.sqrt(variances) * np.repeat([np.rad2deg(1.0), 1.0], 3)
+    worst = int(np.argmax(errors / MOST))
+    if errors[worst] <= MOST[worst]:
         return
     sufficient, unit = angulation.verdict == "sufficient", "degrees" if worst < 3 else "mm"
     help_by = "scan tissue with more structure in all directions" if sufficient else angulation.advice
     raise InsufficientDataError(
-        f"expected sweeps that tell {PARAMETERS[worst]} to {limits[worst]:g} {unit} (standard error), got "
+        f"expected sweeps that tell {PARAMETERS[worst]} to {MOST[worst]:g} {unit} (standard error), got "
         f"{errors[worst]:.1f} {unit}; {help_by}"
     )
 
@@ -161,6 +169,22 @@ def require_one_answer(comparison: Comparison, answer: RigidTransform, rivals: l
                 f"fits as well (correlation {other:.3f} and {score:.3f}): tissue with more structure, or a "
                 "better start with a smaller --capture-mm, would tell them apart"
             )
+
+
+def _scatter(refined: Refined, crossing: CrossingSweeps) -> FloatArray:
+    """Mean square of how far fits that start beside the answer end from one that starts at it, shape (6, 6).
+
+    An answer sits on a bump of speckle, and others may be near: where fits end elsewhere, it is in doubt.
+    """
+    comparison = crossing.level(RESTARTED, refined.sensor_from_image)
+    beside = np.repeat([np.deg2rad(_BESIDE_DEG), _BESIDE_MM * crossing.unit], 3)
+    ends = []
+    for side in np.concatenate([np.zeros((1, 6)), _SIDES, -_SIDES]):
+        start = stepped(refined.sensor_from_image, side * beside, comparison.pivot_mm)
+        ends.append(refine(comparison, start, _RESTART_STEPS).sensor_from_image)
+    away = [ends[0].inv() * end for end in ends[1:]]
+    moves = np.array([np.append(one.rotation.as_rotvec(), one.translation) for one in away])
+    return np.asarray(moves.T @ moves / (len(moves) - 1))
 
 
 def _pulls(refined: Refined, step_mm: float) -> FloatArray:

@@ -128,11 +128,9 @@ def calibrate_from_sweeps(
     if chosen.capture_mm > 0.0 or chosen.capture_deg > 0.0:
         reach = float(np.deg2rad(chosen.capture_deg))
         answer, *rivals = search(crossing, start, chosen.capture_mm, reach, progress)
-    for number, level in enumerate(FINE):
+    for level in FINE:
         refined = refine(crossing.level(level, answer), answer)
         answer = refined.sensor_from_image
-        if progress:
-            progress(number + 1, len(FINE))
     poses = [stack.world_from_sensor for stack in crossing.stacks]
     decided = crossing.level(DECIDED, answer)
     alike = decided.at(answer).score

