@@ -2,7 +2,7 @@
 
 Two thin, slightly bent wires are met by a beam that is thickest away from its focus: each is bright where it
 lies in the beam and across it, so that a frame shows an X, one long line with a short faint one on it, or two
-short strokes. Each point of a wire is blurred by pulse and beam and leaves an arc of side lobes. Added are
+short strokes. Each point of a wire is blurred by pulse and beam. Added are
 speckle, scatterers fixed in the phantom, the skin's reverberations, a step of gain, compression to 8 bits
 and lettering. Nothing is drawn by a line filter.
 """
@@ -95,8 +95,6 @@ def random_look(rng, probe):
         spread_mm=rng.uniform(0.3, 0.6) * probe.depth_mm,
         pulse_mm=rng.uniform(0.2, 0.45) * deep**0.5,
         beam_mm=rng.uniform(0.4, 0.9) * deep**0.5,
-        lobes_db=rng.uniform(-38, -16),
-        lobes_mm=rng.uniform(6, 20),
         slope_db=rng.uniform(3, 10),
         speckle_db=rng.uniform(-42, -20),
         noise_db=rng.uniform(-50, -38),
@@ -233,8 +231,8 @@ def _frame(rng, probe, look, world_from_image, wires, points, skin):
     x, y = probe.from_image(place[near, :2] / probe.pixel_mm).T
     _splat(echoes, probe, x, y, points[1][near] * _met(look, y, place[near, 2]))
     speckle = rng.standard_normal((2, *echoes.shape))
-    seen = _blurred(probe, look, echoes, lobes=True)
-    grains = _blurred(probe, look, speckle[0] + 1j * speckle[1], lobes=False)
+    seen = _blurred(probe, look, echoes)
+    grains = _blurred(probe, look, speckle[0] + 1j * speckle[1])
     grains *= 10 ** (look.speckle_db / 20.0) / np.sqrt(np.mean(np.abs(grains) ** 2))
     hiss = rng.standard_normal((2, *echoes.shape)) * 10 ** (look.noise_db / 20.0)
     depth = np.linspace(0, 1, probe.samples)
@@ -266,8 +264,8 @@ def _splat(echoes, probe, x, y, weight):
         np.add.at(echoes, (b + i, s + j), w * np.where(i, fb, 1 - fb) * np.where(j, fs, 1 - fs))
 
 
-def _blurred(probe, look, echoes, lobes):
-    """Pulse, beam (wider away from the focus) and arcs of side lobes, of unit peak for one point."""
+def _blurred(probe, look, echoes):
+    """Pulse and beam, wider away from the focus, of unit peak for one point."""
     pitch, spacing = probe.width_mm / (probe.beams - 1), probe.depth_mm / (probe.samples - 1)
     pulse = max(look.pulse_mm / spacing, 0.6)
     out = gaussian_filter1d(echoes, pulse, axis=1) * np.sqrt(2 * np.pi) * pulse
@@ -275,26 +273,7 @@ def _blurred(probe, look, echoes, lobes):
     narrow = look.beam_mm / pitch
     thin, wide = (gaussian_filter1d(out, w, axis=0) * np.sqrt(2 * np.pi) * w for w in (narrow, 1.8 * narrow))
     mix = np.clip(np.abs(depth - look.focus_mm) / (2.0 * look.spread_mm), 0, 1)
-    beam = (1 - mix) * thin + mix * wide / 1.5
-    if not lobes:
-        return beam
-    reach = int(look.lobes_mm / pitch)
-    arcs = np.zeros_like(beam)
-    for step in range(-reach, reach + 1, 2):
-        shape = (
-            np.cos(np.pi * step / (2 * reach + 1)) * (0.6 + 0.4 * np.cos(step * 1.3)) * (-1) ** (step // 2)
-        )
-        moved = np.zeros_like(out)
-        if step >= 0:
-            moved[step:] = out[: len(out) - step]
-        else:
-            moved[:step] = out[-step:]
-        # An echo from the side comes late: a linear array's arcs bend down.
-        late = round((step * pitch) ** 2 / (2 * 0.5 * probe.depth_mm) / spacing)
-        moved[:, late:] = moved[:, : probe.samples - late].copy()
-        moved[:, :late] = 0
-        arcs += shape * moved
-    return beam + 10 ** (look.lobes_db / 20.0) * arcs
+    return (1 - mix) * thin + mix * wide / 1.5
 
 
 def _skin(rng, probe, look):

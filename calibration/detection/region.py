@@ -166,15 +166,15 @@ def seen_in_frames(
         Called with the number of frames done and their total.
     """
     count, numbers, dropped = frames.shape[0], list[int](), dict[int, str]()
-    shown = list[tuple[FloatArray, FloatArray]]()
+    detections = list[tuple[FloatArray, FloatArray]]()
     for index in range(count):
         with naming(f"frame {index}"):
             try:
-                shown.append(find(frames[index]))
-                numbers += [index] * len(shown[-1][1])
+                detections.append(find(frames[index]))
+                numbers += [index] * len(detections[-1][1])
             except InsufficientDataError as error:
                 dropped[index] = str(error)
         if progress:
             progress(index + 1, count)
-    pixels, scores = map(np.concatenate, zip(*shown, strict=True)) if shown else np.zeros((2, 0, 2))
+    pixels, scores = map(np.concatenate, zip(*detections, strict=True)) if detections else np.zeros((2, 0, 2))
     return Seen(np.array(numbers, dtype=np.int64), pixels, None, dropped, scores)

@@ -147,17 +147,15 @@ def picked(recording: Recording, points: PickedPoints, settings: ScanSettings) -
 def solved(recording: Recording, seen: Seen, settings: ScanSettings) -> Outcome:
     """Calibrate with what was found; for errors see `calibrate_recording`."""
     size, clock = recording.pixel_mm, settings.time_offset_s
-    calibrated = partial(calibrate_recording, recording)
+    solve = partial(calibrate_recording, recording)
     if isinstance(settings, OrientationSettings):
-        return calibrated(
-            seen, "orientation", lambda points: calibrate_orientation(points, size, settings), clock
-        )
+        return solve(seen, "orientation", lambda points: calibrate_orientation(points, size, settings), clock)
     if not isinstance(recording.readings, TimedPoses):
         raise InvalidInputError(
             "expected a position sensor (tracker), got an orientation sensor: speckle3d calibrate orientation"
         )
     if isinstance(settings, PlaneSettings):
-        outcome = calibrated(seen, "plane", lambda points: calibrate_plane(points, size, settings), clock)
+        outcome = solve(seen, "plane", lambda points: calibrate_plane(points, size, settings), clock)
         widths = () if settings.reflector == "bar" else settings.beam_mm or _BEAM_MM
         return replace(outcome, beam=tuple(predict_bias(outcome.solution, width) for width in widths))
     assert isinstance(settings, WireSettings)
@@ -167,11 +165,9 @@ def solved(recording: Recording, seen: Seen, settings: ScanSettings) -> Outcome:
         if clock == "estimate":
             offsets = delays_around(offsets[0], SEARCH_S, CHOICE_STEP_S).tolist()
         chosen = choose_crossings(recording, seen, offsets) if len(seen) else seen
-        return calibrated(
-            chosen, "cross-wire", lambda points: calibrate_cross_wire(points, size, settings), clock
-        )
+        return solve(chosen, "cross-wire", lambda points: calibrate_cross_wire(points, size, settings), clock)
     # The clock is sought with what depends least on the phantom's place and yet is determined.
-    return calibrated(
+    return solve(
         seen,
         "n-wire" if phantom.n_shapes else "three-wire",
         lambda points: require_adequate(solve_wires(points, phantom, size, settings)),

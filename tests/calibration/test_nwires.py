@@ -1,12 +1,8 @@
-from dataclasses import replace
-
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from wire_scenes import PIXEL_MM, candidates, plus_results, scene
 
-from calibration.nwires import label_by_wires, middle_wires, nwire_errors_mm, trimmed_mean_mm
+from calibration.nwires import label_by_wires, nwire_errors_mm, trimmed_mean_mm
 from calibration.points import Seen
 from speckle3d.io.metaimage import read_poses
 from speckle3d.io.plus_config import read_wire_phantom
@@ -22,22 +18,6 @@ def points_of(shown, noise_mm=0.0, seed=0):
     frame = np.repeat(np.arange(frames), wires)
     seen = Seen(frame, pixels.reshape(-1, 2), np.tile(np.arange(wires), frames))
     return seen.points(shown.world_from_sensor[frame])
-
-
-@given(seed=st.integers(0, 2**32 - 1), stretch=st.floats(0.5, 2.0))
-@settings(deadline=None, max_examples=15)
-def test_middle_dots_are_placed_in_the_phantom_whatever_the_pixels(seed, stretch):
-    shown = scene(seed, frames=4)
-    points = points_of(shown)
-    shuffled = np.random.default_rng(seed).permutation(len(points))
-    squeezed = replace(points, pixels=points.pixels * [1.0, stretch])[shuffled]
-    middle, phantom_mm = middle_wires(squeezed, shown.phantom)
-    assert len(middle) == 4 * 3
-    assert set(middle.wire) == {1, 4, 7}
-    seen = middle.pixels / [1.0, stretch] * PIXEL_MM
-    world = middle.world_from_sensor * shown.sensor_from_image
-    truth = (shown.phantom.world_from_phantom.inv() * world).apply(np.column_stack([seen, np.zeros(12)]))
-    np.testing.assert_allclose(phantom_mm, truth, atol=1e-8)
 
 
 def test_frames_that_lack_wires_are_labelled_by_what_the_others_say():

@@ -60,16 +60,11 @@ def noise(images):
     return np.random.default_rng(0).standard_normal(images.shape)
 
 
-def reversed_in_time(images):
-    return images[::-1]
-
-
 @pytest.mark.parametrize(
     ("change", "offset_s", "search_s"),
     [
         (np.asarray, 0.2, 0.08),  # outside the range
         (noise, 0.0, 0.4),
-        pytest.param(reversed_in_time, 0.0, 0.4, marks=pytest.mark.slow),
     ],
 )
 def test_images_that_do_not_show_where_they_were_taken_are_refused(recording, change, offset_s, search_s):

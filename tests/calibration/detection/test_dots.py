@@ -1,13 +1,9 @@
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from wire_scenes import PIXEL_MM, picture, plus_results, scene
+from wire_scenes import PIXEL_MM, picture, scene
 
 from calibration.detection.dots import dots_in_frames
-from speckle3d.io.import_settings import ImportSettings
-from speckle3d.io.load import load_sweep
-from speckle3d.io.plus_config import read_wire_phantom
 
 
 def dots_in(image, *options):
@@ -44,20 +40,3 @@ def test_wires_are_found_in_speckle_through_side_lobes_and_ringing():
     # Nine wires, and three in four frames without any candidate before the last of them.
     assert max(ranks) < 12
     assert np.median(ranks) == 8
-
-
-@pytest.mark.slow
-@pytest.mark.realdata
-def test_real_wires_are_found_where_others_found_them(realdata):
-    folder = realdata / "plus"
-    config = read_wire_phantom(folder / "PlusDeviceSet_fCal_Sim_SpatialCalibration_2.0.xml")
-    known = ImportSettings(column_pitch_mm=0.08, row_spacing_mm=0.0745, dynamic_range_db=60.0)
-    sweep = load_sweep(folder / "fCal_Test_Validation_3NWires_fCal2.0.igs.mha", known)
-    frames, points, _, _ = plus_results(folder, "Validation")
-    away = []
-    for frame, point in list(zip(frames, points, strict=True))[::4]:
-        pixels, _ = dots_in(sweep.frames[frame], [config.pixel_mm] * 2, config.clip_px)
-        away.append(np.linalg.norm(pixels[None] - point[:, None], axis=2).min(axis=1))
-    # Measured 0.79 px in the middle and 3.9 px at most; a dot's echo is 40 px wide and 13 px high.
-    assert np.median(away) < 1.0
-    assert np.max(away) < 6.0
