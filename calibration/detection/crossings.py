@@ -115,7 +115,7 @@ def _crossings(
     places, scores = [], []
     for width in _WIDTH_MM * np.array(_WIDTHS):
         # On a grid fit for filters of this width.
-        step_px = np.maximum(np.floor(width / _STEPS / pixel_mm), 1.0).astype(int)
+        step_px = np.maximum(np.rint(width / _STEPS / pixel_mm), 1.0).astype(int)
         smooth = ndimage.gaussian_filter(grey, np.where(step_px > 1, 0.4 * step_px, 0.0))
         coarse = smooth[:: step_px[0], :: step_px[1]]
         response = _two_lines(coarse, step_px * pixel_mm, width)

@@ -115,8 +115,7 @@ def claimed(
     # How far an error of one moves sweeps at right angles apart: a shift across or out of the image, root 2.
     stiff, wide = np.diag(refined.system[0]), unit * WIDE_MM
     shows = 2.0 * np.sqrt(stiff / (stiff[3] + stiff[5]))
-    farthest = _FARTHEST * np.repeat([1.0, unit], 3)
-    bends, curvature = curvature_of(refined, np.minimum(wide / np.maximum(shows, 1e-6), farthest))
+    bends, curvature = curvature_of(refined, np.minimum(wide / np.maximum(shows, 1e-6), _FARTHEST))
     slopes = refined.weight[:, None] * refined.similarity.gradient
     cells = np.floor(refined.places_mm / (BLOCK_MM * unit))
     blocks = np.unique(cells, axis=0, return_inverse=True)[1].ravel()
