@@ -41,7 +41,7 @@ _SIDE = 2.5
 """Where the two sides are, in `_WIDTH_MM`: beyond the line itself."""
 _WIDTHS = (1.0, 2.0)
 """Filters across a line, in `_WIDTH_MM`."""
-_STEPS = 1.5
+_STEPS = 1.8
 """Samples to a `_WIDTH_MM` of the images that are filtered."""
 _GLANCES = 40
 """Frames compared to see what stands still."""
@@ -115,7 +115,7 @@ def _crossings(
     places, scores = [], []
     for width in _WIDTH_MM * np.array(_WIDTHS):
         # On a grid fit for filters of this width.
-        step_px = np.maximum(np.rint(width / _STEPS / pixel_mm), 1.0).astype(int)
+        step_px = np.maximum(np.floor(width / _STEPS / pixel_mm), 1.0).astype(int)
         smooth = ndimage.gaussian_filter(grey, np.where(step_px > 1, 0.4 * step_px, 0.0))
         coarse = smooth[:: step_px[0], :: step_px[1]]
         response = _two_lines(coarse, step_px * pixel_mm, width)
