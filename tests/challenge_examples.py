@@ -53,30 +53,26 @@ def write_data_set(root, split=True, landmarks=True):
 
 
 def displacements(tool_poses):
-    """Global and local displacement of every pixel in mm, shape (2, n - 1, 3, HEIGHT * WIDTH), as published.
+    """Global and local displacement of every pixel in mm, shape (2, n - 1, 3, HEIGHT, WIDTH), as published.
 
     From matrices alone: T(j <- i) = inv(C) inv(tool_j) tool_i C in mm, applied to the scaled pixel, counted
     from 1; the displacement is from the scaled pixel.
     """
-    rows, columns = np.mgrid[1 : HEIGHT + 1, 1 : WIDTH + 1]
-    pixels = np.stack([columns.ravel(), rows.ravel(), 0 * rows.ravel(), 1 + 0 * rows.ravel()]).astype(float)
-    in_mm = np.diag([*SCALE_MM, 1.0, 1.0]) @ pixels
-    found = []
-    for before in (np.zeros(len(tool_poses) - 1, dtype=int), np.arange(len(tool_poses) - 1)):
-        moved = np.linalg.inv(tool_poses[before]) @ tool_poses[1:]
-        between = np.linalg.inv(TOOL_FROM_IMAGE) @ moved @ TOOL_FROM_IMAGE
-        found.append((between @ in_mm - in_mm)[:, :3])
-    return np.array(found)
+    rows, columns = np.mgrid[1.0 : HEIGHT + 1, 1.0 : WIDTH + 1]
+    in_mm = np.stack([SCALE_MM[0] * columns, SCALE_MM[1] * rows, 0 * rows, 1 + 0 * rows])
+    steps = np.arange(len(tool_poses) - 1)
+    moved = np.linalg.inv(tool_poses[[0 * steps, steps]]) @ tool_poses[1:]
+    between = np.linalg.inv(TOOL_FROM_IMAGE) @ moved @ TOOL_FROM_IMAGE
+    return (np.einsum("gnij,jhw->gnihw", between, in_mm) - in_mm)[:, :, :3]
 
 
 def published_errors(true_tool, found_tool, marks):
     """GPE, GLE, LPE and LLE from displacement fields."""
-    true, found = displacements(true_tool), displacements(found_tool)
-    distance = np.sqrt(((true - found) ** 2).sum(axis=2))
-    at = marks[:, 0] - 1, (marks[:, 2] - 1) * WIDTH + marks[:, 1] - 1
+    distance = np.linalg.norm(displacements(true_tool) - displacements(found_tool), axis=2)
+    at_marks = distance[:, marks[:, 0] - 1, marks[:, 2] - 1, marks[:, 1] - 1]
+    names = (("GPE_mm", "LPE_mm"), ("GLE_mm", "LLE_mm"))
     return {
-        "GPE_mm": distance[0].mean(),
-        "GLE_mm": distance[0][at].mean(),
-        "LPE_mm": distance[1].mean(),
-        "LLE_mm": distance[1][at].mean(),
+        name: errors.mean()
+        for of_kind, kind in zip(names, (distance, at_marks), strict=True)
+        for name, errors in zip(of_kind, kind, strict=True)
     }

@@ -83,21 +83,6 @@ def corrected(seed, cache):
     return [crossing_pair(seed, 90.0, cache)[0], "--curves", curves, "-o", cache / "out" / f"single-{seed}"]
 
 
-def fused(seed, cache):
-    """A sweep of 3.6 to 6 mm with both sensors, over tissue or a phantom."""
-    settings = SimulationSettings(
-        preset=("tissue", "phantom")[seed % 2],
-        seed=seed,
-        vectors=48,
-        samples=2600,
-        length_mm=3.6 + 0.4 * (seed % 7),
-        frames=45,
-    )
-    modes = [f"--drift={mode}" for mode in ("pose", "orientation", "fused")]
-    out = cache / "out" / f"short-{seed}"
-    return [simulated(settings, cache), "--curves", RIGHT, "-o", out, *modes]
-
-
 CASES = {
     "90 deg, curves right": (lambda seed, cache: crossing(seed, 90.0, RIGHT, cache), CROSSED),
     "curves of another focus (10 %) and attenuation (+0.3)": (
@@ -108,7 +93,6 @@ CASES = {
     ),
     "single sweep, curves corrected by a crossing pair over other tissue": (corrected, ("image",)),
     "45 deg, curves right": (lambda seed, cache: crossing(seed, 45.0, RIGHT, cache), CROSSED),
-    "fused with tracker, 3.6 to 6 mm": (fused, ("fused", "image", "pose", "orientation")),
 }  # fmt: skip
 
 
