@@ -27,7 +27,6 @@ from speckle3d.io.plus.transforms import (
     Names,
     Poses,
     fixed_transform,
-    image_skew_rad,
     names_of,
     pixel_axes,
     sensor_from_image,
@@ -169,14 +168,13 @@ def _recording(
     if tracker is not None and pixels is not None:
         given_mm = settings.first_sample_depth_mm
         first_mm = own.get("first_sample_depth_mm", 0.0) if given_mm is None else given_mm
-        mounting = sensor_from_image(pixels.value, first_mm, where)
-        skew_rad = image_skew_rad(pixels.value, where)
+        mounting, skew_rad = sensor_from_image(pixels.value, first_mm, where)
         tracker = replace(tracker, sensor_from_image=mounting, image_skew_rad=skew_rad)
     orientation, name = None, f"{ORIENTATION}ToWorld"
     if name in names_of(header):  # the stream that this package writes
         turns, _ = _timed(tracked_poses(header, name, "none", Names()), times)
         matrix = fixed_transform(header, f"{IMAGE}To{ORIENTATION}")
-        turn = None if matrix is None else sensor_from_image(matrix, 0.0, path).rotation
+        turn = None if matrix is None else sensor_from_image(matrix, 0.0, path)[0].rotation
         if turns is not None:
             orientation = OrientationSensor(
                 TimedRotations(turns.time_s, turns.world_from_sensor.rotation), turn

@@ -207,6 +207,7 @@ def _write_sensor(file: h5py.File, sensor: OrientationSensor | Tracker) -> None:
     values: dict[str, Any] = {"time_s": readings.time_s, "time_offset_s": sensor.time_offset_s}
     if isinstance(sensor, Tracker):
         name, values["world_from_sensor"] = "tracker", readings.world_from_sensor
+        values["valid"] = np.ones(len(readings), dtype=bool)
         values["image_skew_rad"] = sensor.image_skew_rad or None
     else:
         name, values["quaternion"] = "orientation", readings.world_from_sensor

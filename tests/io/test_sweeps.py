@@ -7,7 +7,6 @@ import sweep_examples
 
 from speckle3d.core.errors import FileError
 from speckle3d.core.grid import ImageGrid
-from speckle3d.core.sweep import stored_dtype
 from speckle3d.io.load import load_sweep
 from speckle3d.io.plus.write import write_sequence
 from speckle3d.io.sweep_writer import write_sweep
@@ -18,19 +17,6 @@ def path(tmp_path):
     target = tmp_path / "sweep.h5"
     write_sweep(target, sweep_examples.rf_sweep())
     return target
-
-
-@pytest.mark.parametrize("paired", [True, False])
-def test_i_and_q_are_stored_as_they_were_read(tmp_path, paired):
-    sweep = sweep_examples.iq_sweep(paired)
-    write_sweep(tmp_path / "s.h5", sweep)
-    write_sweep(tmp_path / "t.h5", load_sweep(tmp_path / "s.h5"))
-    got = load_sweep(tmp_path / "t.h5")
-    np.testing.assert_array_equal(sweep_examples.frames_of(got), sweep_examples.frames_of(sweep))
-    assert stored_dtype(got.part(1, 3).frames) == (np.int16 if paired else np.complex64)
-    with h5py.File(tmp_path / "t.h5") as file:
-        assert file.attrs["version"] == 2
-        assert file["iq"].shape == ((6, 5, 40, 2) if paired else (6, 5, 40))
 
 
 def test_a_file_written_by_hand_from_the_description_is_read(tmp_path):

@@ -156,8 +156,13 @@ def pixel_axes(matrix: FloatArray, where: str) -> tuple[float, float]:
     return column, row
 
 
-def sensor_from_image(matrix: FloatArray, first_sample_depth_mm: float, where: str) -> RigidTransform:
-    """Nearest rigid transform to a calibration of pixels, by singular values.
+def sensor_from_image(
+    matrix: FloatArray, first_sample_depth_mm: float, where: str
+) -> tuple[RigidTransform, float]:
+    """Nearest rigid transform to a calibration of pixels, and how far its axes lean.
+
+    Columns and rows lean towards each other by that angle, rad; the transform lies in their middle: half of
+    the angle is missing from either axis.
 
     Parameters
     ----------
@@ -179,19 +184,8 @@ def sensor_from_image(matrix: FloatArray, first_sample_depth_mm: float, where: s
             "flipped before they were calibrated; if the third column was never measured, make it zeros"
         )
     turned = nearest_rotation(axes)
-    return RigidTransform.from_components(
-        matrix[:3, 3] - turned[:, 1] * first_sample_depth_mm, Rotation.from_matrix(turned)
-    )
-
-
-def image_skew_rad(matrix: FloatArray, where: str) -> float:
-    """Angle by which columns and rows of a calibration of pixels lean towards each other.
-
-    The nearest rigid transform, `sensor_from_image`, lies in their middle: half of the angle is missing from
-    either axis.
-    """
-    across, down = (matrix[:3, :2] / pixel_axes(matrix, where)).T
-    return float(np.arcsin(across @ down))
+    place = matrix[:3, 3] - turned[:, 1] * first_sample_depth_mm
+    return RigidTransform.from_components(place, Rotation.from_matrix(turned)), float(np.arcsin(cosine))
 
 
 def image_matrix(
@@ -201,7 +195,7 @@ def image_matrix(
     first_sample_depth_mm: float,
     skew_rad: float = 0.0,
 ) -> FloatArray:
-    """Transform of pixels to mm that `sensor_from_image` and `image_skew_rad` read back, shape (4, 4).
+    """Transform of pixels to mm that `sensor_from_image` reads back, shape (4, 4).
 
     The third axis, of which a plane has no pixels, has the mean length, as in PLUS's own calibrations.
     """
@@ -271,10 +265,8 @@ def _image_poses(
     rows = right_handed if right_handed.size else valid
     widths = np.linalg.norm(matrices[rows, :3, 0], axis=1)
     usual = matrices[rows[np.argsort(widths)[widths.size // 2]]]
-    sensor_from_image(usual, 0.0, where)  # refuses what is no calibration
-    pixels = image_matrix(
-        RigidTransform.identity(), *pixel_axes(usual, where), 0.0, image_skew_rad(usual, where)
-    )
+    _, skew_rad = sensor_from_image(usual, 0.0, where)  # refuses what is no calibration
+    pixels = image_matrix(RigidTransform.identity(), *pixel_axes(usual, where), 0.0, skew_rad)
     poses = matrices.copy()
     across = np.cross(poses[:, :3, 0], poses[:, :3, 1])
     # The third column, which may be anything, becomes that of a plane's pixels.
