@@ -98,7 +98,7 @@ def reconstruct(
     """
     from speckle3d.io.curves import curves_beside, read_curves, trust_words, write_curves
     from speckle3d.io.load import load_sweep, open_recording
-    from speckle3d.io.voxels.volume_writer import require_suffix
+    from speckle3d.io.voxels.volume_writer import volume_suffix
     from speckle3d.study.job import run_job
 
     settings = load_settings(config_file).with_choices(
@@ -123,7 +123,7 @@ def reconstruct(
     if save_curves is not None:
         require_own_place(save_curves, "curves", *read)
     if volume is not None:
-        require_suffix(volume)
+        volume_suffix(volume)
         # In a folder of results that is still to be made nothing can be in the way.
         if volume.parent.exists() or volume.parent != out:
             require_own_place(volume, "volume", *read)

@@ -90,6 +90,20 @@ def require_target(path: PathLike) -> Path:
     return target
 
 
+def require_suffix(path: PathLike, suffixes: Sequence[str]) -> str:
+    """Return which of some suffixes a name ends in, which chooses the format.
+
+    Raises
+    ------
+    InvalidInputError
+        If it is none of them.
+    """
+    suffix = next((suffix for suffix in suffixes if Path(path).name.lower().endswith(suffix)), None)
+    if suffix is None:
+        raise InvalidInputError(f"{path}: expected a name ending in {', '.join(suffixes)}")
+    return suffix
+
+
 def make_folder(path: PathLike) -> None:
     """Make a folder for results, and those above it, unless it is there.
 

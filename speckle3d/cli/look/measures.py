@@ -161,10 +161,11 @@ def surface(
     """
     from speckle3d.core.labels import EMPTY
     from speckle3d.imaging.measures.surface import largest_part, smoothed, surface_of, surfaces_of_labels
-    from speckle3d.io.shapes.surfaces import require_suffix, write_surface
+    from speckle3d.io.hdf5 import require_suffix
+    from speckle3d.io.shapes.surfaces import SUFFIXES, write_surface
     from speckle3d.io.voxels.volumes import read_states, read_volume
 
-    suffix = require_suffix(out)
+    suffix = require_suffix(out, SUFFIXES)
     if not labels:
         require_own_place(out, "surface", volume_file, reconstruction, state)
     volume = read_volume(volume_file)

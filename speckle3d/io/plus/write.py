@@ -10,7 +10,6 @@ References
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,7 +21,7 @@ from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.files import PathLike
 from speckle3d.core.progress import Progress
 from speckle3d.core.sweep import OrientationSensor, RFSettings, Sweep, Tracker, stored_dtype
-from speckle3d.io.hdf5 import atomic_path
+from speckle3d.io.hdf5 import atomic_path, require_suffix
 from speckle3d.io.headers import NRRD_NAMES, meta_header, nrrd_header, write_image
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.plus.transforms import IMAGE, ORIENTATION, image_matrix
@@ -94,10 +93,7 @@ def write_sequence(
     FileError
         If the file cannot be written.
     """
-    target = Path(path)
-    name = target.name.lower()
-    if not name.endswith(SUFFIXES):
-        raise InvalidInputError(f"{path}: expected a name ending in {' or '.join(SUFFIXES)}")
+    suffix = require_suffix(path, (_OF_SLICER, *SUFFIXES))
     if sweep.grid.fan is not None:
         raise InvalidInputError(
             f"{path}: expected parallel vectors, got a fan's, which a sequence does not hold: write .h5"
@@ -107,7 +103,7 @@ def write_sequence(
     for transform, matrices in (transforms or {}).items():
         _add(fields, transform, matrices)
         fields["ElementSpacing"] = "1 1 1"
-    dtype, is_nrrd = sweep.frames.dtype, name.endswith(".nrrd")
+    dtype, is_nrrd = sweep.frames.dtype, suffix.endswith(".nrrd")
     if dtype.kind == "c":
         dtype = np.dtype(np.int16 if stored_dtype(sweep.frames) == np.int16 else np.float32)
     shape = (*_pixels(sweep.frames[0]).shape[::-1], len(sweep))
@@ -121,10 +117,10 @@ def write_sequence(
     def header(packed_bytes: int | None) -> str:
         if not is_nrrd:
             return meta_header(shape, dtype, _KINDS, fields, packed_bytes)
-        times = sweep.frame_time_s if name.endswith(_OF_SLICER) else None
+        times = sweep.frame_time_s if suffix == _OF_SLICER else None
         return _nrrd_header(fields, times, shape, dtype, compressed)
 
-    with atomic_path(target) as part:
+    with atomic_path(path) as part:
         write_image(part, header, planes(), compressed, is_nrrd)
     return omitted
 

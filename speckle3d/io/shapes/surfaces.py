@@ -13,7 +13,7 @@ from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.extras import extra_module
 from speckle3d.core.files import PathLike
 from speckle3d.core.surface import Surface
-from speckle3d.io.hdf5 import atomic_path, reading
+from speckle3d.io.hdf5 import atomic_path, reading, require_suffix
 
 SUFFIXES = (".stl", ".ply", ".vtk")
 SPACE = "SPACE=LPS"
@@ -50,7 +50,7 @@ def write_surface(path: PathLike, surface: Surface) -> None:
     ...     len(read_surface(f"{folder}/s.ply"))
     1
     """
-    suffix = require_suffix(path)
+    suffix = require_suffix(path, SUFFIXES)
     meshio = extra_module("meshio", "surface", "a surface's file")
     points, triangles = surface.vertices_mm.astype(np.float32), surface.triangles.astype(np.int32)
     mesh = meshio.Mesh(points, [("triangle", triangles)])
@@ -86,7 +86,7 @@ def read_surface(path: PathLike) -> Surface:
     InvalidInputError
         If the suffix is not one of `SUFFIXES`, or the file holds no triangles.
     """
-    suffix = require_suffix(path)
+    suffix = require_suffix(path, SUFFIXES)
     meshio = extra_module("meshio", "surface", "a surface's file")
     # A damaged file shows in whatever meshio happens to stumble over.
     with reading(f"{path}: as {suffix[1:].upper()}", Exception, SystemExit):
@@ -99,14 +99,6 @@ def read_surface(path: PathLike) -> Surface:
     # Not-a-numbers of a damaged file warn when they are cast; the surface refuses them.
     with naming(str(path)), np.errstate(invalid="ignore"):
         return Surface(np.asarray(mesh.points, dtype=float), np.concatenate(triangles).astype(np.int64))
-
-
-def require_suffix(path: PathLike) -> str:
-    """Suffix of a surface's file, or an `InvalidInputError`."""
-    suffix = Path(path).suffix.lower()
-    if suffix not in SUFFIXES:
-        raise InvalidInputError(f"{path}: expected a name ending in {', '.join(SUFFIXES)}")
-    return suffix
 
 
 def write_polylines(path: PathLike, lines_mm: FloatArray, frames: npt.NDArray[np.integer]) -> None:

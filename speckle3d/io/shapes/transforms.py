@@ -19,7 +19,7 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.files import PathLike
 from speckle3d.io.fileset import FileSet
-from speckle3d.io.hdf5 import atomic_path
+from speckle3d.io.hdf5 import atomic_path, require_suffix
 
 SUFFIX = ".tfm"
 
@@ -52,8 +52,7 @@ def write_transform(path: PathLike, world_from_image: RigidTransform) -> None:
     ...     print(Path(f"{folder}/t.tfm").read_text().splitlines()[3])
     Parameters: 1.0 0.0 0.0 0.0 1.0 0.0 0.0 0.0 1.0 -1.0 -2.0 -3.0
     """
-    if Path(path).suffix.lower() != SUFFIX:
-        raise InvalidInputError(f"{path}: expected a name ending in {SUFFIX}")
+    require_suffix(path, [SUFFIX])
     if not world_from_image.single:
         raise InvalidInputError(f"{path}: expected one pose, got a row of {len(world_from_image)}")
     matrix = world_from_image.inv().as_matrix()

@@ -25,7 +25,7 @@ from speckle3d.core.files import PathLike
 from speckle3d.core.labels import LabelMap, Segment
 from speckle3d.core.printable import printable
 from speckle3d.core.volume import Volume
-from speckle3d.io.hdf5 import atomic_path
+from speckle3d.io.hdf5 import atomic_path, require_suffix
 from speckle3d.io.headers import meta_header, nrrd_header, write_image
 from speckle3d.io.voxels.segments import segment_fields
 
@@ -77,7 +77,7 @@ def write_volume(path: PathLike, volume: Volume, compress: bool = True) -> None:
     (4, 3, 2)
     """
     is_labels = isinstance(volume, LabelMap)
-    suffix = require_suffix(Path(path), is_labels)
+    suffix = volume_suffix(path, is_labels)
     plain = segment_fields(volume.segments, volume.shape) if isinstance(volume, LabelMap) else {}
     with atomic_path(path) as part:
         if ".nii" in suffix:
@@ -213,7 +213,7 @@ def _meta_header(volume: Volume, fields: Mapping[str, str], packed_bytes: int | 
     return meta_header(volume.shape, volume.voxels.dtype, kinds, {**place, **fields}, packed_bytes)
 
 
-def require_suffix(path: Path, is_labels: bool = False) -> str:
+def volume_suffix(path: PathLike, is_labels: bool = False) -> str:
     """Suffix of a volume's name, which chooses the format.
 
     Raises
@@ -221,15 +221,11 @@ def require_suffix(path: Path, is_labels: bool = False) -> str:
     InvalidInputError
         If it is none of `SUFFIXES`, or is of labels where there are none.
     """
-    name = path.name.lower()
-    suffix = next((each for each in SUFFIXES if name.endswith(each)), None)
-    if suffix is None:
-        raise InvalidInputError(f"{path}: expected a name ending in {', '.join(SUFFIXES)}")
-    if name.endswith(LABELS_ALONE) and not is_labels:
+    if not is_labels and Path(path).name.lower().endswith(LABELS_ALONE):
         raise InvalidInputError(
             f"{path}: {LABELS_ALONE} is of labels with their segments: take another name ending in .nrrd"
         )
-    return suffix
+    return require_suffix(path, SUFFIXES)
 
 
 def _escaped(text: str) -> str:
