@@ -7,6 +7,7 @@ import re
 from collections.abc import Iterator, Sequence
 
 import numpy as np
+import numpy.typing as npt
 
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.files import PathLike, open_regular
@@ -42,6 +43,12 @@ def numbers(text: str, count: int | None, where: str) -> tuple[float, ...]:
         shown = text if len(text) <= 40 else f"{text[:37]}..."
         raise InvalidInputError(f"{where}: expected {count or 'some'} finite number(s), got {shown!r}")
     return values
+
+
+def number_text(values: npt.ArrayLike, between: str = " ") -> str:
+    """Numbers written so that reading gives them back exactly; none is a negative zero."""
+    plain = (np.ravel(values).astype(float) + 0.0).tolist()
+    return between.join(repr(value).removesuffix(".0") for value in plain)
 
 
 def table(path: PathLike, columns: Sequence[str]) -> Iterator[tuple[str, dict[str, str]]]:

@@ -25,7 +25,7 @@ from speckle3d.io.hdf5 import atomic_path, require_suffix
 from speckle3d.io.headers import NRRD_NAMES, meta_header, nrrd_header, write_image
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.plus.transforms import IMAGE, ORIENTATION, image_matrix
-from speckle3d.io.text import numbers
+from speckle3d.io.text import number_text, numbers
 
 SUFFIXES = (".mha", ".nrrd")
 """Of the files that `write_sequence` writes, as .igs.mha."""
@@ -158,13 +158,13 @@ def write_transforms(path: PathLike, times_s: FloatArray, transforms: Mapping[st
 
 def _timed(times_s: FloatArray) -> dict[str, str]:
     """Fields of frames with their times."""
-    return {f"Seq_Frame{i:04d}_Timestamp": _text(time) for i, time in enumerate(times_s)}
+    return {f"Seq_Frame{i:04d}_Timestamp": number_text(time) for i, time in enumerate(times_s)}
 
 
 def _add(fields: dict[str, str], name: str, matrices: FloatArray, valid: BoolArray | None = None) -> None:
     """Give each frame a transform, shape (n, 4, 4), by a name as ``ProbeToTracker``."""
     for i, matrix in enumerate(matrices):
-        fields[f"Seq_Frame{i:04d}_{name}Transform"] = _text(matrix)
+        fields[f"Seq_Frame{i:04d}_{name}Transform"] = number_text(matrix)
         is_valid = valid is None or valid[i]
         fields[f"Seq_Frame{i:04d}_{name}TransformStatus"] = "OK" if is_valid else "INVALID"
 
@@ -218,24 +218,19 @@ def _standard_fields(sweep: Sweep) -> dict[str, str]:
     if own.pop("dynamic_range_sigma_db", 0.0):
         del own["dynamic_range_db"]  # which is estimated from the images as it was
     own |= {"first_sample_depth_mm": grid.first_sample_depth_mm, **dict(zip(names, sizes, strict=False))}
-    texts = {name: _text(value) for name, value in own.items()}
+    texts = {name: number_text(value) for name, value in own.items()}
     if sweep.probe:
         texts["probe"] = " ".join(sweep.probe.split())
     return {
         "UltrasoundImageOrientation": "FM" if is_rf else "MF",
         "UltrasoundImageType": kind,
-        "ElementSpacing": _text((*spacing, 1.0)),
+        "ElementSpacing": number_text((*spacing, 1.0)),
         "Offset": "0 0 0",
         "TransformMatrix": "1 0 0 0 1 0 0 0 1",
         "CenterOfRotation": "0 0 0",
         "AnatomicalOrientation": "RAI",
         **{_PREFIX + name: text for name, text in texts.items()},
     }
-
-
-def _text(values: npt.ArrayLike) -> str:
-    """Write numbers so that reading gives them back exactly."""
-    return " ".join(repr(value).removesuffix(".0") for value in np.ravel(values).astype(float).tolist())
 
 
 def _nrrd_header(

@@ -20,6 +20,7 @@ from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.files import PathLike
 from speckle3d.io.fileset import FileSet
 from speckle3d.io.hdf5 import atomic_path, require_suffix
+from speckle3d.io.text import number_text
 
 SUFFIX = ".tfm"
 
@@ -50,19 +51,19 @@ def write_transform(path: PathLike, world_from_image: RigidTransform) -> None:
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     write_transform(f"{folder}/t.tfm", RigidTransform.from_translation([1.0, 2.0, 3.0]))
     ...     print(Path(f"{folder}/t.tfm").read_text().splitlines()[3])
-    Parameters: 1.0 0.0 0.0 0.0 1.0 0.0 0.0 0.0 1.0 -1.0 -2.0 -3.0
+    Parameters: 1 0 0 0 1 0 0 0 1 -1 -2 -3
     """
     require_suffix(path, [SUFFIX])
     if not world_from_image.single:
         raise InvalidInputError(f"{path}: expected one pose, got a row of {len(world_from_image)}")
     matrix = world_from_image.inv().as_matrix()
-    # Matrix, row by row, and translation; no number is a negative zero.
-    parameters = np.concatenate((matrix[:3, :3].ravel(), matrix[:3, 3])) + 0.0
+    # Matrix, row by row, and translation.
+    parameters = np.concatenate((matrix[:3, :3].ravel(), matrix[:3, 3]))
     lines = (
         "#Insight Transform File V1.0",
         "#Transform 0",
         f"Transform: {_TYPE}",
-        f"Parameters: {' '.join(map(repr, parameters.tolist()))}",
+        f"Parameters: {number_text(parameters)}",
         "FixedParameters: 0 0 0",
     )
     with atomic_path(path) as part:

@@ -27,6 +27,7 @@ from speckle3d.core.printable import printable
 from speckle3d.core.volume import Volume
 from speckle3d.io.hdf5 import atomic_path, require_suffix
 from speckle3d.io.headers import meta_header, nrrd_header, write_image
+from speckle3d.io.text import number_text
 from speckle3d.io.voxels.segments import segment_fields
 
 SUFFIXES = (".nrrd", ".mha", ".nii.gz", ".nii")
@@ -189,10 +190,10 @@ def _write_nifti(path: Path, volume: Volume, fields: Mapping[str, str], is_label
 
 
 def _nrrd_header(volume: Volume, fields: Mapping[str, str], packed_bytes: int | None) -> str:
-    *steps, origin = (f"({_texts(column, ',')})" for column in volume.world_from_index[:3].T)
+    *steps, origin = (f"({number_text(column, ',')})" for column in volume.world_from_index[:3].T)
     axes = f"""dimension: 3
 space: left-posterior-superior
-sizes: {_texts(volume.shape)}
+sizes: {number_text(volume.shape)}
 space directions: {" ".join(steps)}
 kinds: domain domain domain
 space units: "mm" "mm" "mm"
@@ -203,10 +204,10 @@ space origin: {origin}"""
 def _meta_header(volume: Volume, fields: Mapping[str, str], packed_bytes: int | None) -> str:
     pose = volume.world_from_grid
     place = {
-        "TransformMatrix": _texts(pose.rotation.as_matrix().T.ravel()),
-        "Offset": _texts(pose.translation),
+        "TransformMatrix": number_text(pose.rotation.as_matrix().T.ravel()),
+        "Offset": number_text(pose.translation),
         "CenterOfRotation": "0 0 0",
-        "ElementSpacing": _texts(volume.spacing_mm),
+        "ElementSpacing": number_text(volume.spacing_mm),
     }
     # Kinds as PLUS tells a volume from a sequence of frames.
     kinds = "domain domain domain"
@@ -235,7 +236,3 @@ def _escaped(text: str) -> str:
     """
     shown = printable(text.strip().replace("\r\n", "\n"), kept="\n")
     return shown.replace("\\", "\\\\").replace("\n", "\\n")
-
-
-def _texts(values: npt.ArrayLike, between: str = " ") -> str:
-    return between.join(map(repr, (np.asarray(values) + 0).tolist()))  # no -0.0
