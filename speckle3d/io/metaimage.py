@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from speckle3d.core.arrays import FloatArray, IntArray
+from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.files import PathLike
 from speckle3d.core.streams import TimedPoses, TimedRotations
@@ -33,9 +33,9 @@ from speckle3d.io.plus.transforms import (
     tracked_poses,
 )
 from speckle3d.io.plus.write import own_values
-from speckle3d.io.pose_paths import timed_poses, usable
+from speckle3d.io.pose_paths import timed_poses
 from speckle3d.io.readers import Reader
-from speckle3d.io.recordings import Facts, Recording, Value, differs, rate_of
+from speckle3d.io.recordings import Facts, Recording, Value, differs
 
 _DEVICE = "the device set"
 _CARRIER = ("demodulation_frequency_hz", "centre_frequency_hz", "sampling_rate_hz")
@@ -126,12 +126,7 @@ def _recording(
     statuses = [{frame.get("ImageStatus"), frame.get("Status")} for frame in frames[:count]]
     faults = ["" if status <= {None, "OK"} else "not valid by their status" for status in statuses]
     faults += [""] * (count - len(faults))
-    times, notes = _times(header, settings.frame_rate_hz), list[str]()
-    images = np.flatnonzero(~np.array(faults, dtype=bool))
-    if times is not None:
-        images, notes = usable("images", times[:count], faults)
-    if not images.size:
-        raise InvalidInputError(f"{path}: ImageStatus: expected a valid frame with a time, got none")
+    times, stamps, notes = _times(header, settings.frame_rate_hz), _times(header), list[str]()
     own, poses = own_values(path, header.fields), _poses(header, settings, device)
     pixels = _image_to_probe(header, settings, device, layout, poses)
     spacing, measured = header.spacing_mm, Value()
@@ -150,7 +145,7 @@ def _recording(
     pixel = next((size for size in sizes if size.value is not None), Value())
     values = _values(header, layout, device, pixel)
     values |= {name: Value(value, "as this package wrote it") for name, value in own.items() if "_" in name}
-    stacked = _frames(header, layout, images)
+    stacked = _frames(header, layout)
     if layout.is_complex:
         demodulation, centre, rate = (
             getattr(settings, name) or values.get(name, Value()).value for name in _CARRIER
@@ -158,7 +153,7 @@ def _recording(
         # Depth runs backwards in lines that are stored from the far end on, and so does their phase.
         share = None if demodulation or not (centre and rate) else carried_share(stacked, centre, rate)
         if share is not None and share <= -CARRIED[0]:
-            stacked = _frames(header, replace(layout, conjugated=True), images)
+            stacked = _frames(header, replace(layout, conjugated=True))
             notes.append("Q has the other sign in the file, as its phase tells: turned")
     readings, lost = _timed(poses, times)
     tracker = None if readings is None else Tracker(readings)
@@ -184,7 +179,8 @@ def _recording(
         settings,
         stacked,
         values,
-        time_s=None if times is None else times[images],
+        time_s=None if stamps is None else stamps[:count],
+        faults=faults,
         tracker=tracker,
         orientation=orientation,
         chain=" * ".join(chain),
@@ -227,7 +223,7 @@ def _times(header: SequenceHeader, rate_hz: float | None = None) -> FloatArray |
     return header.index_s if different < min(2, count) else stamps
 
 
-def _frames(header: SequenceHeader, layout: Layout, images: IntArray) -> FileFrames:
+def _frames(header: SequenceHeader, layout: Layout) -> FileFrames:
     """Frames of the pixels' type; RF of wider numbers than int16 as float32."""
     dtype, stored = header.dtype.newbyteorder("="), None
     if layout.is_complex:
@@ -236,14 +232,12 @@ def _frames(header: SequenceHeader, layout: Layout, images: IntArray) -> FileFra
     elif layout.is_rf and dtype != np.int16:
         dtype = np.dtype(np.float32)
     shape = (header.frame_count, *layout.shape(header.size))
-    return FileFrames(header.path, SequenceFile(header, layout), shape, dtype, stored, images.tolist())
+    return FileFrames(header.path, SequenceFile(header, layout), shape, dtype, stored)
 
 
 def _values(header: SequenceHeader, layout: Layout, device: DeviceSet, pixel: Value) -> dict[str, Value]:
     """What a sweep of this kind needs, and where file or device set have it."""
-    values, stamps = dict[str, Value](), _times(header)
-    if stamps is not None and (rate := rate_of(stamps[np.isfinite(stamps)])):
-        values["frame_rate_hz"] = Value(rate, "of its time stamps")
+    values = dict[str, Value]()
     across, down = (replace(pixel, value=size) for size in pixel.value or (None, None))
     vectors, samples = layout.shape(header.size)
 

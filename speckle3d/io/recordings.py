@@ -8,7 +8,7 @@ at once. Readers fill a `Recording`; it makes the sweep, describes itself and te
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Generator, Mapping
+from collections.abc import Generator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -17,7 +17,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from speckle3d.core.arrays import FloatArray
+from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.compression import USUAL_PIXEL_MM, estimate_dynamic_range
 from speckle3d.core.errors import FileError, InvalidInputError, naming
 from speckle3d.core.grid import ImageGrid
@@ -100,6 +100,8 @@ class Recording:
     time_s : ndarray, shape (n,), optional
         NaN where a frame has none; frames whose time is not after the one before are left out. By default
         of the frame rate, from 0.
+    faults : sequence of str, length n
+        Why a frame is of no use, empty where it is; by default all are.
     chain : str
         Transforms that the tracker's poses were made of.
     asked : mapping of str to str
@@ -121,6 +123,7 @@ class Recording:
     frames: Any = None
     values: Mapping[str, Value] = field(default_factory=dict)
     time_s: FloatArray | None = None
+    faults: Sequence[str] = ()
     tracker: Tracker | None = None
     orientation: OrientationSensor | None = None
     chain: str = "the tracker"
@@ -154,11 +157,11 @@ class Recording:
         assumed = [" ".join(row) for name, row in words.items() if getattr(self.settings, name) is None]
         assumed += self.assumptions
         told = [f"assumed, as the file does not say: {', '.join(assumed)}"] if assumed else []
-        return [*self.contradictions(), *self._timed[2], *self.remarks, *self._checked[1], *told]
+        return [*self.contradictions(), *self._used[2], *self.remarks, *self._checked[1], *told]
 
     def describe(self) -> list[Row]:
         """Rows of what the file says, where each number is from, and what is odd."""
-        remarks = [*self._timed[2], *self.remarks]
+        remarks = [*self._used[2], *self.remarks]
         with suppress(InvalidInputError, FileError):  # which is told by who asks for the sweep
             remarks += self._checked[1]
         numbers = () if self.fault else (self._told(name, one)[0] for name, one in self.needed.items())
@@ -197,9 +200,9 @@ class Recording:
         names += ["row_spacing_mm", "dynamic_range_db"] if is_grey else ["speed_of_sound_m_s", *_RATES]
         if dtype.kind == "c":
             names.append("demodulation_frequency_hz")
-        if self.settings.frame_rate_hz is not None or (self._timed[0] is None and self.frames.shape[0] > 1):
+        own, times = self._own, self._used[0]
+        if self.settings.frame_rate_hz is not None or (times is None and self.frames.shape[0] > 1):
             names.append("frame_rate_hz")
-        own, times = self._own, self._timed[0]
         if times is not None:
             own.setdefault("frame_rate_hz", Value(rate_of(times), "of its times"))
         if "dynamic_range_db" in names and own["dynamic_range_db"].value is None and self._range:
@@ -225,19 +228,27 @@ class Recording:
             getattr(self.settings, name) or self._own[name].value or USUAL_PIXEL_MM
             for name in ("column_pitch_mm", "row_spacing_mm")
         )
-        return estimate_dynamic_range(self.frames, pitch_mm, spacing_mm, self.full_scale)
+        return estimate_dynamic_range(self._images, pitch_mm, spacing_mm, self.full_scale)
 
     @cached_property
-    def _timed(self) -> tuple[FloatArray | None, Any, list[str]]:
-        """Times of the frames that have one, those frames, and a line of the frames left out."""
-        if self.time_s is None:
-            return None, self.frames, []
-        rows, notes = usable("images", self.time_s)
-        if rows.size < min(2, self.time_s.size):
-            return None, self.frames, []
-        if self.settings.frame_rate_hz is not None or not notes:
-            return self.time_s[rows], self.frames, []
-        return self.time_s[rows], self.frames.take(rows, 0), notes
+    def _used(self) -> tuple[FloatArray | None, IntArray, list[str]]:
+        """The file's own times of the frames, if it has them, the frames in use, and a line of the others."""
+        if self.frames is None:
+            return None, np.arange(0), []
+        own_s, rate_hz, count = None, self.settings.frame_rate_hz, self.frames.shape[0]
+        faults = self.faults or [""] * count
+        if self.time_s is not None:
+            rows, notes = usable("images", self.time_s, faults)
+            own_s = self.time_s[rows] if rows.size >= min(2, count) else None
+        if own_s is None or rate_hz is not None:
+            rows, notes = usable("images", np.arange(count) / (rate_hz or 1.0), faults)
+        return own_s, rows, notes
+
+    @cached_property
+    def _images(self) -> Any:
+        """The frames in use."""
+        rows = self._used[1]
+        return self.frames if rows.size == self.frames.shape[0] else self.frames.take(rows, 0)
 
     @cached_property
     def _checked(self) -> tuple[Sweep, list[str]]:
@@ -251,16 +262,17 @@ class Recording:
     def _made(self) -> Sweep:
         if self.fault is not None:
             raise self.fault
-        times, frames, _ = self._timed
-        if frames is None or 0 in frames.shape:
-            shape = None if frames is None else frames.shape
+        times, rows, _ = self._used
+        if self.frames is None or 0 in (rows.size, *self.frames.shape):
+            shape = None if self.frames is None else (rows.size, *self.frames.shape[1:])
             raise InvalidInputError(f"{self.path}: expected frames, got shape {shape}")
+        frames = self._images
         own = {name: one.value for name, one in self.needed.items()}
         values = own | {name: one for name, one in self.settings if name in own and one is not None}
         if lacking := [self.asked.get(name, name) for name, one in values.items() if one is None]:
             raise MissingSettingsError(self.path, tuple(lacking))
         if (rate_hz := values.get("frame_rate_hz")) is not None:
-            times = np.arange(frames.shape[0]) / float(rate_hz)
+            times = rows / float(rate_hz)
         signal: RFSettings | BModeSettings
         if "dynamic_range_db" in values:
             is_assumed = self.needed["dynamic_range_db"].is_assumed

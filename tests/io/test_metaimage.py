@@ -110,6 +110,15 @@ def test_one_bad_row_is_left_out_and_counted(tmp_path, change, images, poses):
     assert any("of 12 left out" in note for note in recording.notes)
 
 
+def test_a_given_rate_counts_images_that_are_left_out(tmp_path):
+    true, frames = path_of(12)
+    frames[5]["ImageStatus"] = "INVALID"
+    sweep = opened(tmp_path, frames, settings_=given_over(BMODE, frame_rate_hz=10.0)).sweep
+    np.testing.assert_allclose(sweep.frame_time_s, np.delete(np.arange(12), 5) / 10.0)
+    at_images = sweep.tracker.readings.at(sweep.frame_time_s).as_matrix()
+    np.testing.assert_allclose(at_images, np.delete(true.as_matrix(), 5, axis=0), atol=1e-9)
+
+
 @pytest.mark.parametrize("lost", [[5, 6], [0, 1]])
 def test_a_lost_tool_that_is_written_as_the_identity_is_left_out(tmp_path, lost):
     true, frames = path_of(12)
