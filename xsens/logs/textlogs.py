@@ -104,9 +104,7 @@ def _samples(table: TextTable) -> Parts:
         if unit != "s":
             notes.append(f"times without a unit: taken as in {unit}, by their steps")
     for key in stamps:
-        with np.errstate(invalid="ignore"):
-            whole = (columns[key] >= 0.0) & (columns[key] < 2.0**53) & (columns[key] % 1.0 == 0.0)
-        timed &= np.isfinite(columns[key]) if key == "time" else whole
+        timed &= np.abs(columns[key]) < (np.inf if key == "time" else 2.0**53)
     if not timed.any():
         raise InvalidInputError("expected lines with a time, got none")
     if not timed.all():

@@ -6,6 +6,7 @@ Cells without a number are NaN, lines of another length are left out.
 from __future__ import annotations
 
 import csv
+import math
 import re
 from array import array
 from collections.abc import Iterable, Iterator, Mapping
@@ -21,7 +22,7 @@ from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
 from xsens.logs.clocks import COUNTS, LATE, TICKS, unwrapped
 
-Names = tuple[str, ...]
+Names, Header = tuple[str, ...], list[str]
 
 _SEPARATORS = ("\t", ";", "|", ",", None)
 """In order of trust: a tab only separates, a comma may be a decimal point, blanks (None) may be padding."""
@@ -31,10 +32,6 @@ _LONGEST_HEADER = 64
 
 _COMMENT = "#"
 _DIGIT = re.compile("[0-9]")
-_LIKE_NAMES = re.compile(r"(?:[a-z°²µ_%][\w .()\[\]/^°²µ-]*|)$")
-_AXES = frozenset("wxyzs")
-"""Second line of names; s is the unit of a time."""
-
 # -- names of columns
 
 _DEG = 0.017453292519943295
@@ -135,7 +132,7 @@ class TextTable:
     and cells that hold no number.
     """
 
-    header: Names
+    header: Header
     names: Names
     columns: dict[str, FloatArray]
     stated: frozenset[str]
@@ -153,23 +150,19 @@ def read_table(lines: Iterable[str]) -> TextTable:
     InvalidInputError
         If there is no table, a quantity has two columns, or its rows are of several sensors.
     """
-    lines, header, count = iter(lines), [""], 0
-    for line in lines:
+    rows, header, count = (line for line in lines if line.strip("\r\n")), [""], 0
+    for line in rows:
         comment = line.startswith(_COMMENT)
         for separator in () if comment else _SEPARATORS:
-            cells, above = _cells(line, separator), _cells(header[-1], separator)
-            for names in (cells, _of_two_lines(above, cells)):
-                if _known(names) >= 2:
-                    return _named(lines, tuple(header[1:]), names, separator)
-            if len(cells) >= 4 and all(cell == "nan" or number(cell) == number(cell) for cell in cells):
-                for split in _SEPARATORS:  # a line above numbers may name their columns
-                    names = tuple(cell.strip(' "#%') for cell in _cells(header[-1], split))
-                    if len(names) == len(cells) and any(names) and all(map(_LIKE_NAMES.match, names)):
-                        if _known(names) >= 2:
-                            return _named(chain([line], lines), tuple(header[1:]), names, separator)
-                        raise InvalidInputError(not_understood(names))
+            cells, above = _cells(line, separator), _cells(header[-1].lstrip("#% "), separator)
+            for names in (cells, _joined(above, cells)):
+                if sum(column_of(name) is not None for name in names) >= 2:
+                    return _named(rows, header, names, separator)
+            if len(cells) >= 4 and all(cell == "nan" or _is_number(cell) for cell in cells):
+                if len(above) == len(cells) and any(above) and not any(map(_is_number, above)):
+                    return _named(chain([line], rows), header, above, separator)
                 columns = {str(i): (i, None) for i in range(len(cells))}
-                return _rows(chain([line], lines), tuple(header[1:]), (), columns, separator, len(cells))
+                return _rows(chain([line], rows), header, (), columns, separator)
         header.append(line.rstrip("\n"))
         count += not comment
         if count > _LONGEST_HEADER:
@@ -203,32 +196,28 @@ def _cells(line: str, separator: str | None) -> Names:
     return tuple(cell.strip().strip('"').lower() for cell in _split(line, separator))
 
 
-def _known(names: Names) -> int:
-    return sum(column_of(name) is not None for name in names)
+def _is_number(cell: str) -> bool:
+    return not math.isnan(number(cell))
 
 
-def _of_two_lines(groups: Names, axes: Names) -> Names:
-    """Names of columns whose group is in the line above, at the first of its axes; empty if they are not."""
-    if len(groups) != len(axes) or not _AXES & set(axes):
-        return ()
+def _joined(above: Names, below: Names) -> Names:
+    """Names in two lines, of which the upper one may name a group at its first column alone."""
     names, group = list[str](), ""
-    for above, axis in zip(groups, axes, strict=True):
-        group = above or group
-        names.append(f"{group}_{axis}" if axis in _AXES else above)
-    return tuple(names)
+    for over, under in zip(above, below, strict=False):
+        group = over or group
+        names.append(f"{group} {under}" if under else over)
+    return tuple(names) if len(above) == len(below) else ()
 
 
-def _named(lines: Iterator[str], header: Names, names: Names, separator: str | None) -> TextTable:
+def _named(rows: Iterator[str], header: Header, names: Names, separator: str | None) -> TextTable:
     while not names[-1]:  # what a separator at the end of the line makes
         names = names[:-1]
-    lines = (line for line in lines if line.strip("\r\n"))
-    first = next(lines, "")
+    first = next(rows, "")
     cells = _cells(first, separator)
-    if len(cells) == len(names) and not any(number(cell) == number(cell) for cell in cells):
-        joined = tuple(f"{name} {unit}" for name, unit in zip(names, cells, strict=True))
-        if _known(joined):  # a line of units
-            pairs = zip(names, joined, strict=True)
-            names, first = tuple(both if column_of(both) else name for name, both in pairs), next(lines, "")
+    joined = _joined(names, cells)
+    if any(map(column_of, joined)) and not any(map(_is_number, cells)):  # a line of units
+        pairs = zip(names, joined, strict=True)
+        names, first = tuple(both if column_of(both) else name for name, both in pairs), next(rows, "")
     blanks = tuple(part for name in names for part in name.split())
     if len(names) != len(cells) == len(blanks):  # a blank where a tab should be
         names = blanks
@@ -243,24 +232,24 @@ def _named(lines: Iterator[str], header: Names, names: Names, separator: str | N
             )
         if key not in columns or columns[key][1] is None:  # of several times, one with its unit
             columns[key] = i, scale
-    return _rows(chain([first], lines), header, names, columns, separator, len(names))
+    if not columns:
+        raise InvalidInputError(not_understood(names))
+    return _rows(chain([first], rows), header, names, columns, separator)
 
 
 def _rows(
     lines: Iterable[str],
-    header: Names,
+    header: Header,
     names: Names,
     columns: Mapping[str, tuple[int, float | None]],
     separator: str | None,
-    count: int,
 ) -> TextTable:
     """Read columns, of which index and unit are known by key."""
+    count = len(names or columns)
     which = [i for i, _ in columns.values()]
     sensors = {i: dict[str, None]() for i, name in enumerate(names) if _WHOSE.match(name)}
     values, left_out, words = array("d"), 0, 0
     for line in lines:
-        if not line.strip("\r\n"):
-            continue
         cells = _split(line if separator == "," else line.replace(",", "."), separator)
         while len(cells) > count and not cells[-1].strip():
             cells.pop()
