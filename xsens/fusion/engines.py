@@ -42,6 +42,11 @@ class Filter:
         self.last = np.zeros(0, kernel.STEP)  # whole increment
         self._north = np.zeros((0, len(UNKNOWN)))  # as known then
 
+    @property
+    def start_force_m_s2(self) -> FloatArray:
+        """Mean accelerometer's reading by which up was found, shape (1, 3)."""
+        return np.asarray(self._filter["start_force"] / self._filter["start_s"][:, None])
+
     def steps(
         self, samples: Samples, to_end: bool, covariances: bool = False
     ) -> tuple[Any, FloatArray, FloatArray, FloatArray]:

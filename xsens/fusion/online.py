@@ -15,12 +15,9 @@ from speckle3d.core.errors import InvalidInputError, MismatchError
 from speckle3d.core.shown import shown
 from xsens.fusion.engines import Filter
 from xsens.fusion.readings import FASTEST_RAD_S, PAUSE_S, Samples, lost_variance, require_metres
-from xsens.fusion.settings import BRIDGED_S, LOST, FusionSettings
+from xsens.fusion.settings import LOST, FusionSettings
 from xsens.logs.faults import LIMITS
 from xsens.logs.samples import VECTORS
-
-_JUDGED_S = 0.99
-"""The accelerometer's unit is judged by the median of the first second, less rounding of the steps."""
 
 _FOLLOWS = 0.05
 """How fast the usual step between samples follows theirs, as a fraction of a sample."""
@@ -85,9 +82,8 @@ class OnlineFilter:
         self._pending: list[tuple[Any, ...]] = []  # since the filter ran: once in an increment is enough
         self._rate: FloatArray | None = None
         self._force = np.full(3, np.nan)
-        self._skipped_s = self._forceless_s = self._judged_s = 0.0
+        self._skipped_s = self._forceless_s = 0.0
         self._usual_s = math.nan
-        self._first: list[FloatArray] = []
 
     def push(
         self,
@@ -114,12 +110,11 @@ class OnlineFilter:
         MismatchError
             If the shapes do not fit together.
         InvalidInputError
-            If a step is not positive and finite, the gyroscope is not in rad/s or, by its median over the
-            first second, the accelerometer is not in m/s^2.
+            If a step is not positive and finite, the gyroscope is not in rad/s or, by its mean at the start,
+            the accelerometer is not in m/s^2.
         """
         steps, rates, forces, fields = _checked(step_s, gyroscope_rad_s, accelerometer_m_s2, magnetometer_au)
         for step_s, rate, force, field in zip(map(float, steps), rates, forces, fields, strict=True):
-            self._judge(step_s, force)
             reading = self._measured(step_s, rate, force, field)
             if reading is None:
                 continue
@@ -140,6 +135,8 @@ class OnlineFilter:
         found = self._filter.run(Samples(*map(np.array, zip(*self._pending, strict=True))))
         self._pending = []
         if len(last := self._filter.last):
+            if last["started"][0]:
+                require_metres(self._filter.start_force_m_s2, "accelerometer_m_s2")
             self._state = OnlineState(
                 Rotation.from_quat(found.xyzw[-1]),
                 found.sd_rad[-1],
@@ -156,17 +153,6 @@ class OnlineFilter:
         """Estimate after the last sample; None before the first whole increment."""
         self._run()
         return self._state
-
-    def _judge(self, step_s: float, force: FloatArray) -> None:
-        """Raise if the accelerometer is in other units, after a second of it."""
-        if self._judged_s >= _JUDGED_S or not np.isfinite(force).all():
-            return
-        self._first.append(force)
-        self._judged_s += min(step_s, BRIDGED_S)
-        if self._judged_s >= _JUDGED_S:
-            first, self._first, self._judged_s = np.array(self._first), [], 0.0
-            require_metres(first, "accelerometer_m_s2")
-            self._judged_s = _JUDGED_S  # else the next second is judged too
 
     def _measured(
         self, step_s: float, rate: FloatArray, force: FloatArray, field: FloatArray

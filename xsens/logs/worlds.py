@@ -139,14 +139,16 @@ def world_of(
         shown = "NWU"
     elif abs(north_deg - 90.0) <= _NORTH_DEG:
         shown = "ENU"
-    sensors = "accelerometer" if np.isnan(north_deg) else "accelerometer and magnetometer"
-    world, note = shown, f"{shown} by its own {sensors}"
+    sensors = f"its own accelerometer{'' if np.isnan(north_deg) else ' and magnetometer'}"
     if claim.final:
-        world, note = taken, f"{taken}, {claim.by}; by its own {sensors} it is {shown}"
+        note = f"{taken}, {claim.by}; by {sensors} it is {shown}"
     elif taken != shown:
-        note = f"{note}, not {taken}, {claim.by}"
+        note = f"{shown} by {sensors}, not {taken}, {claim.by}"
     elif np.isnan(north_deg):
         note = f"taken as {taken}, {claim.by}: no steady field tells; see --world"
+    else:
+        note = f"{shown} by {sensors}"
+    world = taken if claim.final else shown
     return world, ((f"orientation: {note}",) if taken != shown or claim.assumed else ())
 
 
