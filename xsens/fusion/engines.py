@@ -31,7 +31,7 @@ class Filter:
         tilt = 2.0 * settings.speed_m_s / settings.gravity_m_s2  # of the mean force over a second
         deviations = [tilt, tilt, 1e-6, *3 * [settings.bias_sd_rad_s], *3 * [2.0 * settings.speed_m_s]]
         self._filter["fresh"] = np.square(deviations)
-        numbers = {name: float(value) for name, value in vars(settings).items()}
+        numbers = vars(settings)
         self._limits = np.array([tuple(numbers.values())], [(name, "f8") for name in numbers])
         self.begin(0.0)
 
