@@ -159,10 +159,17 @@ def start(motion, amount, rng):
     return seen_by(motion, room_ut(motion, rng) + np.outer(near, amount * direction(rng) * [1.0, 1.0, 0.5]))
 
 
+def drift(motion, amount, rng):
+    """A field that wanders over minutes, as of a magnet that is carried about far away."""
+    away = wandering(motion.log.time_s, rng, amount, 60.0)
+    return seen_by(motion, room_ut(motion, rng) + away - away[0])
+
+
 FIELDS = {
     "attached": attached,
     "walk": walk,
     "start": start,
+    "drift": drift,
 }
 
 

@@ -69,6 +69,11 @@ _NEGLIGIBLE = 0.005
 BIN_S = 0.25
 """Readings are averaged over this time: the heading's error changes in seconds."""
 
+_STEADY_S = 60.0
+"""Time over which the gyroscope is trusted to hold the heading within its error."""
+
+_STEADY = round(_STEADY_S / BIN_S)
+
 
 def steps_per_bin(settings: FusionSettings) -> int:
     """Steps of the filter in a bin."""
@@ -158,6 +163,7 @@ class HeadingFilter:
         self._filters["begun"] = False
         self._rows = np.zeros(0, STEP)  # steps of a bin that is not whole
         self._north = np.zeros((0, len(UNKNOWN)))  # at the end of the last bin
+        self._lately = np.zeros((0, _FILTERS + 1))  # angles of the filters, and slip
 
     def follow(self, rows: Any, to_end: bool = False) -> FloatArray:
         """`NORTH` after each step by the last whole bin, or else the first; what is left is one `to_end`."""
@@ -170,7 +176,9 @@ class HeadingFilter:
             rows = rows[:whole]
             bins = averaged_bins(rows, rows["start"], rows["bias"], rows["sd"], self._settings)
             estimates = self._run(bins)
-            north = np.concatenate([north, _combined(estimates, *self._weights(estimates), bins)])
+            weights, best = self._weights(estimates)
+            more = self._unsteady(estimates, best, bins)
+            north = np.concatenate([north, _combined(estimates, weights, best, bins, more)])
         self._north = north[-1:]
         north = north if len(north) else np.array([UNKNOWN])
         return np.asarray(north[np.clip(done, 0, len(north) - 1)])
@@ -184,10 +192,12 @@ class HeadingFilter:
         filtered = _shaped(_FILTERS, len(bins))
         rows = self._run(bins, filtered)
         weights, best = (values[-1] for values in self._weights(rows))
+        many = np.full(len(bins), best)
+        more = np.median(self._unsteady(rows, many, bins))  # what passes is smoothed
         weights[weights < _NEGLIGIBLE] = 0.0
         for j in np.union1d(np.flatnonzero(weights), best):
             rows["turn_rad"][:, j], rows["variance"][:, j] = _backward(*(each[j] for each in filtered))
-        return _combined(rows, np.tile(weights, (len(bins), 1)), np.full(len(bins), best), bins)
+        return _combined(rows, np.tile(weights, (len(bins), 1)), many, bins, more)
 
     def _weights(self, rows: Any) -> tuple[FloatArray, IntArray]:
         """Weights of the filters after each bin, shape (n, filters), and the one whose heading is taken.
@@ -207,11 +217,25 @@ class HeadingFilter:
         best = np.where(total.min(axis=1) > _PLAIN, _IRON, np.where(beside < 0.0, _BESIDE, _FIRST))
         return likely / likely.sum(axis=1, keepdims=True), best
 
+    def _unsteady(self, rows: Any, best: IntArray, bins: Any) -> FloatArray:
+        """Square of what the best filter's north has moved against the gyroscope, beyond its error."""
+        lately = np.vstack([self._lately, np.column_stack([rows["turn_rad"], bins["slip_rad2"]])])
+        last = len(self._lately) + np.arange(len(bins))
+        first = np.maximum(last - _STEADY, 0)
+        slip = np.cumsum(lately[:, _FILTERS])
+        gyroscope = slip[last] - slip[first] + bins["bias_variance"] * _STEADY_S**2
+        self._lately = lately[-_STEADY:]
+        return np.maximum(_angle(lately[last, best] - lately[first, best]) ** 2 - gyroscope, 0.0)
+
     def _run(self, bins: Any, filtered: list[FloatArray] | None = None) -> Any:
         """What each filter finds in each bin, shape (n, filters)."""
         rows = np.zeros((len(bins), _FILTERS), kernel.HEADING)
         kernel.find_headings(bins, self._models, self._filters, rows, *(filtered or _shaped(0, 0)))
         return rows
+
+
+def _angle(difference: FloatArray) -> FloatArray:
+    return np.asarray(np.angle(np.exp(1j * difference)))
 
 
 def _shaped(*shape: int) -> list[FloatArray]:
@@ -220,11 +244,11 @@ def _shaped(*shape: int) -> list[FloatArray]:
     return [np.zeros((*shape, *each)) for each in ((size,), *3 * [(size, size)])]
 
 
-def _combined(rows: Any, weights: FloatArray, best: IntArray, bins: Any) -> FloatArray:
+def _combined(rows: Any, weights: FloatArray, best: IntArray, bins: Any, more_rad2: Any) -> FloatArray:
     """`NORTH` of each bin: the best filter's angle, and deviation of all from it by their weights."""
     turn = np.take_along_axis(rows["turn_rad"], best[:, None], axis=1)
-    off = np.angle(np.exp(1j * (rows["turn_rad"] - turn)))
-    variance = (weights * (rows["variance"] + off**2)).sum(axis=1)
+    off = _angle(rows["turn_rad"] - turn)
+    variance = np.minimum((weights * (rows["variance"] + off**2)).sum(axis=1) + more_rad2, np.pi**2)
     trust, stray = ((weights * rows[name]).sum(axis=1) for name in ("trust", "stray"))
     disturbed = bins["seen"] & (trust < _DISTRUSTED)
     return np.column_stack([turn, np.sqrt(variance), disturbed, stray, weights[:, _IRON]])

@@ -18,6 +18,7 @@ KINDS = [
     ("attached", 30.0),
     ("walk", 0.3),
     ("start", 20.0),
+    ("drift", 4.0),
     ("truncated", 0.25),
 ]
 
