@@ -225,7 +225,8 @@ class HeadingFilter:
         slip = np.cumsum(lately[:, _FILTERS])
         gyroscope = slip[last] - slip[first] + bins["bias_variance"] * _STEADY_S**2
         self._lately = lately[-_STEADY:]
-        return np.maximum(_angle(lately[last, best] - lately[first, best]) ** 2 - gyroscope, 0.0)
+        moved = _angle(lately[last, best] - lately[first, best])
+        return np.asarray(np.maximum(moved**2 - gyroscope, 0.0))
 
     def _run(self, bins: Any, filtered: list[FloatArray] | None = None) -> Any:
         """What each filter finds in each bin, shape (n, filters)."""

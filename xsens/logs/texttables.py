@@ -22,7 +22,8 @@ from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
 from xsens.logs.clocks import COUNTS, LATE, TICKS, unwrapped
 
-Names, Header = tuple[str, ...], list[str]
+Names = tuple[str, ...]
+Header = list[str]
 
 _SEPARATORS = ("\t", ";", "|", ",", None)
 """In order of trust: a tab only separates, a comma may be a decimal point, blanks (None) may be padding."""
