@@ -97,59 +97,21 @@ def seen_by(motion, field_ut):
     return motion.turns.inv().apply(field_ut)
 
 
-def room(motion, amount, rng):
-    """The earth's field in a room: a little different from place to place."""
-    return seen_by(motion, room_ut(motion, rng))
-
-
 def room_ut(motion, rng):
+    """The earth's field in a room: a little different from place to place."""
     walked_s = np.cumsum(motion.moving) / motion.log.rate_hz
     return EARTH_UT + wandering(walked_s, rng, ROOM * np.linalg.norm(EARTH_UT), 7.0)
 
 
 def attached(motion, amount, rng):
     """Iron and a magnet that turn with the sensor."""
-    return fixed(motion, amount * direction(rng), rng)
+    magnet_ut, soft = amount * direction(rng), np.eye(3) + 0.03 * rng.standard_normal((3, 3))
+    return seen_by(motion, room_ut(motion, rng)) @ soft.T + magnet_ut
 
 
-def fixed(motion, magnet_ut, rng):
-    soft = np.eye(3) + 0.03 * rng.standard_normal((3, 3))
-    return room(motion, None, rng) @ soft.T + magnet_ut
-
-
-def direction(rng, shape=()):
-    aim = rng.standard_normal((*shape, 3))
-    return aim / np.linalg.norm(aim, axis=-1, keepdims=True)
-
-
-IRON_M = 0.5
-"""Size of a desk's or a column's iron: nearer than that, the field does not grow any more."""
-
-
-def dipoles(position_m, place_m, moment_a_m2):
-    """Field of magnets, shape (k, 3) each, at positions of shape (n, 3), uT."""
-    out = np.zeros_like(position_m)
-    for place, moment in zip(place_m, moment_a_m2, strict=True):
-        apart = position_m - place
-        square = (apart**2).sum(axis=1, keepdims=True) + IRON_M**2
-        along = apart @ moment
-        out += 0.1 * (3.0 * apart * along[:, None] / square**2.5 - moment / square**1.5)
-    return out
-
-
-def walk(motion, amount, rng):
-    """Indoors among desks, columns and a lift at walking pace, wherever the sensor moves at all."""
-    place_m = rng.uniform([0.0, 0.0, -1.2], [20.0, 10.0, 0.3], (60, 3))
-    moment = direction(rng, (60,)) * rng.lognormal(0.0, 0.8, (60, 1))
-    corners = rng.uniform([0.0, 0.0, 0.0], [20.0, 10.0, 0.0], (80, 3))
-    lasting_s = np.linalg.norm(np.diff(corners, axis=0), axis=1) / rng.uniform(0.8, 1.4, 79)
-    at_s = np.concatenate([[0.0], np.cumsum(lasting_s)])
-    walked_s = np.cumsum(motion.moving) / motion.log.rate_hz
-    path = np.column_stack([np.interp(walked_s, at_s, c) for c in corners.T])
-    path = path + 0.05 * wandering(walked_s, rng, 1.0, 1.5)
-    iron = dipoles(path, place_m, moment)
-    strength = np.sqrt((iron[motion.moving] ** 2).sum(axis=1).mean())
-    return seen_by(motion, EARTH_UT + iron * (amount * np.linalg.norm(EARTH_UT) / strength))
+def direction(rng):
+    aim = rng.standard_normal(3)
+    return aim / np.linalg.norm(aim)
 
 
 def start(motion, amount, rng):
@@ -167,7 +129,6 @@ def drift(motion, amount, rng):
 
 FIELDS = {
     "attached": attached,
-    "walk": walk,
     "start": start,
     "drift": drift,
 }

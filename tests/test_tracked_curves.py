@@ -57,15 +57,3 @@ def test_curves_of_a_tracked_phantom_are_those_of_steps(sweep, curves):
     assert np.abs(ratio - 1).max() < 0.12
     assert found.origin == "tracked"
     assert found.scale_sigma < 0.04
-
-
-def test_two_rows_read_with_curves_of_tissue_claim_as_usual_ones_scatter(sweep, curves):
-    """What two rows happen to disagree on tells little; thirteen tell their own."""
-    part, of_tissue = (
-        replace(sweep.part(0, 24), tracker=None, orientation=None),
-        replace(curves, of_tissue=True),
-    )
-    grid = replace(part.grid, samples=round(9.5 / part.grid.sample_spacing_mm))
-    frames = np.stack([part.frames[k][:, : grid.samples] for k in range(len(part))])
-    assert track(replace(part, frames=frames, grid=grid), of_tissue).shared.scale_sigma > 0.05
-    assert 0.005 < track(part, of_tissue).shared.scale_sigma < 0.02

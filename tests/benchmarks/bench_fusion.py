@@ -1,7 +1,7 @@
 """Orientation on BROAD trials beside VQF's: total RMS error, degrees (without a constant heading).
 
 Run: ``python tests/benchmarks/bench_fusion.py [FOLDER]``, the folder that of the trials' .mat files;
-without one, of a simulated hand that walks past iron. On-line methods stand beside on-line, off-line beside
+without one, of a simulated sensor with iron on it. On-line methods stand beside on-line, off-line beside
 off-line. Last comes how often errors are within one claimed sigma.
 """
 
@@ -26,7 +26,7 @@ def trials(folder):
     """Name, log, true orientation and where the sensor moved, of every trial."""
     if folder is None:
         rng = np.random.default_rng(20)
-        yield "walk", *scene(simulated(rng, 20.0), "walk", 0.3, rng)
+        yield "attached", *scene(simulated(rng, 20.0), "attached", 5.0, rng)
     else:
         for name in trials_in(folder):
             yield name, *read_trial(folder, name)

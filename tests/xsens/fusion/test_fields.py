@@ -16,7 +16,6 @@ SIGMAS = 2.3
 KINDS = [
     ("attached", 5.0),
     ("attached", 30.0),
-    ("walk", 0.3),
     ("start", 20.0),
     ("drift", 4.0),
     ("truncated", 0.25),
