@@ -159,15 +159,15 @@ def _frame_axis(node: h5py.Dataset, pixels: int) -> tuple[int | None, int]:
     MATLAB leaves out axes of length 1 at its end, which is the beginning in the file; pyuff keeps MATLAB's
     order.
     """
-    shape, is_full = node.shape, len(node.shape) == 4
-    singles = shape[1:3] if is_full else (*shape[1:], *shape[:-1])
-    axes = [axis for axis, end in ((0, -1), (3, 0)) if shape[end:][:1] == (pixels,)]
-    if len(shape) > 4 or not axes or (is_full and len(axes) > 1) or {*singles} - {1, pixels}:
+    shape = node.shape
+    axis = (0 if shape[-1] == pixels else 3) if len(shape) == 4 else None
+    count = 1 if axis is None else shape[axis]
+    if pixels not in (*shape[:1], *shape[-1:]) or node.size != count * pixels:
         raise InvalidInputError(
             f"{locate(node)}: expected {pixels} pixels of one channel and one wave, summed, got (MATLAB's "
             f"order) {shape[::-1]}"
         )
-    return (axes[0], shape[axes[0]]) if is_full else (None, 1)
+    return axis, count
 
 
 READER = Reader(FORMAT, None, open_uff, claims_hdf5=is_uff)

@@ -35,7 +35,7 @@ _HEADER = np.dtype([(name, "<i4") for name in _NAMES])
 _READ = {2: ("B-mode before scan conversion (.bpr)", 8), 4: ("B-mode (.b8)", 8), 16: ("RF (.rf)", 16)}
 """Name and bits of the types that are read; all are powers of two."""
 _BMODE, _LAST_TYPE = 4, 2**19
-_SUFFIXES = (".rf", ".bpr", ".b8", ".b32", ".mpr", ".drf", ".pw", ".crf", ".col", ".cvv", ".el", ".gps")
+_SUFFIXES = (".rf", ".bpr", ".b8", ".crf", ".col")
 
 
 def _mapped(path: Path, record: np.dtype[Any], count: int, is_image: bool) -> ReadFrame:
