@@ -10,7 +10,6 @@ import queue
 import socket
 import threading
 import time
-from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -26,8 +25,9 @@ _LOOK_S = 0.005
 """Between two looks at what another thread does."""
 _CONNECT_S, _PAUSE_S = 5.0, 0.5
 """Longest time to connect, and between two attempts."""
-_MOST_RECEIVED, _MOST_SENDING = 256, 64
-"""Messages not yet taken, for which the peer then waits; and not yet sent, of which the oldest go."""
+_MOST_RECEIVED, _MOST_UNSENT_BYTES = 256, 2**24
+"""Messages not yet taken, for which the peer then waits; and what is not yet sent, above which no more is:
+a dozen frames of 1 MB, half a second."""
 _PIECE_BYTES = 2**20
 
 
@@ -62,15 +62,6 @@ class LinkState:
         return time.monotonic() - self.heard_s
 
 
-@dataclass(eq=False)
-class _Peer:
-    """Messages to send to a connected peer."""
-
-    outbox: deque[bytes] = field(default_factory=lambda: deque(maxlen=_MOST_SENDING))
-    wake: asyncio.Event = field(default_factory=asyncio.Event)
-    is_sending: bool = False
-
-
 class End:
     """An end of connections: messages received and not yet taken, and counts of what has come.
 
@@ -81,7 +72,7 @@ class End:
     def __init__(self) -> None:
         self.state = LinkState()
         self._inbox: queue.Queue[Received] = queue.Queue(_MOST_RECEIVED)
-        self._peers: list[_Peer] = []
+        self._writers: list[asyncio.StreamWriter] = []
         self._loop, self._over = asyncio.new_event_loop(), asyncio.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
 
@@ -101,7 +92,7 @@ class End:
 
     def wait_connected(self, timeout_s: float) -> bool:
         """Wait for a peer; whether there is one."""
-        return _until(lambda: bool(self._peers), timeout_s)
+        return _until(lambda: self.state.peers > 0, timeout_s)
 
     def receive(self, timeout_s: float) -> list[Received]:
         """Take all messages in the order in which they came, waiting for the first one.
@@ -119,12 +110,16 @@ class End:
         return taken
 
     def send(self, message: bytes) -> None:
-        """Send a packed message to all peers, without waiting for any: a slow one loses the oldest ones."""
-        for peer in list(self._peers):
-            self.state.dropped += len(peer.outbox) == peer.outbox.maxlen
-            peer.outbox.append(message)
-            with suppress(RuntimeError):  # closed meanwhile
-                self._loop.call_soon_threadsafe(peer.wake.set)
+        """Send a packed message to all peers, without waiting for any: a slow one is left out."""
+        with suppress(RuntimeError):  # closed meanwhile
+            self._loop.call_soon_threadsafe(self._write, message)
+
+    def _write(self, message: bytes) -> None:
+        for writer in self._writers:
+            if writer.transport.get_write_buffer_size() > _MOST_UNSENT_BYTES:
+                self.state.dropped += 1
+            else:
+                writer.write(message)
 
     async def _serve(self) -> None:
         """Make connections, for ever."""
@@ -140,32 +135,19 @@ class End:
             runner.run(serve())
 
     async def _talk(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """Read and write until the connection is lost."""
+        """Read, and be written to, until the connection is lost."""
         writer.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-        peer = _Peer()
-        tasks = [asyncio.create_task(self._read(reader)), asyncio.create_task(self._write(peer, writer))]
-        self._peers.append(peer)
+        writer.transport.set_write_buffer_limits(0)  # so that `drain` waits until all is sent
+        self._writers.append(writer)
         self.state.peers += 1
         try:
-            await asyncio.gather(*tasks)
+            await self._read(reader)
         except (OSError, MessageError) as error:
             self.state.last_failure = str(error)
         finally:
-            self._peers.remove(peer)
+            self._writers.remove(writer)
             self.state.peers -= 1
-            for task in tasks:
-                task.cancel()
             writer.transport.abort()
-
-    async def _write(self, peer: _Peer, writer: asyncio.StreamWriter) -> None:
-        writer.transport.set_write_buffer_limits(0)  # so that `drain` waits until all is sent
-        while await peer.wake.wait():
-            peer.wake.clear()
-            while peer.outbox:
-                peer.is_sending = True
-                writer.write(peer.outbox.popleft())
-                await writer.drain()
-                peer.is_sending = False
 
     async def _read(self, reader: asyncio.StreamReader) -> None:
         while start := await reader.read(1):
@@ -266,7 +248,14 @@ class Server(End):
 
     def drain(self, timeout_s: float) -> bool:
         """Wait until all clients were sent everything; whether they were in time."""
-        return _until(lambda: not any(one.outbox or one.is_sending for one in list(self._peers)), timeout_s)
+
+        async def drained() -> None:
+            await asyncio.gather(*(writer.drain() for writer in self._writers))
+
+        with suppress(OSError):  # a client's that is lost, or too slow
+            asyncio.run_coroutine_threadsafe(drained(), self._loop).result(timeout_s)
+            return True
+        return False
 
     async def _serve(self) -> None:
         async def welcome(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
