@@ -43,14 +43,15 @@ from speckle3d.core.geometry import RIGID_TOLERANCE
 from speckle3d.core.streams import TimedRotations
 from speckle3d.core.sweep import OrientationSensor
 from speckle3d.io.clarius.package import Member
-from speckle3d.io.clarius.sidecars import parsed
 from speckle3d.io.pose_paths import usable
 from speckle3d.io.recordings import Row
 
 G_M_S2 = 9.80665
 MEANING = "scalar first, world from sensor"
 
-_NAMES = [f"{name} {axis}" for name in ("accelerometer", "gyroscope", "magnetometer") for axis in "xyz"]
+_VECTORS = [f"{name} {axis}" for name in ("accelerometer", "gyroscope", "magnetometer") for axis in "xyz"]
+_NAMES = [*_VECTORS, "q0", "q1", "q2", "q3"]
+_FIELD = re.compile(r"(\w[\w ]*): *([-+.\w]+)")
 _MOST_OFF_DEG = 10.0
 """A hand's accelerations of a tenth of g tilt what is measured by 6 deg."""
 _LEAST_G, _MOST_G = 0.8, 1.2
@@ -112,12 +113,9 @@ def read_samples(member: Member) -> SensorSamples:
     documents = [text for text in re.split(r"^---.*$", member.text(), flags=re.MULTILINE) if text.strip()]
     table = np.full((len(documents), 14), np.nan)
     for row, text in zip(table, documents, strict=True):
-        # What cannot be read stays without a time or a value.
-        with suppress(InvalidInputError, ValueError, TypeError, LookupError, AttributeError):
-            fields = parsed(text, member.where)
-            turn = fields.get("orientation") or {}
-            values = [fields.get(name) for name in _NAMES] + [turn.get(f"q{k}") for k in range(4)]
-            row[1:] = [float(value or "nan") for value in values]
+        fields = dict(_FIELD.findall(text))
+        with suppress(ValueError, KeyError):  # what cannot be read stays without a time or a value
+            row[1:] = [float(fields.get(name, "nan")) for name in _NAMES]
             row[0] = int(fields["timestamp"]) / 1e9
     stamps, table = table[:, 0], table[:, 1:]
     wanted = np.isfinite(table).sum(axis=0) > 0.5 * len(
