@@ -101,8 +101,6 @@ class Devices:
         sentences = []
         for kind, name in self._wanted:
             if (kind, name) not in self._heard:
-                devices = ", ".join(
-                    sorted(device for heard_kind, device in self._heard if heard_kind == kind)
-                )
+                devices = ", ".join(sorted(device for heard, device in self._heard if heard == kind))
                 sentences.append(f"no {kind} {name}" + (f", but {devices}" if devices else " yet"))
         return "; ".join(sentences)

@@ -75,9 +75,10 @@ class GrowingVolume:
             ``world_from_image`` of all frames that were kept, and perhaps others.
         """
         numbers, images = self.kept()
-        numbers, images = numbers[numbers < len(poses)], images[: int((numbers < len(poses)).sum())]
-        voxel_mm = max(spacing_within(self.grid, poses[numbers], VOXELS_GB), self.grid.vector_pitch_mm)
-        return compound(grey_levels(images), self.grid, poses[numbers], voxel_mm, voxel_type="uint8")
+        placed = numbers < len(poses)
+        at = poses[numbers[placed]]
+        voxel_mm = max(spacing_within(self.grid, at, VOXELS_GB), self.grid.vector_pitch_mm)
+        return compound(grey_levels(images[placed]), self.grid, at, voxel_mm, voxel_type="uint8")
 
 
 def grey_levels(images: Float16Array) -> Float32Array:
