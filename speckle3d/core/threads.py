@@ -83,13 +83,8 @@ def in_parallel(function: Callable[[int, int], None], count: int, grain: int = 1
     grain : int
         Items below which a slice is not worth another thread's while.
     """
-    threads = min(cores(), -(-count // grain))
-    if threads <= 1:
-        if count:
-            function(0, count)
-        return
-    size = max(grain, -(-count // (_SLICES_PER_CORE * threads)))
-    starts = range(0, count, size)
+    size = count if cores() == 1 else max(grain, -(-count // (_SLICES_PER_CORE * cores())))
+    starts = range(0, count, max(size, 1))
     deque(ahead(lambda first: function(first, min(first + size, count)), starts, len(starts)), maxlen=0)
 
 

@@ -202,25 +202,6 @@ class TiledMedium:
         """Tiles that together hold all scatterers in a box of the image."""
         return [_tile(self, i, j) for i, j in tiles_near(medium_from_image, box).tolist()]
 
-    def make_tile(self, i: int, j: int) -> Scatterers:
-        """All scatterers of one tile."""
-        parts = [self._background(i, j)]
-        parts += [self._fascia(layer, n, i, j) for n, layer in enumerate(self.layers) if layer.fascia]
-        # Children of a neighbouring tile's parents may lie in this tile.
-        around = np.indices((3, 3)).reshape(2, -1).T + np.array([i - 1, j - 1])
-        for position, strength in [_family(self, *tile) for tile in around.tolist()] if self.clusters else ():
-            inside = (np.floor(position[:, [0, 2]] / TILE_MM) == [i, j]).all(axis=1)
-            parts.append((position[inside], strength[inside]))
-        position, strength = _joined(parts)
-        for sphere in self.spheres:
-            inside = ((position - sphere.centre_mm) ** 2).sum(axis=1) < sphere.radius_mm**2
-            strength[inside] *= sphere.factor
-        present = np.flatnonzero(strength)
-        # By depth, so that neighbours meet the same part of the beam's table.
-        depth = (position[present, 1] - self.depth_mm[0]) / _DEPTH_BIN_MM
-        present = present[np.argsort(depth.astype(np.int16), kind="stable")]
-        return position[present], strength[present]
-
     def _background(self, i: int, j: int) -> Scatterers:
         """Half of the scatterers Poisson distributed, half of them one anywhere in each of equal cells.
 
@@ -259,7 +240,23 @@ class TiledMedium:
 
 @lru_cache(_KEPT_TILES)
 def _tile(medium: TiledMedium, i: int, j: int) -> Scatterers:
-    return medium.make_tile(i, j)
+    """All scatterers of one tile."""
+    parts = [medium._background(i, j)]
+    parts += [medium._fascia(layer, n, i, j) for n, layer in enumerate(medium.layers) if layer.fascia]
+    # Children of a neighbouring tile's parents may lie in this tile.
+    around = np.indices((3, 3)).reshape(2, -1).T + np.array([i - 1, j - 1])
+    for position, strength in [_family(medium, *tile) for tile in around.tolist()] if medium.clusters else ():
+        inside = (np.floor(position[:, [0, 2]] / TILE_MM) == [i, j]).all(axis=1)
+        parts.append((position[inside], strength[inside]))
+    position, strength = _joined(parts)
+    for sphere in medium.spheres:
+        inside = ((position - sphere.centre_mm) ** 2).sum(axis=1) < sphere.radius_mm**2
+        strength[inside] *= sphere.factor
+    present = np.flatnonzero(strength)
+    # By depth, so that neighbours meet the same part of the beam's table.
+    depth = (position[present, 1] - medium.depth_mm[0]) / _DEPTH_BIN_MM
+    present = present[np.argsort(depth.astype(np.int16), kind="stable")]
+    return position[present], strength[present]
 
 
 @lru_cache(_KEPT_TILES)
