@@ -187,7 +187,6 @@ def _recording(
         probe=settings.probe or own.get("probe") or device.text("TransducerName"),
         full_scale=own.get("full_scale", 255.0),
         assumptions=("parallel lines",) if layout.is_rf and not own else (),
-        rows=(("tracker of", " * ".join(chain) or "none", ""),),
         remarks=(*notes, *lost, *_remarks(header, settings, device, layout, poses)),
     )
 
