@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -278,22 +278,21 @@ def _image_to_probe(
 
 def _remarks(
     header: SequenceHeader, settings: ImportSettings, device: DeviceSet, layout: Layout, poses: Poses | None
-) -> list[str]:
+) -> Iterator[str]:
     """Tell what contradicts, and which poses were not used."""
-    count, notes = header.frame_count, list[str]()
+    count = header.frame_count
     if poses is None and names_of(header) and settings.tracker_transform is None:
-        notes.append(f"no tracker: the header's transforms are {lacking_poses(header.path)}")
+        yield f"no tracker: the header's transforms are {lacking_poses(header.path)}"
     if len(header.frames) not in (0, count):
-        notes.append(f"the header has fields of {len(header.frames)} frames for {count} images")
+        yield f"the header has fields of {len(header.frames)} frames for {count} images"
     if device.is_curved:
         is_picture = not (layout.is_rf or layout.has_lines_in_rows)
         what = "images are taken for scan-converted" if is_picture else "its lines spread"
-        notes.append(f"the device set calls the transducer {device.geometry}: {what}")
+        yield f"the device set calls the transducer {device.geometry}: {what}"
     if device.clip is not None and device.clip.is_part_of(header.size):
-        notes.append(f"the device set clips images for volumes, as `speckle3d volume` does: {device.clip}")
+        yield f"the device set clips images for volumes, as `speckle3d volume` does: {device.clip}"
     if header.is_volume:
-        notes.append("third axis is time, as the frame rate that is given says: by its Kinds it is in space")
-    return notes
+        yield "third axis is time, as the frame rate that is given says: by its Kinds it is in space"
 
 
 def _shown(lengths: Sequence[float]) -> str:

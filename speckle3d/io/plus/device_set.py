@@ -27,7 +27,7 @@ from speckle3d.io.hdf5 import reading
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.plus.transforms import Names, pixel_axes
 from speckle3d.io.readers import Reader
-from speckle3d.io.recordings import Recording, Row
+from speckle3d.io.recordings import Facts
 from speckle3d.io.text import numbers
 
 _PLACES = (".//CoordinateDefinitions/Transform", ".//CalibrationResults/Transform")
@@ -243,29 +243,28 @@ def read_device_set(path: PathLike) -> DeviceSet:
     return DeviceSet(str(path), root)
 
 
-def _open(path: Path, settings: ImportSettings) -> Recording:
+def _open(path: Path, _: ImportSettings) -> Facts:
+    """Tell what a document is; there is no sweep in it."""
     device = DeviceSet(str(path), read_xml(path))
-    tag = device.root.tag
-    if tag not in _DOCUMENTS:
-        raise InvalidInputError(f"{path}: expected a document of PLUS ({', '.join(_DOCUMENTS)}), got {tag}")
-    what, use = _DOCUMENTS[tag]
-    rows: list[Row] = [("content", what, "")]
-    if tag == "TemporalCalibrationResults":  # whose sign is the other way round: a lag is negative there
-        rows.append(
-            ("time offset of the tracker", f"{-vector(device.root, 'TrackerLagSec', 1)[0]:+.4f}", "s")
-        )
+    root = device.root
+    if root.tag not in _DOCUMENTS:
+        known = ", ".join(_DOCUMENTS)
+        raise InvalidInputError(f"{path}: expected a document of PLUS ({known}), got {root.tag}")
+    what, use = _DOCUMENTS[root.tag]
+    yield "content", what, ""
+    if root.tag == "TemporalCalibrationResults":  # whose sign is the other way round: a lag is negative there
+        yield "time offset of the tracker", f"{-vector(root, 'TrackerLagSec', 1)[0]:+.4f}", "s"
     if use == _CONFIG:
         pixel, transducer = device.pixel_mm(), f"{device.text('TransducerName')} {device.geometry}"
-        if device.root.find(".//PhantomDefinition/Geometry/Pattern/Wire") is not None:
+        for a, b in device.transforms:
+            yield f"{a} to {b}", "transform", ""
+        yield "pixel", "unknown" if pixel is None else " x ".join(f"{mm:.5f} mm" for mm in pixel), ""
+        yield "transducer", transducer.strip() or "not said", ""
+        yield "clip of volumes", str(device.clip or "none"), ""
+        if root.find(".//PhantomDefinition/Geometry/Pattern/Wire") is not None:
             use += ", --phantom of calibrate wires"
-        rows += [
-            *((f"{a} to {b}", "transform", "") for a, b in device.transforms),
-            ("pixel", "unknown" if pixel is None else " x ".join(f"{mm:.5f} mm" for mm in pixel), ""),
-            ("transducer", transducer.strip() or "not said", ""),
-            ("clip of volumes", str(device.clip or "none"), ""),
-        ]
-    fault = InvalidInputError(f"{path}: expected a recording, got {what} of PLUS, which is for {use}")
-    return Recording(path, settings, rows=(*rows, ("for", use, "")), fault=fault)
+    yield "for", use, ""
+    raise InvalidInputError(f"{path}: expected a recording, got {what} of PLUS, which is for {use}")
 
 
 def _claims(_: Path, start: bytes) -> bool:
