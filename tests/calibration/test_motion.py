@@ -2,18 +2,16 @@
 
 import numpy as np
 import pytest
-from calibration_examples import BEAM_DOWN, COLUMNS, PIXEL_MM, TRIAL_1, about, centre_of, scan_wires
+from calibration_examples import BEAM_DOWN, COLUMNS, PIXEL_MM, TRIAL_1, about, centre_of
 from scipy.spatial.transform import RigidTransform
 
 from calibration.motion import MOTIONS
 from calibration.orientation import calibrate_orientation
 from calibration.plane import calibrate_plane
 from calibration.points import ImagePoints
-from calibration.settings import OrientationFit
-from calibration.wires import calibrate_cross_wire
 from speckle3d.core.errors import InsufficientDataError
 
-FULL = {"tilt": 25.0, "roll": 15.0, "rotate": 25.0, "move": 11.0, "shift": 15.0}
+FULL = {"tilt": 25.0, "roll": 15.0, "rotate": 25.0, "move": 11.0}
 """What a hand does when told to: degrees, or mm, to both sides. Named by the first word of the advice."""
 
 
@@ -41,15 +39,8 @@ def calibrate_lines(moves):
     return calibrate_plane(lines_of(moves))
 
 
-def calibrate_directions(moves, level=False):
-    return calibrate_orientation(lines_of(moves, 100), PIXEL_MM, OrientationFit(level=level))
-
-
-def calibrate_dots(moves):
-    named = {"tilt_deg": "tilt", "roll_deg": "roll", "yaw_deg": "rotate"}
-    degrees = {name: moves.get(word, 0.0) for name, word in named.items()}
-    pixels, readings = scan_wires(np.random.default_rng(0), np.zeros((60, 3)), noise_mm=0.3, **degrees)
-    return calibrate_cross_wire(ImagePoints(pixels, np.arange(60), readings))
+def calibrate_directions(moves):
+    return calibrate_orientation(lines_of(moves, 100), PIXEL_MM)
 
 
 def advised(text):
@@ -61,7 +52,6 @@ def advised(text):
     [
         (calibrate_lines, ("tilt", "move")),
         (calibrate_directions, ("roll", "rotate")),
-        (calibrate_dots, ()),
     ],
 )
 def test_doing_as_told_cures_a_calibration(calibrate, done):

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from speckle3d.scoring.statistics import mean_interval
 from speckle3d.study.overall import over_sweeps
 
 
@@ -38,19 +37,6 @@ def of(records, quantity, *modes):
         if r["quantity"] == quantity and (r["mode"], r.get("against"))[: len(modes)] == modes
     ]
     return record
-
-
-def test_one_number_per_sweep_is_the_mean_magnitude_of_its_parts():
-    rows, drift = study(11)
-    intervals, _ = over_sweeps(rows, drift)
-    mean = of(intervals, "length_error_percent", "image")
-    expected = mean_interval([r["FDR_percent"] for r in drift if r["mode"] == "image"])
-    assert (mean["sweeps"], mean["mean"], mean["low"]) == (
-        11, pytest.approx(expected.mean), pytest.approx(expected.low),
-    )  # fmt: skip
-    # Quantities without a value are left out, those without scatter have no interval.
-    assert {r["quantity"] for r in intervals} & {"tilt_error_deg", "GLE_mm", "MD_mm"} == set()
-    assert of(intervals, "GPE_mm", "pose")["low"] is None
 
 
 def test_modes_that_differ_in_every_sweep_are_told_apart_and_like_ones_not():

@@ -49,12 +49,8 @@ def test_a_delay_is_found_within_two_milliseconds(kind):
 
 def test_what_tells_no_one_delay_is_refused():
     signal, frames, poses, _ = recorded(0, noise_mm=0.01, jitter_mm=0.01)
-    wave = 8.0 * np.sin(2 * np.pi * 4.0 * frames)
-    swing = 8.0 * np.sin(2 * np.pi * 4.0 * (poses.time_s + DELAY_S))
-    periodic = TimedPoses(poses.time_s, RigidTransform.from_translation(np.outer(swing, [0.0, 0.0, 1.0])))
     other = recorded(50, noise_mm=0.01)[0]
     for arguments in (
-        (np.column_stack([25.0 - wave, 0.0 * wave]), frames, periodic),  # two delays alike
         (other, frames, poses),  # of another motion
         (signal, frames, poses, 0.0, 0.05),  # beyond the range searched
     ):

@@ -57,13 +57,3 @@ def test_volume_labels_outlines_and_pose_are_at_one_place(folder):
     pose = SimpleITK.ReadTransform(str(folder / "first-frame-image.tfm"))
     inside = pose.TransformPoint(posed.world_from_image[0].apply([1.0, 2.0, 0.0]).tolist())
     np.testing.assert_allclose(inside, [1.0, 2.0, 0.0], atol=1e-9)
-
-
-def test_a_scene_replaces_a_scene_with_all_its_files(tmp_path):
-    target = tmp_path / "s"
-    write_scene(target, [posed_sweep("image"), posed_sweep("pose")], REQUEST, with_images=True)
-    (target / "volume-crop.nrrd").write_bytes(b"somebody's own")
-    write_scene(target, [posed_sweep("image")], REQUEST)
-    (target / "volume-crop.nrrd").unlink()
-    stems = ("first-frame", "outlines", "scene", "state", "volume")
-    assert sorted(path.name.split(".")[0].removesuffix("-image") for path in target.iterdir()) == [*stems]
