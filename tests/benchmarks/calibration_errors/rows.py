@@ -22,10 +22,10 @@ class Row:
 def coverage_row(case, ratio):
     """Coverage of 68 % and 95 % intervals by errors over claims, against 62 to 74 and 92 to 98 %.
 
-    It is missed where it is outside by two standard errors: few trials tell little.
+    It is missed where it is outside by two standard errors of so many figures: few trials tell little.
     """
     shares = np.array([np.mean(np.abs(ratio) < limit) for limit in (1.0, 1.96)])
-    slack = 2.0 * np.sqrt(np.array([0.68 * 0.32, 0.95 * 0.05]) / len(ratio))
+    slack = 2.0 * np.sqrt(np.array([0.68 * 0.32, 0.95 * 0.05]) / ratio.size)
     found = "{:.0f} / {:.0f} %".format(*(100.0 * shares))
     found += f", RMS z {np.sqrt(np.mean(ratio**2)):.2f}, {ratio.size} figures of {len(ratio)} trials"
     reached = (shares >= np.array([0.62, 0.92]) - slack) & (shares <= np.array([0.74, 0.98]) + slack)
