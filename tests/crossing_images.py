@@ -2,9 +2,9 @@
 
 Two thin, slightly bent wires are met by a beam that is thickest away from its focus: each is bright where it
 lies in the beam and across it, so that a frame shows an X, one long line with a short faint one on it, or two
-short strokes. Each point of a wire is blurred by pulse and beam. Added are
-speckle, scatterers fixed in the phantom, the skin's reverberations, a step of gain, compression to 8 bits
-and lettering. Nothing is drawn by a line filter.
+short strokes. Each point of a wire is blurred by pulse and beam and leaves an arc of side lobes. Added are
+speckle, scatterers fixed in the phantom, the skin's reverberations, a step of gain, compression to 8 bits,
+scan conversion of a linear or convex probe, and a scanner's lettering. Nothing is drawn by a line filter.
 """
 
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ STEP_MM = 0.1
 
 @dataclass(frozen=True)
 class Probe:
-    """What the scanner shows by a linear array.
+    """What the scanner shows: `radius_mm` is infinite for a linear array.
 
     Attributes
     ----------
@@ -29,7 +29,7 @@ class Probe:
     corner_px : ndarray, shape (2,)
         Where the array's middle is in it.
     width_mm : float
-        Length of the array.
+        Length of the array, or of its arc.
     """
 
     shape: tuple[int, int]
@@ -37,12 +37,18 @@ class Probe:
     corner_px: np.ndarray
     depth_mm: float
     width_mm: float
+    radius_mm: float
     beams: int
     samples: int
 
     def beam_range(self, x, y):
         """Number of the beam and of the sample at points in mm from the array's middle."""
-        return (x / self.width_mm + 0.5) * (self.beams - 1), y / self.depth_mm * (self.samples - 1)
+        if np.isinf(self.radius_mm):
+            across, depth = x, y
+        else:
+            across = self.radius_mm * np.arctan2(x, y + self.radius_mm)
+            depth = np.hypot(x, y + self.radius_mm) - self.radius_mm
+        return (across / self.width_mm + 0.5) * (self.beams - 1), depth / self.depth_mm * (self.samples - 1)
 
     def from_image(self, pixels):
         """Points in mm from the array's middle."""
@@ -77,24 +83,38 @@ class World:
 
 
 def random_probe(rng):
-    """A linear probe in a video frame."""
+    """A linear or convex probe in a video frame."""
     shape = [(640, 480), (400, 400), (512, 512), (576, 432)][rng.integers(4)]
-    depth, width = rng.uniform(40, 90), rng.uniform(38, 52)
-    pixel = max(depth / (rng.uniform(0.82, 1.0) * shape[1]), width / (1.15 * shape[0]))
+    if rng.random() < 0.5:
+        depth, width, radius = rng.uniform(40, 90), rng.uniform(38, 52), np.inf
+        extent = width, depth
+    else:
+        depth, radius = rng.uniform(70, 150), rng.uniform(40, 60)
+        angle = np.deg2rad(rng.uniform(55, 72))
+        width = radius * angle
+        extent = 2 * np.sin(angle / 2) * (radius + depth), depth + 2.0
+    fill = rng.uniform(0.82, 1.0)
+    pixel = max(extent[1] / (fill * shape[1]), extent[0] / (1.15 * shape[0]))
     size = pixel * np.array([rng.uniform(0.95, 1.05), 1.0])
     corner = np.array([shape[0] * rng.uniform(0.47, 0.53), rng.uniform(0.0, 0.06) * shape[1]])
-    return Probe(shape, size, corner, depth, width, 160, min(700, int(depth / 0.12)))
+    return Probe(shape, size, corner, depth, width, radius, 160, min(700, int(depth / 0.12)))
 
 
 def random_look(rng, probe):
-    """Settings of a scanner and a phantom; decibels are relative to a wire across."""
+    """Settings of a scanner and a phantom; decibels are relative to a wire across.
+
+    The floor of its bath, so far beyond the crossing, is a long line that wires seem to cross, too.
+    """
     deep = probe.depth_mm / 80.0
     return SimpleNamespace(
         elevation_mm=rng.uniform(0.7, 1.2) * deep**0.5,
         focus_mm=rng.uniform(0.3, 0.7) * probe.depth_mm,
         spread_mm=rng.uniform(0.3, 0.6) * probe.depth_mm,
         pulse_mm=rng.uniform(0.2, 0.45) * deep**0.5,
-        beam_mm=rng.uniform(0.4, 0.9) * deep**0.5,
+        # Along the array: a convex one's beams spread by the angle of wavelength over aperture, 0.02 rad.
+        beam_mm=rng.uniform(0.4, 0.9) * (deep**0.5 if np.isinf(probe.radius_mm) else 0.7),
+        lobes_db=rng.uniform(-38, -16),
+        lobes_mm=rng.uniform(6, 20),
         slope_db=rng.uniform(3, 10),
         speckle_db=rng.uniform(-42, -20),
         noise_db=rng.uniform(-50, -38),
@@ -104,7 +124,11 @@ def random_look(rng, probe):
         skin_mm=rng.uniform(2, 9),
         points_per_cm3=np.exp(rng.uniform(np.log(0.1), np.log(4.0))),
         points_db=rng.uniform(-14, 7),
+        tail=rng.uniform(0.0, 0.35),
         faint_db=rng.uniform(-9, 0),
+        lettering=bool(rng.random() < 0.8),
+        floor_db=rng.uniform(-15, 8) if rng.random() < 0.4 else -np.inf,
+        floor_mm=rng.uniform(0.15, 0.6) * probe.depth_mm,
     )
 
 
@@ -127,11 +151,14 @@ def crossing_world(seed, frames=54):
     best = int(np.argmax([one.sum() for one in seen]))
     wires = _wires(rng, base, centre, drawn[best])
     points = _scatterers(rng, look, centre)
-    texture, letters = _skin(rng, probe, look), _lettering(rng, probe)
-    frames = (_frame(rng, probe, look, pose, wires, points, texture) for pose in world_from_image)
-    images = np.stack([np.maximum(frame, letters.astype(np.uint8)) for frame in frames])
+    letters = _lettering(rng, probe) if look.lettering else None
+    floor = centre + base.apply([0.0, look.floor_mm, 0.0]), base.apply([0.0, 1.0, 0.0])
+    texture = _skin(rng, probe, look)
+    images = np.stack(
+        [_frame(rng, probe, look, pose, wires, points, floor, texture, letters) for pose in world_from_image]
+    )
     mounting = RigidTransform.from_components(rng.uniform(-120, 120, 3), Rotation.random(rng=rng))
-    readings = world_from_image * mounting.inv() * _errors(rng, len(images))
+    readings = world_from_image * mounting.inv() * _errors(rng, frames)
     shown = (np.abs(away) < 1.2 * look.elevation_mm) & probe.inside(pixels) & seen[best]
     return World(images, probe.pixel_mm, readings, pixels, shown, mounting)
 
@@ -156,7 +183,13 @@ def _places(rng, probe, where):
     """Pixels at these parts of the picture, some near its edges."""
     depth = (0.12 + 0.82 * where[:, 1]) * probe.depth_mm
     across = (where[:, 0] - 0.5) * 0.96 * probe.width_mm
-    return np.column_stack([across, depth]) / probe.pixel_mm + probe.corner_px
+    if np.isinf(probe.radius_mm):
+        place = np.column_stack([across, depth])
+    else:
+        angle = across / probe.radius_mm
+        r = probe.radius_mm + depth
+        place = np.column_stack([r * np.sin(angle), r * np.cos(angle) - probe.radius_mm])
+    return place / probe.pixel_mm + probe.corner_px
 
 
 def _directions(rng):
@@ -173,9 +206,10 @@ def _both_seen(probe, look, pixels, turns, along):
 
     They must be 20 degrees apart, or both be strokes shorter than 8 mm.
     """
-    y = probe.from_image(pixels)[:, 1]
+    x, y = probe.from_image(pixels).T
+    beam = (0.0, 1.0) if np.isinf(probe.radius_mm) else _unit(x, y + probe.radius_mm)
     in_image = np.stack([turns.inv().apply(one) for one in along])
-    level = _slope_loss_db(look, in_image) + np.array([[0.0], [look.faint_db]])
+    level = _slope_loss_db(look, in_image, beam) + np.array([[0.0], [look.faint_db]])
     flat = in_image[..., :2] / np.linalg.norm(in_image[..., :2], axis=2, keepdims=True)
     apart = np.abs(np.sum(flat[0] * flat[1], axis=1)) < np.cos(np.deg2rad(20))
     short = 2.0 * look.elevation_mm / np.tan(np.arcsin(np.abs(in_image[..., 2]))) < 4.0
@@ -185,9 +219,10 @@ def _both_seen(probe, look, pixels, turns, along):
     return clear & (apart | short.all(axis=0))
 
 
-def _slope_loss_db(look, along):
+def _slope_loss_db(look, along, beam):
     """Level of a wire's echo relative to one across the beam; 45 degrees cost `slope_db`."""
-    return -look.slope_db * (np.arcsin(np.clip(np.abs(along[..., 1]), 0, 1)) / (np.pi / 4)) ** 2
+    sine = np.abs(along[..., 0] * beam[0] + along[..., 1] * beam[1])
+    return -look.slope_db * (np.arcsin(np.clip(sine, 0, 1)) / (np.pi / 4)) ** 2
 
 
 def _wires(rng, base, centre, along):
@@ -213,7 +248,7 @@ def _scatterers(rng, look, centre):
     return places, size * np.exp(2j * np.pi * rng.random(count))
 
 
-def _frame(rng, probe, look, world_from_image, wires, points, skin):
+def _frame(rng, probe, look, world_from_image, wires, points, floor, skin, letters):
     echoes = np.zeros((probe.beams, probe.samples), complex)
     into = world_from_image.inv()
     faint = 10 ** (look.faint_db / 20.0)
@@ -223,16 +258,19 @@ def _frame(rng, probe, look, world_from_image, wires, points, skin):
         grain /= grain.std()
         amplitude = 1.0 + 0.35 * (grain[0] + 1j * grain[1])
         x, y = probe.from_image(place[:, :2] / probe.pixel_mm).T
-        loss = 10 ** (_slope_loss_db(look, direction) / 20.0)
+        beam = (0.0, 1.0) if np.isinf(probe.radius_mm) else _unit(x, y + probe.radius_mm)
+        loss = 10 ** (_slope_loss_db(look, direction, beam) / 20.0)
         weight = (faint if number else 1.0) * amplitude * loss * STEP_MM / 0.6
         _splat(echoes, probe, x, y, weight * _met(look, y, place[:, 2]))
     place = into.apply(points[0])
     near = np.abs(place[:, 2]) < 6 * look.elevation_mm
     x, y = probe.from_image(place[near, :2] / probe.pixel_mm).T
     _splat(echoes, probe, x, y, points[1][near] * _met(look, y, place[near, 2]))
+    if np.isfinite(look.floor_db):
+        _splat(echoes, probe, *_floor(rng, probe, look, into.apply(floor[0]), into.rotation.apply(floor[1])))
     speckle = rng.standard_normal((2, *echoes.shape))
-    seen = _blurred(probe, look, echoes)
-    grains = _blurred(probe, look, speckle[0] + 1j * speckle[1])
+    seen = _blurred(probe, look, echoes, lobes=True)
+    grains = _blurred(probe, look, speckle[0] + 1j * speckle[1], lobes=False)
     grains *= 10 ** (look.speckle_db / 20.0) / np.sqrt(np.mean(np.abs(grains) ** 2))
     hiss = rng.standard_normal((2, *echoes.shape)) * 10 ** (look.noise_db / 20.0)
     depth = np.linspace(0, 1, probe.samples)
@@ -246,7 +284,26 @@ def _frame(rng, probe, look, world_from_image, wires, points, skin):
     beam, sample = probe.beam_range(*np.moveaxis(probe.from_image(pixels), 2, 0))
     picture = map_coordinates(grey, [beam, sample], order=1, cval=0.0)
     picture = np.clip(picture + rng.normal(0, 1.0, picture.shape) * (picture > 0), 0, 255)
+    if letters is not None:
+        picture = np.maximum(picture, letters)
     return picture.astype(np.uint8)
+
+
+def _floor(rng, probe, look, place, normal):
+    """Points where the image meets a plane, and their amplitudes: a mirror, weak where met aslant."""
+    across = np.array([-normal[1], normal[0]]) / np.hypot(*normal[:2])
+    place = probe.from_image(place[:2] / probe.pixel_mm) - place[2] * np.array([0, normal[2]])
+    t = np.arange(-120, 120, STEP_MM)[:, None]
+    x, y = (place + t * across).T
+    beam = (0.0, 1.0) if np.isinf(probe.radius_mm) else _unit(x, y + probe.radius_mm)
+    aslant = np.arccos(np.clip(np.abs(beam[0] * normal[0] + beam[1] * normal[1]), 0, 1))
+    grain = 1.0 + 0.4 * gaussian_filter1d(rng.standard_normal(len(x)), 8) / 0.19
+    return x, y, grain * 10 ** ((look.floor_db - 18 * (aslant / 0.5) ** 2) / 20.0) * STEP_MM / 0.6
+
+
+def _unit(x, y):
+    length = np.hypot(x, y)
+    return x / length, y / length
 
 
 def _met(look, y, z):
@@ -264,16 +321,41 @@ def _splat(echoes, probe, x, y, weight):
         np.add.at(echoes, (b + i, s + j), w * np.where(i, fb, 1 - fb) * np.where(j, fs, 1 - fs))
 
 
-def _blurred(probe, look, echoes):
-    """Pulse and beam, wider away from the focus, of unit peak for one point."""
+def _blurred(probe, look, echoes, lobes):
+    """Pulse, tail, beam (wider away from the focus) and arcs of side lobes, of unit peak for one point."""
     pitch, spacing = probe.width_mm / (probe.beams - 1), probe.depth_mm / (probe.samples - 1)
     pulse = max(look.pulse_mm / spacing, 0.6)
     out = gaussian_filter1d(echoes, pulse, axis=1) * np.sqrt(2 * np.pi) * pulse
+    if lobes and look.tail > 0.05:
+        late, gap = np.zeros_like(out), round(3.5 * pulse)
+        for k in range(1, 4):
+            late[:, k * gap :] += look.tail**k * out[:, : -k * gap]
+        out = out + late
     depth = np.linspace(0, probe.depth_mm, probe.samples)
     narrow = look.beam_mm / pitch
     thin, wide = (gaussian_filter1d(out, w, axis=0) * np.sqrt(2 * np.pi) * w for w in (narrow, 1.8 * narrow))
     mix = np.clip(np.abs(depth - look.focus_mm) / (2.0 * look.spread_mm), 0, 1)
-    return (1 - mix) * thin + mix * wide / 1.5
+    beam = (1 - mix) * thin + mix * wide / 1.5
+    if not lobes:
+        return beam
+    reach = int(look.lobes_mm / pitch)
+    arcs = np.zeros_like(beam)
+    for step in range(-reach, reach + 1, 2):
+        shape = (
+            np.cos(np.pi * step / (2 * reach + 1)) * (0.6 + 0.4 * np.cos(step * 1.3)) * (-1) ** (step // 2)
+        )
+        moved = np.zeros_like(out)
+        if step >= 0:
+            moved[step:] = out[: len(out) - step]
+        else:
+            moved[:step] = out[-step:]
+        # An echo from the side comes late: a linear array's arcs bend down.
+        if np.isinf(probe.radius_mm):
+            late = round((step * pitch) ** 2 / (2 * 0.5 * probe.depth_mm) / spacing)
+            moved[:, late:] = moved[:, : probe.samples - late].copy()
+            moved[:, :late] = 0
+        arcs += shape * moved
+    return beam + 10 ** (look.lobes_db / 20.0) * arcs
 
 
 def _skin(rng, probe, look):
