@@ -164,19 +164,19 @@ def _volume_rows(path: PathLike) -> Iterator[Row]:
 
 
 def _curves_rows(path: PathLike) -> Iterator[Row]:
-    held = curves.read_curves(path)
-    half = [np.interp(-0.5, -row, held.distance_mm) for row in held.correlation]
-    yield "probe", held.key.probe or "not named", ""
-    yield "origin", held.origin, ""
-    yield from _signal_rows(held.key.signal)
-    yield number_row("vector_pitch_mm", held.key.vector_pitch_mm)
-    yield "patches", f"{held.key.patch_width_mm:g} x {held.key.patch_height_mm:g}", "mm"
-    yield "correlation of", held.key.correlation_of, ""
-    yield "depths", f"{held.depth_mm.size}, {held.depth_mm[0]:.1f} to {held.depth_mm[-1]:.1f}", "mm"
-    yield "distances", f"up to {held.distance_mm[-1]:.2f}", "mm"
+    record = curves.read_curves(path)
+    half = [np.interp(-0.5, -row, record.distance_mm) for row in record.correlation]
+    yield "probe", record.key.probe or "not named", ""
+    yield "origin", record.origin, ""
+    yield from _signal_rows(record.key.signal)
+    yield number_row("vector_pitch_mm", record.key.vector_pitch_mm)
+    yield "patches", f"{record.key.patch_width_mm:g} x {record.key.patch_height_mm:g}", "mm"
+    yield "correlation of", record.key.correlation_of, ""
+    yield "depths", f"{record.depth_mm.size}, {record.depth_mm[0]:.1f} to {record.depth_mm[-1]:.1f}", "mm"
+    yield "distances", f"up to {record.distance_mm[-1]:.2f}", "mm"
     yield "correlation halves at", f"{min(half):.2f} to {max(half):.2f}", "mm"
-    yield "frame pairs", str(held.pairs_used), ""
-    yield "lengths read with them, 95 %", f"+- {196 * held.scale_sigma:.1f}", "%"
+    yield "frame pairs", str(record.pairs_used), ""
+    yield "lengths read with them, 95 %", f"+- {196 * record.scale_sigma:.1f}", "%"
 
 
 _TELL: dict[str, Callable[[PathLike], Iterator[Row]]] = {

@@ -65,14 +65,14 @@ def read_tum(path: PathLike, length_unit: LengthUnit | None = None) -> TimedPose
     """
     lines = [text for _, text in text_lines(path)]
     comments = {word for text in lines if text.startswith("#") for word in text.split()}
-    said = next((unit for unit in _MM_PER_UNIT if f"x_{unit}" in comments), length_unit or "m")
+    unit = next((unit for unit in _MM_PER_UNIT if f"x_{unit}" in comments), length_unit or "m")
     table = np.array([_eight(text) for text in lines if not text.startswith("#")]).reshape(-1, _COLUMNS)
     finite = np.isfinite(table).all(axis=1)
     if 2 * np.count_nonzero(finite) <= len(table):
         got = f"{np.count_nonzero(finite)} of {len(table)}"
         raise InvalidInputError(f"{path}: expected lines of eight finite numbers, got {got}")
-    if said != (length_unit or said):
-        raise InvalidInputError(f"{path}: expected lengths in {length_unit}, got a file that says {said}")
+    if unit != (length_unit or unit):
+        raise InvalidInputError(f"{path}: expected lengths in {length_unit}, got a file that says {unit}")
     sound = np.abs(np.linalg.norm(table[:, 4:], axis=1) - 1.0) <= _UNIT_TOLERANCE
     words = np.where(finite, np.where(sound, "", "without a unit quaternion"), "that are not eight numbers")
     rows, notes = usable(f"{path}: poses", table[:, 0], words.tolist())
@@ -81,7 +81,7 @@ def read_tum(path: PathLike, length_unit: LengthUnit | None = None) -> TimedPose
     for note in notes:
         warnings.warn(note, stacklevel=2)
     time_s, places, turns = np.split(table[rows], [1, 4], axis=1)
-    poses = RigidTransform.from_components(_MM_PER_UNIT[said] * places, Rotation.from_quat(turns))
+    poses = RigidTransform.from_components(_MM_PER_UNIT[unit] * places, Rotation.from_quat(turns))
     return TimedPoses(time_s[:, 0], poses)
 
 

@@ -2,7 +2,7 @@
 
 Header: five uint32 (id, frames, lines, samples of a line, bytes of a sample); then, by frame, a uint64 time
 in nanoseconds and its samples, line by line; all little-endian [1]_. They may be packed by the program lzop,
-whose blocks lzallright unpacks [2]_: a packed file is held unpacked in memory while its frames are read.
+whose blocks lzallright unpacks [2]_: a packed file is content unpacked in memory while its frames are read.
 
 References
 ----------
@@ -34,7 +34,7 @@ SAMPLES = {"RF": ("<i2", 1, np.int16), "IQ": ("<i2", 2, np.complex64), "envelope
 """By kind: type of the numbers in the file, how many make a sample, and type of the samples."""
 
 
-def open_raw(member: Member, said: Description) -> npt.NDArray[Any]:
+def open_raw(member: Member, yml: Description) -> npt.NDArray[Any]:
     """Frames as they lie in a raw file: ``time`` in ns and ``samples``, shape (line, sample, part).
 
     Raises
@@ -44,30 +44,30 @@ def open_raw(member: Member, said: Description) -> npt.NDArray[Any]:
     InvalidInputError
         If its header contradicts the yml.
     """
-    held, (dtype, parts, _) = _content(member), SAMPLES[said.kind]
-    size = said.size.lines, said.size.samples
-    expected = (said.frames, *size, parts * np.dtype(dtype).itemsize)
-    got = HEADER.unpack(bytes(held[: HEADER.size]).ljust(HEADER.size, b"\0"))[1:]
+    content, (dtype, parts, _) = _content(member), SAMPLES[yml.kind]
+    size = yml.size.lines, yml.size.samples
+    expected = (yml.frames, *size, parts * np.dtype(dtype).itemsize)
+    got = HEADER.unpack(bytes(content[: HEADER.size]).ljust(HEADER.size, b"\0"))[1:]
     if got != expected or 0 in got:
         raise InvalidInputError(
-            f"{member.where}: header: expected frames, lines, samples and bytes of a sample of {said.kind} "
+            f"{member.where}: header: expected frames, lines, samples and bytes of a sample of {yml.kind} "
             f"as in the yml, {expected}, got {got}"
         )
     with reading(member.where):  # of more samples than memory has places for
         record = np.dtype([("time", "<u8"), ("samples", dtype, (*size, parts))])
-    whole = (len(held) - HEADER.size) // record.itemsize
-    if whole < said.frames:
-        raise FileError(f"{member.where}: ends early: {whole} of {said.frames} frames")
-    return np.frombuffer(held, record, said.frames, HEADER.size)
+    whole = (len(content) - HEADER.size) // record.itemsize
+    if whole < yml.frames:
+        raise FileError(f"{member.where}: ends early: {whole} of {yml.frames} frames")
+    return np.frombuffer(content, record, yml.frames, HEADER.size)
 
 
-def open_frames(member: Member, said: Description, turns: ComplexArray | None = None) -> ReadFrame:
+def open_frames(member: Member, yml: Description, turns: ComplexArray | None = None) -> ReadFrame:
     """Map or unpack a raw file, whose I/Q are multiplied by `turns`, shape (sample,)."""
-    samples = open_raw(member, said)["samples"]
+    samples = open_raw(member, yml)["samples"]
 
     def frame(i: int) -> Any:
         parts = samples[i]
-        echoes = (parts.astype(np.float32).view(np.complex64) if said.kind == "IQ" else parts)[..., 0]
+        echoes = (parts.astype(np.float32).view(np.complex64) if yml.kind == "IQ" else parts)[..., 0]
         return echoes if turns is None else echoes * turns
 
     return frame
@@ -94,12 +94,12 @@ def _unpacked(member: Member, _: int) -> bytes:
     plain, packs = (sum(bool(flags & bit) for bit in bits) for bits in ((0x1, 0x100), (0x2, 0x200)))
     check = zlib.adler32 if flags & 0x1 else zlib.crc32
     while any((lengths := content[at : at + 12].ljust(12, b"\0"))[:4]):
-        unpacked_size, size, said = struct.unpack(">III", lengths)
+        unpacked_size, size, check_sum = struct.unpack(">III", lengths)
         at += 8 + 4 * (plain + (packs if size < unpacked_size else 0))  # behind the check sums
         with reading(f"{member.where}: block {len(parts)}", Exception):
             part = content[at : at + size]
             parts.append(part if size == unpacked_size else bytes(lzo.decompress(part, unpacked_size)))
-            if plain and check(parts[-1]) != said:
+            if plain and check(parts[-1]) != check_sum:
                 raise ValueError("damaged: its check sum is another")
         at += size
     return b"".join(parts)

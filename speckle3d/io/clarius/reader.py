@@ -86,36 +86,36 @@ def open_package(path: Path, settings: ImportSettings) -> Facts:
     described = {kind: validated(fields[kind], files.yml[kind].where, Description) for kind in files.raw}
     kind = min(files.raw, key=lambda kind: _ORDER.index(described[kind].kind))
     yield "sweep is made from", kind, ""
-    said = described[kind]
+    yml = described[kind]
     member, turns = files.raw[kind], None
-    records = open_raw(member, said)
+    records = open_raw(member, yml)
     with naming(files.yml[kind].where):
-        elements = _elements(said)
+        elements = _elements(yml)
         per_line = step_of(elements, "lines (packets of a Doppler mode are no image): rx element")
     yield "first line at element", f"{elements[0]:g}, taken as the image's left", ""
 
-    rate_hz = settings.sampling_rate_hz or said.rate_hz
-    speed_m_s = settings.speed_of_sound_m_s or said.speed_m_s or SPEED_OF_SOUND_M_S
+    rate_hz = settings.sampling_rate_hz or yml.rate_hz
+    speed_m_s = settings.speed_of_sound_m_s or yml.speed_m_s or SPEED_OF_SOUND_M_S
     spacing_mm, first_mm = 1e3 * speed_m_s / (2.0 * rate_hz), None
     # Less than a sample above the array is 0: the delay is a whole number of samples.
-    if said.delay is not None and (after := said.delay - BEFORE_DEPTH_S * rate_hz) > -1.0:
+    if yml.delay is not None and (after := yml.delay - BEFORE_DEPTH_S * rate_hz) > -1.0:
         first_mm = max(after, 0.0) * spacing_mm
-    probe, pitch = settings.probe or said.probe.model, _pitch(said, per_line, settings)
-    spreading = _spreading(said, elements[[0, -1]], per_line, pitch, probe)
+    probe, pitch = settings.probe or yml.probe.model, _pitch(yml, per_line, settings)
+    spreading = _spreading(yml, elements[[0, -1]], per_line, pitch, probe)
     values = {
         "first_sample_depth_mm": Value(first_mm, "delay samples, less 1 us before depth 0 (assumed)", _OWN),
         "vector_pitch_mm": pitch,
         "row_spacing_mm": Value(spacing_mm, f"of {rate_hz / 1e6:g} MHz", _OWN),
-        "sampling_rate_hz": Value(said.rate_hz, "", _OWN),
-        "centre_frequency_hz": Value(said.sent_hz, "transmit frequency", _OWN),
-        **({} if said.speed_m_s is None else {"speed_of_sound_m_s": Value(said.speed_m_s, "", _OWN)}),
+        "sampling_rate_hz": Value(yml.rate_hz, "", _OWN),
+        "centre_frequency_hz": Value(yml.sent_hz, "transmit frequency", _OWN),
+        **({} if yml.speed_m_s is None else {"speed_of_sound_m_s": Value(yml.speed_m_s, "", _OWN)}),
         **spreading,
     }
-    shift_hz = settings.demodulation_frequency_hz if said.kind == "IQ" else None
-    if said.kind == "IQ" and said.receive is not None:
-        shallow_hz, deep_hz, filter_mm = said.receive
+    shift_hz = settings.demodulation_frequency_hz if yml.kind == "IQ" else None
+    if yml.kind == "IQ" and yml.receive is not None:
+        shallow_hz, deep_hz, filter_mm = yml.receive
         start_mm = first_mm or settings.first_sample_depth_mm or 0.0
-        depths_mm = start_mm + spacing_mm * np.arange(said.size.samples)
+        depths_mm = start_mm + spacing_mm * np.arange(yml.size.samples)
         slid_hz = np.interp(depths_mm, [0.0, filter_mm], [shallow_hz, deep_hz])
         middle_hz = float(np.interp(depths_mm[[0, -1]].mean(), depths_mm, slid_hz))
         values["demodulation_frequency_hz"] = Value(middle_hz, "of the lines' middle", _OWN)
@@ -131,11 +131,11 @@ def open_package(path: Path, settings: ImportSettings) -> Facts:
                 f"over {filter_mm:g} mm, turned to that of the line's middle"
             )
         shift_hz = middle_hz if shift_hz is None else shift_hz
-    narrow = np.int16 if said.kind == "IQ" and turns is None else None
-    source, shape = partial(open_frames, member, said, turns), records["samples"].shape[:3]
-    frames = FileFrames(member.path, source, shape, SAMPLES[said.kind][2], narrow)
-    sent_hz, band = settings.centre_frequency_hz or said.sent_hz, None
-    is_known = said.kind == "RF" or (said.kind == "IQ" and shift_hz is not None)
+    narrow = np.int16 if yml.kind == "IQ" and turns is None else None
+    source, shape = partial(open_frames, member, yml, turns), records["samples"].shape[:3]
+    frames = FileFrames(member.path, source, shape, SAMPLES[yml.kind][2], narrow)
+    sent_hz, band = settings.centre_frequency_hz or yml.sent_hz, None
+    is_known = yml.kind == "RF" or (yml.kind == "IQ" and shift_hz is not None)
     if settings.bandwidth_hz is None and sent_hz and is_known:
         band = band_hz(frames, rate_hz, sent_hz, shift_hz)
     if band is not None:
@@ -179,9 +179,9 @@ def package_files(path: Path) -> Sequence[Path]:
     return sorted({member.path for member in (*files.raw.values(), *files.yml.values())} - {path})
 
 
-def _elements(said: Description) -> FloatArray:
+def _elements(yml: Description) -> FloatArray:
     """Elements at which the lines are received; lines that are steered are refused."""
-    elements, angle_deg = said.places.T
+    elements, angle_deg = yml.places.T
     if (steered := np.flatnonzero(angle_deg)).size:
         raise InvalidInputError(
             f"lines[{steered[0]}]: angle: expected 0 (lines that are not steered), got "
@@ -191,12 +191,12 @@ def _elements(said: Description) -> FloatArray:
     return np.asarray(elements)
 
 
-def _pitch(said: Description, per_line: float, settings: ImportSettings) -> Value:
+def _pitch(yml: Description, per_line: float, settings: ImportSettings) -> Value:
     """Distance between lines at the array, mm: of the elements' as given, by the yml, or a table's."""
-    model = _model(settings.probe or said.probe.model)
+    model = _model(settings.probe or yml.probe.model)
     pitches = {
         "as given": settings.element_pitch_mm,
-        _OWN: said.probe.pitch,
+        _OWN: yml.probe.pitch,
         f"the maker's table, {model}": ELEMENT_PITCH_MM.get(model),
     }
     for source, element_mm in pitches.items():
@@ -207,10 +207,10 @@ def _pitch(said: Description, per_line: float, settings: ImportSettings) -> Valu
 
 
 def _spreading(
-    said: Description, ends: FloatArray, per_line: float, pitch: Value, probe: str
+    yml: Description, ends: FloatArray, per_line: float, pitch: Value, probe: str
 ) -> dict[str, Value]:
     """Where the lines of a curved array lie; of a curved model without its radius, that it is lacking."""
-    radius_mm, elements = said.probe.radius, said.probe.elements
+    radius_mm, elements = yml.probe.radius, yml.probe.elements
     if not radius_mm and not _model(probe).startswith(CONVEX):
         return {}
     angles = Value()

@@ -147,14 +147,14 @@ def _place(header: Any) -> Generator[Row, None, tuple[tuple[slice, slice], dict[
         sizes = zip(("row_spacing_mm", "column_pitch_mm"), spacing, strict=False)
         return (slice(None), slice(None)), {name: Value(mm or None, "PixelSpacing") for name, mm in sizes}
     chosen = []
-    for one in regions:
-        kind, box = _numbers(one, *_KIND), [int(number) for number in _numbers(one, *_BOX)]
+    for candidate in regions:
+        kind, box = _numbers(candidate, *_KIND), [int(number) for number in _numbers(candidate, *_BOX)]
         name = (
             "2-D tissue" if kind == _TISSUE else "RegionSpatialFormat {:g}, RegionDataType {:g}".format(*kind)
         )
         place = "columns {0} to {2}, rows {1} to {3}".format(*box)
         yield f"region {'read' if kind == _TISSUE else 'left out'}", f"{name} ({place})", ""
-        chosen += [(one, box)] if kind == _TISSUE else []
+        chosen += [(candidate, box)] if kind == _TISSUE else []
     if len(chosen) != 1:
         raise InvalidInputError(f"expected one region of 2-D tissue, got {len(chosen)} of {len(regions)}")
     region, (left, top, right, bottom) = chosen[0]
@@ -203,13 +203,13 @@ def _clock(header: Any, count: int) -> tuple[FloatArray | None, Value, tuple[str
     with _reading("frame times"):
         steps = np.ravel(np.asarray(header.get("FrameTimeVector") or [], dtype=float))
         numbers = {name: float(header.get(name) or 0.0) for name in _RATES}
-    said = [
+    rates = [
         (1e3 / number if name == "FrameTime" else number, name)
         for name, number in numbers.items()
         if 0 < number < np.inf
     ]
-    others = [f"{name} says {rate:.4g}" for rate, name in said[1:2] if differs(said[0][0], rate)]
-    rate = Value(said[0][0], ", ".join([said[0][1], *others])) if said else Value()
+    others = [f"{name} says {rate:.4g}" for rate, name in rates[1:2] if differs(rates[0][0], rate)]
+    rate = Value(rates[0][0], ", ".join([rates[0][1], *others])) if rates else Value()
     steps = steps[int(steps.size == count) :]  # the first of as many as there are frames is 0
     if steps.size == count - 1 and np.isfinite(steps).all():
         return np.cumsum([0.0, *steps]) / 1e3, rate, ()

@@ -72,11 +72,11 @@ def open_matlab(path: Path, settings: ImportSettings) -> Facts:
         raise InvalidInputError(f"{where}: expected {', '.join(sorted(_ROLES))}, axes, got {unknown[0]}")
     data = next((data for data in _DATA if {*data} == _ROLES & {*arrays}), None)
     if data is None:
-        held = ", ".join(map(" ".join, shown))
+        listing = ", ".join(map(" ".join, shown))
         raise InvalidInputError(
             f"{path}: expected to be told which array is what: write rf (or iq, or i and q, or bmode) = "
             f'"NAME" and axes = "sample, vector, frame" below [arrays] in {path.name}.toml beside it; there '
-            f"are {held or 'none'}"
+            f"are {listing or 'none'}"
         )
     with naming(where):
         nodes = [_array(variables, arrays[role]) for role in data]

@@ -93,9 +93,9 @@ def _arrays(file: h5py.File, kinds: Sequence[str]) -> list[tuple[str, str, str]]
 
 
 def _recording(path: Path, settings: ImportSettings, file: h5py.File) -> Facts:
-    held = [f"{home}data/{printable(name)}" for home in _homes(file) for name in file[f"{home}data"]]
-    contents = ", ".join(held)
-    if any(name.endswith(_NOT_BEAMFORMED) for name in held):
+    members = [f"{home}data/{printable(name)}" for home in _homes(file) for name in file[f"{home}data"]]
+    contents = ", ".join(members)
+    if any(name.endswith(_NOT_BEAMFORMED) for name in members):
         contents += ": channel data need beamforming, by zea's Pipeline, and its result written"
     yield "holds", contents, ""
     asked = settings.arrays.get("data", "").strip("/").removesuffix("/values")
@@ -174,7 +174,7 @@ def _pixels(node: h5py.Dataset, shape: tuple[int, ...]) -> tuple[dict[str, Value
     said, where = "of the coordinates", locate(node)
 
     def is_zero(*off: FloatArray) -> bool:
-        return bool(max(np.abs(one).max() for one in off) <= _TOLERANCE_MM)
+        return bool(max(np.abs(array).max() for array in off) <= _TOLERANCE_MM)
 
     for x_first in (False, True):
         x, y, z = (start if x_first else start.swapaxes(0, 1)).transpose(2, 0, 1)
