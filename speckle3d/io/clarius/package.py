@@ -98,7 +98,7 @@ def is_package(path: Path, start: bytes) -> bool:
     if is_part or path.is_dir() or path.suffix.lower() == ".tar" or start[257:262] == b"ustar":
         with suppress(OSError, ValueError):
             return any(member.is_own for member in _members(path))
-    return False
+    return path.suffix.lower() == ".tar"  # one that is cut says so when it is read
 
 
 def find_files(path: Path) -> Files:

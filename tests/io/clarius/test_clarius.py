@@ -8,7 +8,7 @@ import pytest
 from clarius_examples import GIVEN, sweep_of
 from sweep_examples import sizes_of
 
-from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.io.clarius.imu import read_samples
 from speckle3d.io.clarius.package import Member
 from speckle3d.io.clarius.reader import sensor_of
@@ -44,6 +44,13 @@ def test_what_is_written_is_read(tmp_path, kind, packed, place):
     require_equal(got, sweep)
     assert got.probe == "Clarius L7HD3"
     assert got.frames.stored_dtype == (np.uint8 if kind == "env" else np.int16)
+
+
+def test_an_archive_cut_short_is_refused(tmp_path):
+    path = examples.write_package(tmp_path / "p.tar", sweep_of("rf"))
+    path.write_bytes(path.read_bytes()[:3000])
+    with pytest.raises((FileError, InvalidInputError), match=r"p\.tar"):
+        _ = load_sweep(path, GIVEN)
 
 
 def test_rf_is_preferred_and_a_raw_file_gives_its_own_kind(tmp_path):
