@@ -126,7 +126,7 @@ def main():
     parser.add_argument("--scans", type=int, default=25)
     parser.add_argument("--frames", type=int, default=100)
     parser.add_argument("--first-seed", type=int, default=FIRST_SEED)
-    options = parsed(parser, phantoms=["bar"], scans=1, frames=40)
+    options = parsed(parser, phantoms=["bar", "handheld"], scans=1, frames=40)
     for phantom in options.phantoms or SCANS:
         print(
             f"{phantom}, {options.frames} frames (published, plane: sd of tilt, yaw, roll 1.50, 1.10, 0.08)"

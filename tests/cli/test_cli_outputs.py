@@ -9,51 +9,34 @@ SMALLEST = ("--preset", "phantom", "--vectors", 16, "--samples", 600, "--frames"
 
 
 @pytest.fixture
-def log(tmp_path):
-    path = tmp_path / "log.csv"
-    write_csv(path, ImuLog(**{**samples(50), "source": "turning"}))
-    return path
-
-
-@pytest.fixture
-def calls(bench, reconstructed, log):
-    """Commands by name, each given the place it is to write to."""
-    made = reconstructed / "reconstruction.h5"
+def calls(bench, reconstructed, tmp_path):
+    """What a command is given by the name of what it is to write."""
+    made, log = reconstructed / "reconstruction.h5", tmp_path / "log.csv"
+    write_csv(log, ImuLog(**{**samples(50), "source": "turning"}))
     return {
-        "simulate": lambda out: ("simulate", out, *SMALLEST),
-        "convert": lambda out: ("convert", bench / "sweep.h5", out),
-        "volume": lambda out: ("volume", made, "-o", out, "--voxel-mm", 1),
-        "imu orient": lambda out: ("imu", "orient", log, "-o", out),
+        "s.h5": lambda out: ("simulate", out, *SMALLEST),
+        "c.h5": lambda out: ("convert", bench / "sweep.h5", out),
+        "v.nrrd": lambda out: ("volume", made, "-o", out, "--voxel-mm", 1),
+        "o.csv": lambda out: ("imu", "orient", log, "-o", out),
     }
 
 
-OUT = {
-    "simulate": "s.h5",
-    "convert": "c.h5",
-    "volume": "v.nrrd",
-    "imu orient": "o.csv",
-}
-
-
-@pytest.mark.parametrize("name", OUT)
+@pytest.mark.parametrize("name", ["s.h5", "c.h5", "v.nrrd", "o.csv"])
 def test_a_file_of_another_kind_stays_as_it_is(refused, calls, tmp_path, name):
-    place = tmp_path / OUT[name]
+    place = tmp_path / name
     place.write_text("precious, 1, 2\n", encoding="utf-8")
     assert str(place) in refused(*calls[name](place))
     assert place.read_text(encoding="utf-8") == "precious, 1, 2\n"
 
 
-def test_an_input_stays_as_it_is(refused, calls):
-    arguments = calls["convert"]("there")
-    given = next(path for path in arguments[1:] if hasattr(path, "read_bytes"))
-    before = given.read_bytes()
-    assert str(given) in refused(*calls["convert"](given))
-    assert given.read_bytes() == before
+def test_an_input_stays_as_it_is(refused, bench):
+    before = (bench / "sweep.h5").read_bytes()
+    assert str(bench / "sweep.h5") in refused("convert", bench / "sweep.h5", bench / "sweep.h5")
+    assert (bench / "sweep.h5").read_bytes() == before
 
 
-@pytest.mark.parametrize("name", ["volume", "imu orient"])
+@pytest.mark.parametrize("name", ["v.nrrd", "o.csv"])
 def test_what_the_command_wrote_before_is_replaced(run, calls, tmp_path, name):
-    place = tmp_path / OUT[name]
     for _ in range(2):
-        code, _, err = run(*calls[name](place))
+        code, _, err = run(*calls[name](tmp_path / name))
         assert code == 0, err
