@@ -359,8 +359,6 @@ def _placed(words: Mapping[str, Any], count: int) -> tuple[FloatArray | None, Fl
     if axes is not None and len(axes) != count:
         raise InvalidInputError(f"expected a spacing for each of {count} axes, got {len(axes)}")
     if origin is not None:
-        if axes is not None and len(origin) != axes.shape[1]:
-            raise InvalidInputError(f"space origin: expected {axes.shape[1]} numbers, got {len(origin)}")
         origin = origin * scale[: len(origin)]
     return axes, origin
 

@@ -87,7 +87,7 @@ def recording_of(reader: Reader, path: Path, settings: ImportSettings) -> Record
             made = _read(reader, path, settings)
     except Speckle3DError:
         raise
-    except (OSError, RuntimeError) as error:  # h5py's, of damage where nothing else is asked for
+    except (OSError, RuntimeError, MemoryError) as error:  # of damage where nothing else is asked for
         raise FileError(f"{path}: cannot be read: {one_line(error)}") from error
     return made if isinstance(made, Recording) else Recording(path, settings, ready=made)
 

@@ -149,5 +149,5 @@ def test_an_origin_with_too_few_numbers_is_told(tmp_path):
         b"kinds: domain domain domain\nspace directions: (1,0,0) (0,1,0) (0,0,1)\nspace origin: (1,2)\n"
         b"encoding: raw\n\n" + bytes(24)
     )
-    with pytest.raises(InvalidInputError, match="space origin"):
+    with pytest.raises(InvalidInputError, match="origin of 2"):
         read_volume(tmp_path / "v.nrrd")

@@ -89,12 +89,15 @@ def read_volume(path: PathLike) -> Volume:
         texts = {name.removeprefix(PREFIX): text for name, text in fields.items() if name.startswith(PREFIX)}
         own = {name: unescaped(text) for name, text in texts.items()}
         axes = np.eye(3) if header.axes_mm is None else header.axes_mm
-        if header.channels > 1 or len(header.size) != 3 or axes.shape != (3, 3):
-            got = f"axes {header.stored}, {header.channels} number(s) a pixel"
+        origin = np.zeros(3) if header.origin_mm is None else header.origin_mm
+        if header.channels > 1 or len(header.size) != 3 or axes.shape != (3, 3) or origin.size != 3:
+            got = (
+                f"axes {header.stored}, {header.channels} number(s) a pixel, origin of {origin.size} numbers"
+            )
             raise InvalidInputError(f"{path}: expected a grey image of three axes in space, got {got}")
         # The first axis runs fastest in a file; a mapped file may be replaced while voxels are used.
         voxels, matrix = np.array(header.numbers()).reshape(header.size[::-1]).T, np.eye(4)
-        matrix[:3, :3], matrix[:3, 3] = axes.T, 0.0 if header.origin_mm is None else header.origin_mm
+        matrix[:3, :3], matrix[:3, 3] = axes.T, origin
     else:
         raise InvalidInputError(
             f"{path}: expected NRRD, MetaImage or NIfTI (.nii.gz, .nii, .hdr), got something else"
