@@ -129,7 +129,7 @@ def _recorded(
 
     if not len(sweep):
         raise InvalidInputError(f"{path}: expected frames to look at, got none")
-    pages: list[Page] = [SweepPage(sweep, Folder(path), reconstruction, doubts)]
+    pages: list[Page] = [SweepPage(sweep, reconstruction, doubts)]
     if sweep.orientation is not None:
         pages.append(_sensor(log_of(sweep.orientation, path.name), sweep.orientation.sensor_from_image))
     return pages

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import gc
 import io
 import os
 import signal
 import sys
 import warnings
-from typing import Annotated
 
 # Small factorisations lose far more to a team of threads than they gain; set before NumPy is loaded.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-
-import typer
 
 from speckle3d.cli.commands import Table, group
 from speckle3d.cli.common import emit, note
@@ -63,33 +59,13 @@ _COMMANDS: Table = {
 }
 """In the order of work: what most sessions need first."""
 
-_OBJECTS_BETWEEN_COLLECTIONS = 10_000
-"""New objects after which Python looks for those that only hold each other.
-
-At its own 700 it looks through all modules several times while they are imported: a tenth of a short command.
-"""
-
 _STOPPED = 128 + signal.SIGINT
 """Exit code after Ctrl-C, as shells have it."""
 
 
-def _print_version(asked: bool) -> None:
-    if asked:
-        from speckle3d import __version__
-
-        emit(f"speckle3d {__version__}")
-        raise typer.Exit
-
-
-def _options(
-    version: Annotated[
-        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
-    ] = False,
-) -> None:
-    """Options of the whole."""
-
-
-app = group("Freehand 2-D ultrasound sweeps to measured 3-D.", _COMMANDS, _options)
+app = group(
+    "Freehand 2-D ultrasound sweeps to measured 3-D; `speckle3d --version` prints the version.", _COMMANDS
+)
 
 
 def main() -> None:
@@ -98,7 +74,6 @@ def main() -> None:
     A wrong input is one line on stderr and exit code 2, a full disk one and exit code 1. Signals that ask for
     the end stop the command as Ctrl-C does, with exit code 128 and their number.
     """
-    gc.set_threshold(_OBJECTS_BETWEEN_COLLECTIONS)
     for stream in (sys.stdout, sys.stderr):  # a terminal of another encoding shows what it can
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
@@ -112,6 +87,11 @@ def _warn(message: Warning | str, *_: object, **__: object) -> None:
 
 
 def _run(heard: list[int]) -> None:
+    if sys.argv[1:] == ["--version"]:
+        from speckle3d import __version__
+
+        emit(f"speckle3d {__version__}")
+        sys.exit(0)
     try:
         code = app(standalone_mode=False, prog_name="speckle3d")
     except Speckle3DError as error:

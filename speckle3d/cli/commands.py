@@ -4,13 +4,13 @@ A command is a function with a numpydoc docstring. Options under *Parameters* ar
 ``--help`` in that order, those under *Other Parameters* by ``--help-all``. "With --origin or --curve:" and
 "Not with --paper." in a help are rules that are checked, as is "One of --level or --labels." in the text. A
 parameter annotated with `Fields` of a pydantic model or a dataclass becomes an option for each field, with a
-model's description of it as help; the function gets the values that were given as a dict, and of a dataclass
-the others as well.
+model's description of it as help; the function gets the model made of the values that were given.
 """
 
 from __future__ import annotations
 
 import inspect
+import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from copy import copy
@@ -33,7 +33,8 @@ from typing import (
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from speckle3d.cli.common import shared
+from speckle3d.cli.common import emit, shared
+from speckle3d.cli.outputs import require_own_places
 from speckle3d.core.errors import FileError, InvalidInputError
 
 if TYPE_CHECKING:
@@ -41,7 +42,7 @@ if TYPE_CHECKING:
 
 Table = Mapping[str, "str | tuple[str, Table]"]
 """Commands by name: where their functions are (``module:function``), or a group's help and its own table."""
-Command = Callable[..., None]
+Command = Callable[..., Any]
 
 _SETTINGS = {"help_option_names": ["-h", "--help"]}
 _SECTION = re.compile(r"^(Parameters|Other Parameters|Examples)\n-+\n", re.MULTILINE)
@@ -51,23 +52,21 @@ _CHOICE = re.compile(r"\bOne of ((?:[A-Z]+|--[\w-]+) or --[\w-]+)")
 _OUTPUT = re.compile(r"(?:-o|--output=)(.+)|-o|--output", re.DOTALL)
 _FUSED = "`fused` takes any sensor there is, `crossed` a second sweep"
 _ANY_VIEWER = "frames are cut here, and volumes by any viewer, as 3D Slicer"
-_OF_SIMULATE = (
-    "mounting floor-slope-deg roll-range-deg yaw-range-deg depth-range-mm wobble-hz drift-mm tremor-mm"
-)
 _REMOVED = {
+    ("reconstruct", "--volume-mode"): "`speckle3d volume --mode` writes a volume at any mode's poses",
+    ("reconstruct", "--consistent-subset"): "`--drift consistent-subset`, or the setting of that name",
     ("reslice", "--volume"): _ANY_VIEWER,
     ("reslice", "--state"): _ANY_VIEWER,
+    ("reslice", "--origin"): "--points takes the origin, a point along the rows and one of the plane",
     ("reslice", "--outlines"): "`view` and the report of `compare` draw where frames are",
     ("images", "--clock"): "`calibrate clock --by images` finds the offset, --time-offset-s takes it",
     ("images", "--scales"): "calipers tell pixel sizes better; --pixel-mm takes them",
     ("images", "--method"): "there is one optimiser, which finds what Nelder-Mead did",
     ("reconstruct", "inertial"): _FUSED,
     ("compare", "inertial"): _FUSED,
-    ("plane", "--stages"): "there are always three: angles, distances, all",
+    ("export", "--frame"): "`convert` and `scene` write poses as 3D Slicer reads them",
+    ("live", "--compression"): "`convert --compression gzip` compresses its recording",
     ("simulate", "--reverse"): "--preset reversal comes back",
-    **dict.fromkeys(
-        (("simulate", f"--{name}") for name in _OF_SIMULATE.split()), "what it was by default stays"
-    ),
 }
 """Words of commands that older versions took, and what replaces them."""
 
@@ -83,12 +82,14 @@ class Fields(NamedTuple):
         """Options by the fields' names; the model is loaded."""
         model = _loaded(self.model)
         if is_dataclass(model):
-            kinds = get_type_hints(model)
-            made = {f.name: _option(f.name, kinds[f.name], f.default, None, words) for f in fields(model)}
+            from pydantic.fields import FieldInfo
+
+            kinds, of = get_type_hints(model), FieldInfo.from_annotated_attribute
+            stated = {f.name: of(kinds[f.name], f.default) for f in fields(model)}
         else:
-            made = {name: _of_field(name, field, words) for name, field in model.model_fields.items()}
-        chosen = self.only or made
-        return {name: made[name] for name in made if name in chosen and name not in self.without}
+            stated = model.model_fields
+        names = [name for name in self.only or stated if name not in self.without]
+        return {name: _of_field(name, stated[name], words) for name in names}
 
 
 def _loaded(place: str) -> Any:
@@ -121,17 +122,24 @@ def command_of(name: str, function: Command) -> TyperCommand:
     """Make the command of a function."""
     words, hints = Words.of(function), get_type_hints(function, include_extras=True)
     options: dict[str, inspect.Parameter] = {}
-    groups: dict[str, list[str]] = {}
+    groups: dict[str, tuple[str, list[str]]] = {}
+    places: dict[str, str] = {}
     for parameter in inspect.signature(function).parameters.values():
         kind, info = hints[parameter.name], None
         if get_origin(kind) is Annotated:
-            kind, info = kind.__origin__, copy(kind.__metadata__[0])
+            kind, (info, *writes) = kind.__origin__, kind.__metadata__
+            info = copy(info)
+            if writes:
+                places[parameter.name] = writes[0]
         if isinstance(info, Fields):
             chosen = {each: option for each, option in info.options(words).items() if each not in hints}
-            groups[parameter.name] = list(chosen)
+            groups[parameter.name] = info.model, list(chosen)
             options |= chosen
         else:
             options[parameter.name] = _option(parameter.name, kind, parameter.default, info, words)
+    prints = hints["return"] is not type(None)
+    if prints:
+        options["as_json"] = _option("as_json", bool, False, typer.Option("--json"), words)
     order = [*words.options, *options]
     options = {each: options[each] for each in sorted(options, key=order.index)}
 
@@ -143,15 +151,23 @@ def command_of(name: str, function: Command) -> TyperCommand:
             if values[name] is not None and values[name] is not False and values[name] != option.default
         }
         for flag, option in given.items():
-            _require_fit(flag, option, values[option.name], given)
-            values[option.name] = _opened(option, values[option.name])
+            values[option.name] = _checked(flag, option, values[option.name], given)
+        written = [(values[name], what) for name, what in places.items() if values[name] is not None]
+        require_own_places(written, [values[name] for name in values.keys() - places], values.get("out"))
         for choice in _CHOICE.finditer(words.text):
             if sum(other in given for other in choice[1].split(" or ")) != 1:
                 raise InvalidInputError(f"expected one of {choice[1]}, got both or neither")
-        for group, names in groups.items():
+        for group, (model, names) in groups.items():
             picked = {name: values.pop(name) for name in names}
-            values[group] = {name: value for name, value in picked.items() if value is not None}
-        function(**values)
+            values[group] = _made(_loaded(model), {k: v for k, v in picked.items() if v is not None})
+        as_json = prints and values.pop("as_json")
+        numbers, text = function(**values) or (None, "")
+        if as_json:
+            from speckle3d.study.results import json_text
+
+            text = json_text(numbers)
+        if text:
+            emit(text)
 
     run.__signature__ = inspect.Signature(list(options.values()))  # type: ignore[attr-defined]
     run.__annotations__ = {each.name: each.annotation for each in options.values()}
@@ -166,8 +182,21 @@ def command_of(name: str, function: Command) -> TyperCommand:
 _SHARED = Words.of(shared).options
 
 
+def _made(model: Any, values: Mapping[str, Any]) -> Any:
+    """Settings of options; of the first whose value is refused the option is named."""
+    from pydantic import ValidationError
+
+    try:
+        return model(**values)
+    except ValidationError as error:
+        from speckle3d.io.toml import first_fault
+
+        name, fault = first_fault(error)
+        raise InvalidInputError(f"{_flag(name.partition('.')[0])}: {fault}") from None
+
+
 def _flag(name: str) -> str:
-    return f"--{name.removesuffix('_file').replace('_', '-')}"
+    return f"--{name.removesuffix('_file').removeprefix('tracker_').replace('_', '-')}"
 
 
 def _called(option: inspect.Parameter) -> str:
@@ -176,8 +205,11 @@ def _called(option: inspect.Parameter) -> str:
     return _flag(option.name) if isinstance(info, typer.models.OptionInfo) else option.name.upper()
 
 
-def _require_fit(flag: str, option: inspect.Parameter, value: Any, flags: Mapping[str, Any]) -> None:
-    """Refuse an option against the rule that its help begins with, and an input that is not there."""
+def _checked(flag: str, option: inspect.Parameter, value: Any, flags: Mapping[str, Any]) -> Any:
+    """Value of an option; a results folder stands for its reconstruction.
+
+    Refused are an option against the rule of its help, a number that is none, an input that is not there.
+    """
     (info,) = option.annotation.__metadata__
     for rule in _RULE.finditer(info.help or ""):
         others = [other for other in rule[2].split(" or ") if other in flags]
@@ -185,19 +217,16 @@ def _require_fit(flag: str, option: inspect.Parameter, value: Any, flags: Mappin
             raise InvalidInputError(f"{flag}: expected {rule[2]} with it, got none")
         if rule[1] == "Not with" and others:
             raise InvalidInputError(f"{flag}: expected no {others[0]} beside it, got both")
-    for path in value if isinstance(value, list) else [value]:
+    for path in value if isinstance(value, list | tuple) else [value]:
+        if isinstance(path, float) and not math.isfinite(path):
+            raise InvalidInputError(f"{flag}: expected a finite number, got {path}")
         if isinstance(path, Path) and not path.exists() and not info.writable:
             where = f"{flag}: " if isinstance(info, typer.models.OptionInfo) else ""
             is_server = re.fullmatch(r"[^/]+:[0-9]+", str(path))
             live = f"; a server's sweep: speckle3d live {path} --view" if is_server else ""
             raise FileError(f"{where}{path}: expected a file, got none{live}")
-
-
-def _opened(option: inspect.Parameter, value: Any) -> Any:
-    """The reconstruction that stands for a results folder; any other value as it is."""
-    if not isinstance(value, Path) or option.annotation.__metadata__[0].writable:
-        return value
-    return inside if (inside := value / "reconstruction.h5").is_file() else value
+    is_results = isinstance(value, Path) and not info.writable and (value / "reconstruction.h5").is_file()
+    return value / "reconstruction.h5" if is_results else value
 
 
 def _option(name: str, kind: Any, default: Any, info: Any, words: Words) -> inspect.Parameter:
@@ -231,7 +260,7 @@ def _of_field(name: str, field: FieldInfo, words: Words) -> inspect.Parameter:
     kind = _unbounded(kind)
     shown = "" if isinstance(default, bool | tuple) or default in (None, "") else f" ({default})"
     text = (field.description or "").removesuffix(".")
-    info = typer.Option(help=f"{text[:1].upper()}{text[1:]}{shown}.")
+    info = typer.Option(help=text and f"{text[:1].upper()}{text[1:]}{shown}.")
     if default is True:
         info.param_decls = (f"{_flag(name)}/--no-{_flag(name)[2:]}",)
     return _option(name, kind | None, None, info, words)
@@ -305,10 +334,10 @@ def _function(place: str) -> Command:
     return function
 
 
-def group(text: str, table: Table, callback: Command = lambda: None) -> Any:
-    """Make a group of commands; its callback's parameters are options of its own."""
+def group(text: str, table: Table) -> Any:
+    """Make a group of commands."""
     builder = typer.Typer(cls=Group, add_completion=False, no_args_is_help=True, context_settings=_SETTINGS)
-    builder.callback(help=text)(callback)
+    builder.callback(help=text)(lambda: None)
     made: Any = typer.main.get_command(builder)
     made.table, made.commands = table, dict.fromkeys(table)
     return made

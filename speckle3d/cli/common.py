@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import json
-import math
+import re
 import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Sequence
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -17,12 +15,8 @@ from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.printable import printable
 
 if TYPE_CHECKING:
-    from pydantic import BaseModel
-
     from speckle3d.config import Config
     from speckle3d.core.sweep import Sweep
-
-    Model = TypeVar("Model", bound=BaseModel)
 
 
 class Drift(StrEnum):
@@ -45,7 +39,8 @@ OptionalOut = Annotated[MaybePath, typer.Option("-o", "--output", writable=True)
 OutArgument = Annotated[Path, typer.Argument(writable=True)]
 Written = Annotated[MaybePath, typer.Option(writable=True)]
 PixelMm = tuple[float, float] | None
-Json = Annotated[bool, typer.Option("--json")]
+Result = tuple[Any, str]
+"""What a command prints: numbers for --json, else text."""
 
 
 def shared() -> None:
@@ -93,7 +88,7 @@ def shared() -> None:
         'fan x,y angle,angle radius,radius'; several joined by ' and '.
     sweep_file
         The sweep, if it moved since the reconstruction.
-    transform
+    transform, tracker_transform
         Poses to use, by their name in an image sequence, as ToolToTracker (ProbeToTracker).
     """
 
@@ -119,19 +114,11 @@ def emit(text: str) -> None:
         raise FileError(f"standard output: cannot be written: {error.strerror}") from error
 
 
-def emit_json(values: Any) -> None:
-    """Print results as JSON on stdout."""
-    emit(json.dumps(values, indent=2))
-
-
-def emit_rows(rows: Sequence[tuple[str, Any, str]], as_json: bool) -> None:
-    """Print rows of description, value and unit on stdout, aligned or as JSON."""
+def rows_of(rows: Sequence[tuple[str, Any, str]]) -> Result:
+    """Rows of description, value and unit, for JSON and aligned."""
     from speckle3d.core.tables import text_rows
 
-    if as_json:
-        emit_json([{"description": d, "value": v, "unit": u} for d, v, u in rows])
-    else:
-        emit(text_rows(rows))
+    return [{"description": d, "value": v, "unit": u} for d, v, u in rows], text_rows(rows)
 
 
 def load_settings(path: Path | None) -> Config:
@@ -145,40 +132,7 @@ def part_of(sweep: Sweep, frames: str | None, option: str) -> Sweep:
     """Frames FIRST-LAST of a sweep; by default all."""
     if frames is None:
         return sweep
-    first, dash, last = frames.partition("-")
-    if not (dash and first.isdecimal() and last.isdecimal()):
+    match = re.fullmatch("([0-9]+)-([0-9]+)", frames)
+    if match is None:
         raise InvalidInputError(f"{option}: expected FIRST-LAST, two frame numbers, got {frames!r}")
-    return sweep.part(int(first), int(last) + 1)
-
-
-def require_finite(option: str, *values: float | None) -> None:
-    """Refuse numbers that are NaN or infinite."""
-    if not all(value is None or math.isfinite(value) for value in values):
-        raise InvalidInputError(f"{option}: expected finite numbers, got {' '.join(map(str, values))}")
-
-
-def from_options(model: type[Model], options: Mapping[str, Any]) -> Model:
-    """Make settings from the options that were given.
-
-    Raises
-    ------
-    InvalidInputError
-        Naming the first option whose value is out of range.
-    """
-    with naming_options():
-        return model(**options)
-
-
-@contextmanager
-def naming_options() -> Iterator[None]:
-    """Name the command-line option of the first setting that pydantic refuses in the block."""
-    from pydantic import ValidationError
-
-    try:
-        yield
-    except ValidationError as error:
-        from speckle3d.io.toml import first_fault
-
-        name, fault = first_fault(error)
-        option = name.partition(".")[0].replace("_", "-")
-        raise InvalidInputError(f"--{option}: {fault}") from None
+    return sweep.part(int(match[1]), int(match[2]) + 1)

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from speckle3d.cli.common import (
     Drift,
-    Json,
     MaybePath,
     MaybeText,
     Out,
@@ -23,9 +22,6 @@ from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.extras import require_extra
 from speckle3d.core.progress import progress_bar
 
-if TYPE_CHECKING:
-    from speckle3d.study.results import Study
-
 
 def compare(
     out: Out,
@@ -38,7 +34,7 @@ def compare(
     scheduler: MaybeText = None,
     workers: Annotated[int | None, typer.Option(min=1)] = None,
     paper: bool = False,
-    as_json: Json = False,
+    as_json: Annotated[bool, typer.Option("--json")] = False,
 ) -> None:
     """Compare drift-correction modes over sweeps with a reference: tables, curves, a report.
 
@@ -91,17 +87,11 @@ def compare(
             )
     write_report(study)
     emit((out / "study.json").read_text(encoding="utf-8") if as_json else table or study.table)
-    _tell(study)
-
-
-def _tell(study: Study) -> None:
-    """Say on stderr what became of the sweeps; fail if all did."""
     skipped = sum(outcome.skipped for outcome in study.outcomes)
     if skipped:
         note(f"{skipped} of {len(study.outcomes)} sweeps were finished before and are taken as they are")
     for outcome in study.broken:
         note(f"{outcome.name}: failed: {outcome.reason}")
-    out = study.directory
     note(f"results in {out}; the report is {out / 'report.html'}")
     if not study.done:
         raise InsufficientDataError(f"{out}: expected a sweep that can be compared, got none")

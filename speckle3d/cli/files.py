@@ -2,25 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from speckle3d.cli.calibrations import files_of, given_settings, mount
+from speckle3d.cli.calibrations import clip_of, mount
 from speckle3d.cli.commands import Fields
 from speckle3d.cli.common import (
-    Json,
     MaybePath,
     MaybeText,
     OutArgument,
     Paths,
+    Result,
     emit,
-    emit_rows,
-    from_options,
     note,
     notes,
+    rows_of,
 )
 from speckle3d.cli.outputs import require_own_place
 from speckle3d.core.errors import InvalidInputError
@@ -30,7 +28,7 @@ if TYPE_CHECKING:
     from speckle3d.simulation.presets import SimulatedSweep
 
 
-def info(path: Path, as_json: Json = False) -> None:
+def info(path: Path) -> Result:
     """Tell what a file holds, after checking it.
 
     Parameters
@@ -45,7 +43,7 @@ def info(path: Path, as_json: Json = False) -> None:
     """
     from speckle3d.io.describe import describe
 
-    emit_rows(describe(path), as_json)
+    return rows_of(describe(path))
 
 
 def config() -> None:
@@ -62,19 +60,13 @@ def config() -> None:
 
 def convert(
     source: Annotated[Path, typer.Argument(metavar="IN")],
-    out: OutArgument,
+    out: Annotated[OutArgument, "sweep sequence"],
     imported: Annotated[
-        dict[str, Any],
-        Fields(
-            "speckle3d.io.import_settings:ImportSettings",
-            without=("tracker_transform", "image_to_probe", "arrays"),
-        ),
+        Any,
+        Fields("speckle3d.io.import_settings:ImportSettings", without=("image_to_probe", "arrays")),
     ],
-    transform: MaybeText = None,
     calibration: Paths = None,
-    compression: Annotated[
-        Literal["gzip", "lzf", "none"] | None, typer.Option("--compression", "--compress")
-    ] = None,
+    compression: Literal["gzip", "lzf", "none"] | None = None,
     mode: MaybeText = None,
     sweep_file: MaybePath = None,
 ) -> None:
@@ -102,9 +94,9 @@ def convert(
     --------
     $ speckle3d convert scan.mha sweep.h5 --calibration tracker.h5
     """
+    from speckle3d.calibrating.recordings import require_unsaid
     from speckle3d.io.calibrations import fitted_pixels, resized
     from speckle3d.io.load import kind_of, open_recording
-    from speckle3d.io.plus.device_set import read_device_set
     from speckle3d.io.plus.write import SUFFIXES, write_sequence
     from speckle3d.io.reconstructions import FORMAT
     from speckle3d.io.sweep_writer import COMPRESSIONS, write_sweep
@@ -115,16 +107,13 @@ def convert(
     suffix = out.suffix.lower()
     is_made = source.is_file() and kind_of(source) == FORMAT
     known = SUFFIXES if is_made else (".h5", ".hdf5", *SUFFIXES)
-    if out.name.lower().endswith(LABELS_ALONE) or suffix not in (*known, *([] if is_made else [""])):
+    if out.name.lower().endswith(LABELS_ALONE) or suffix not in known:
         raise InvalidInputError(f"{out}: expected a name ending in {', '.join(known)}, got {out.name!r}")
-    require_own_place(
-        out, "sequence" if suffix in SUFFIXES else "sweep", source, *files_of(imported, calibration)
-    )
     packs = compression != "none"
     if is_made:
-        range_db = imported.pop("dynamic_range_db", 60.0)
-        settings = given_settings(source, imported, transform)
-        posed = open_posed(source, mode, sweep_file, settings, calibration or ())
+        range_db = imported.dynamic_range_db or 60.0
+        stated = type(imported)(**imported.model_dump(exclude={"dynamic_range_db"}, exclude_unset=True))
+        posed = open_posed(source, mode, sweep_file, stated, calibration or ())
         notes(posed.notes())
         with progress_bar(f"writing {out.name}") as progress:
             sequence, poses = slicer_sequence(posed, range_db)
@@ -132,15 +121,14 @@ def convert(
         return
     if mode or sweep_file:
         raise InvalidInputError(f"--mode, --sweep: are of a reconstruction, got {source.name}")
-    given = given_settings(source, imported, transform)
-    fitted = {k: v for k, v in fitted_pixels(calibration or ()).items() if k not in given.model_fields_set}
-    recording = open_recording(source, given.model_copy(update=fitted))
+    require_unsaid(source, imported)
+    pixels = fitted_pixels(calibration or ())
+    fitted = {name: pixels[name] for name in pixels.keys() - imported.model_fields_set}
+    recording = open_recording(source, imported.model_copy(update=fitted))
     sweep = mount(resized(recording.sweep, fitted), calibration or ())
     notes(recording.notes)
     config = recording.settings.plus_config
-    clip = None if config is None else read_device_set(config).clip
-    skew_rad = 0.0 if sweep.tracker is None else sweep.tracker.image_skew_rad
-    if region := clip and clip.region_text(replace(sweep.grid, skew_rad=skew_rad)):
+    if region := clip_of(config, sweep.grid, 0.0 if sweep.tracker is None else sweep.tracker.image_skew_rad):
         note(f"{out}: does not hold the clip of {config}: give `speckle3d volume` --region '{region}'")
     with progress_bar(f"writing {out.name}") as progress:
         if suffix not in SUFFIXES:
@@ -152,8 +140,8 @@ def convert(
 
 
 def simulate(
-    out: OutArgument,
-    settings: Annotated[dict[str, Any], Fields("speckle3d.simulation.settings:SimulationSettings")],
+    out: Annotated[OutArgument, "simulation"],
+    settings: Annotated[Any, Fields("speckle3d.simulation.settings:SimulationSettings")],
 ) -> None:
     """Simulate a sweep with truth; `crossed` writes a second file beside the first, named ...-crossing.
 
@@ -168,15 +156,12 @@ def simulate(
     $ speckle3d simulate sweep.h5 --preset tissue --length-mm 8 --seed 4
     """
     from speckle3d.io.fileset import FileSet
-    from speckle3d.simulation.presets import SimulationSettings
     from speckle3d.simulation.presets import simulate as prepare
 
-    checked = from_options(SimulationSettings, settings)
     with progress_bar("computing the beam"):
-        prepared = prepare(checked)
+        prepared = prepare(settings)
     paths = [out, out.with_name(f"{out.stem}-crossing{out.suffix}")][: len(prepared)]
-    for path in paths:
-        require_own_place(path, "simulation")
+    require_own_place(paths[-1], "simulation")
     if len(paths) == 1:
         _write(out, prepared[0])
         return

@@ -2,14 +2,38 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 from speckle3d.core.errors import InvalidInputError
 
 _FIRST_BYTES = 2**16
 
 
-def require_own_place(out: Path, kind: str, *inputs: Path | None) -> None:
+def require_own_places(places: Sequence[tuple[Path, str]], inputs: Iterable[Any], results: Any) -> None:
+    """Refuse places of outputs that are one, or that `require_own_place` refuses.
+
+    Parameters
+    ----------
+    places : sequence of (path, str)
+        Where the command writes, and what.
+    inputs : iterable
+        Values of its other options; texts may be names of files, too.
+    results : path or None
+        Folder that the command makes, in which nothing can be in the way.
+    """
+    flat = [item for value in inputs for item in (value if isinstance(value, list) else [value])]
+    files = [Path(item) for item in flat if isinstance(item, str | Path) and os.path.isfile(item)]
+    for path, kind in places:
+        if path.parent != results or results.exists():
+            require_own_place(path, kind, *files)
+    if len({path.resolve() for path, _ in places}) < len(places):
+        raise InvalidInputError(f"{places[0][0]}: expected a file of its own for each output")
+
+
+def require_own_place(out: Path, kind: str, *inputs: Path) -> None:
     """Refuse to write over an input, or over another kind of file than the command writes.
 
     Parameters
@@ -17,8 +41,8 @@ def require_own_place(out: Path, kind: str, *inputs: Path | None) -> None:
     out : path
         A file without content is always free.
     kind : str
-        What the command writes: one of `_kinds_of`.
-    inputs : path or None
+        What the command writes: one of `_kinds_of`, or several.
+    inputs : path
         Files that the command reads.
 
     Raises
@@ -31,13 +55,22 @@ def require_own_place(out: Path, kind: str, *inputs: Path | None) -> None:
     from speckle3d.io.hdf5 import require_target
 
     target = require_target(out)
+    written = [target]
+    if kind == "calibration":
+        from speckle3d.calibrating.written import BESIDE
+
+        written += [target.with_suffix(suffix) for suffix in BESIDE]
+        if out.suffix in BESIDE:
+            raise InvalidInputError(f"{out}: expected a calibration file, not {', '.join(BESIDE)} beside it")
+    for path in inputs:
+        if any(place.exists() and path.samefile(place) for place in written):
+            raise InvalidInputError(f"{path}: is an input and would be overwritten: give -o another name")
     if not target.exists():
         return
-    if any(path is not None and path.exists() and path.samefile(target) for path in inputs):
-        raise InvalidInputError(f"{out}: is an input and would be overwritten: give another name")
-    if target.stat().st_size and kind not in _kinds_of(target):
+    if target.stat().st_size and _kinds_of(target).isdisjoint(kind.split()):
+        wanted = kind.replace(" ", " or ")
         raise InvalidInputError(
-            f"{out}: expected a new name or a {kind} to replace, got another kind of file"
+            f"{out}: expected a new name or a {wanted} to replace, got another kind of file"
         )
 
 
@@ -54,15 +87,13 @@ def _kinds_of(path: Path) -> set[str]:
             own = str(held.attrs.get("format", "")).removeprefix("speckle3d.")
             return {own, *({"simulation"} & {*held})}
     triangles = int.from_bytes(start[80:84], "little")
-    row = next((line for line in start.splitlines() if not line.startswith(b"#")), b"")
     signs = {
-        "log": row.startswith(b"time_s,"),
+        "log": b"\ntime_s," in b"\n" + start,
         "picture": start.startswith(b"\x89PNG\r\n\x1a\n"),
         "sequence": b"Seq_Frame" in start,
         "surface": start.startswith((b"ply", b"# vtk DataFile", b"solid"))
         or path.stat().st_size == 84 + 50 * triangles,  # binary STL
         "trajectory": is_tum(path),
-        "transform": start.startswith(b"#Insight Transform File"),
         "volume": may_be_volume(path),
     }
     return {kind for kind, is_one in signs.items() if is_one}

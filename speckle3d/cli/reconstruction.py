@@ -10,7 +10,6 @@ import typer
 from speckle3d.cli.calibrations import mount
 from speckle3d.cli.common import (
     Drift,
-    Json,
     MaybePath,
     MaybeText,
     Out,
@@ -23,13 +22,17 @@ from speckle3d.cli.common import (
     notes,
     part_of,
 )
-from speckle3d.cli.outputs import require_own_place
-from speckle3d.core.errors import InvalidInputError, MismatchError
+from speckle3d.core.errors import MismatchError
 from speckle3d.core.progress import progress_bar
 
 if TYPE_CHECKING:
     from speckle3d.config import Config
     from speckle3d.study.job import JobResult
+
+_SIGNS = {
+    "truth": "that of the simulation's truth",
+    "assumed": "not told by anything: taken as positive (setting sensors.direction)",
+}
 
 
 def reconstruct(
@@ -38,20 +41,16 @@ def reconstruct(
     curves_file: MaybePath = None,
     drift: list[Drift] | None = None,
     crossing_file: MaybePath = None,
-    save_curves: Written = None,
+    save_curves: Annotated[Written, "curves"] = None,
     frames: MaybeText = None,
     crossing_frames: MaybeText = None,
     reference: Reference | None = None,
     region: MaybeText = None,
-    consistent_subset: Annotated[
-        bool | None, typer.Option("--consistent-subset/--no-consistent-subset")
-    ] = None,
     drift_curves: Literal["published", "distance"] | None = None,
-    volume: Written = None,
-    volume_mode: MaybeText = None,
+    volume: Annotated[Written, "volume"] = None,
     calibration: Paths = None,
     config_file: MaybePath = None,
-    as_json: Json = False,
+    as_json: Annotated[bool, typer.Option("--json")] = False,
 ) -> None:
     """Reconstruct a sweep: trajectory, drift-corrected trajectories, table, figures.
 
@@ -70,7 +69,8 @@ def reconstruct(
         Second sweep over the same tissue, turned by 30 to 90 degrees.
     calibration
     volume
-        Write a volume, too (.nrrd, .mha, .nii.gz, .nii), as group `volume` of the settings says.
+        Write a volume, too (.nrrd, .mha, .nii.gz, .nii), as group `volume` of the settings says, at the poses
+        of the mode that claims the smallest error of length.
     reference
         What to compare with.
     region
@@ -78,16 +78,12 @@ def reconstruct(
 
     Other Parameters
     ----------------
-    volume_mode
-        With --volume: its poses; by default those of the mode that claims the smallest error of length.
     frames
         FIRST-LAST: reconstruct these frames of the recording only.
     crossing_frames
         FIRST-LAST: cross with these frames; of the same recording without --crossing.
     save_curves
         With --crossing or --crossing-frames: write the curves as the crossing sweep corrects them.
-    consistent_subset
-        In mode orientation, drop distances that the sensed orientation contradicts.
     drift_curves
         Correction cubic in time (published) or in distance (for reversals).
     config_file
@@ -101,9 +97,7 @@ def reconstruct(
     from speckle3d.io.voxels.volume_writer import volume_suffix
     from speckle3d.study.job import run_job
 
-    settings = load_settings(config_file).with_choices(
-        consistent_subset=consistent_subset, drift_curves=drift_curves, region=region
-    )
+    settings = load_settings(config_file).with_choices(drift_curves=drift_curves, region=region)
     modes, calibrations = list[str](dict.fromkeys(drift or ())), calibration or ()
     recording = open_recording(sweep_file)
     sweep = recording.sweep
@@ -119,18 +113,8 @@ def reconstruct(
         crossing = part_of(whole, crossing_frames, "--crossing-frames"), crossing_file or sweep_file
         if not {"crossed", "fused"}.intersection(modes):
             modes.append("crossed")
-    read = (sweep_file, crossing_file, config_file, used, *calibrations)
-    if save_curves is not None:
-        require_own_place(save_curves, "curves", *read)
     if volume is not None:
         volume_suffix(volume)
-        # In a folder of results that is still to be made nothing can be in the way.
-        if volume.parent.exists() or volume.parent != out:
-            require_own_place(volume, "volume", *read)
-        if volume_mode not in (None, "image", *modes):
-            raise InvalidInputError(
-                f"--volume-mode: expected one of image, {', '.join(modes)}, got {volume_mode!r}"
-            )
     sweep = part_of(sweep, frames, "--frames")
     with progress_bar(f"reconstructing {sweep_file.name}") as progress:
         result = run_job(
@@ -149,17 +133,17 @@ def reconstruct(
     elif save_curves is not None:
         note(f"{save_curves}: not written, since the sweeps could not be crossed")
     if volume is not None:
-        _write_volume(result, sweep_file, volume, volume_mode, settings)
+        _write_volume(result, sweep_file, volume, settings)
     for reason in result.summary.left_out.values():
         raise MismatchError(f"{reason}; the other modes' results are in {result.directory}")
 
 
-def _write_volume(result: JobResult, sweep_file: Path, out: Path, mode: str | None, settings: Config) -> None:
+def _write_volume(result: JobResult, sweep_file: Path, out: Path, settings: Config) -> None:
     """Compound the sweep at the poses just found."""
     from speckle3d.study.posed import open_posed
     from speckle3d.study.scenes.voxels import VolumeRequest, write_voxels
 
-    posed = open_posed(result.directory / "reconstruction.h5", mode, sweep_file)
+    posed = open_posed(result.directory / "reconstruction.h5", None, sweep_file)
     notes(posed.notes())
     with progress_bar(f"compounding {out.name}"):
         note(write_voxels(posed, VolumeRequest(settings.volume), out).line)
@@ -175,9 +159,5 @@ def _tell(result: JobResult) -> None:
     rejected = details["rejected_patch_share"]
     if rejected == rejected:
         note(f"{100 * rejected:.0f} % of patches contradict the sensed orientation and were left out")
-    if details["direction_from"] == "truth":
-        note("the sign of the elevational motion was taken from the simulation's truth")
-    if details["direction_from"] == "assumed":
-        note(
-            "nothing tells the sign of the elevational motion: taken as positive (setting sensors.direction)"
-        )
+    if (sign := _SIGNS.get(details["direction_from"])) is not None:
+        note(f"the sign of the elevational motion is {sign}")

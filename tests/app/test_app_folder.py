@@ -14,13 +14,9 @@ def folder(tmp_path):
     return Folder(tmp_path / "sweep.h5")
 
 
-@pytest.mark.parametrize(
-    "name",
-    ["", "../a.csv", "/x/a.csv", ".hidden", "a\0.csv"],
-)
-def test_only_a_new_name_in_it_is_taken(folder, tmp_path, name):
+def test_only_a_new_name_in_it_is_taken(folder, tmp_path):
     os.symlink(tmp_path.parent / "elsewhere.csv", tmp_path / "link.csv")
-    for wrong in (name, "sweep.h5", "link.csv"):
+    for wrong in ("", "../a.csv", "/x/a.csv", ".hidden", "a\0.csv", "sweep.h5", "link.csv"):
         with pytest.raises(InvalidInputError):
             folder.save(wrong, lambda path: path.write_text("new"))
     assert (tmp_path / "sweep.h5").read_bytes() == b"sweep"

@@ -1,9 +1,7 @@
 """A sweep while it is made, in the browser, until its sender leaves."""
 
 import subprocess
-from types import SimpleNamespace
 
-import numpy as np
 from browsers import needs_browser, opened, running
 from commands import RF, command, free_port, read_until
 
@@ -25,17 +23,3 @@ def test_picture_length_and_end_are_shown(browser, shipped, tmp_path, monkeypatc
             session.communicate()
             assert session.returncode == 0
     assert (tmp_path / "out" / "reconstruction.h5").is_file()
-
-
-def test_a_picture_lies_beside_the_middle_where_its_lines_do():
-    from speckle3d.app.live import _Viewer
-    from speckle3d.core.grid import ImageGrid
-    from speckle3d.live.progress import Progress
-
-    grid = ImageGrid(40, 60, 0.5, 0.5, first_vector_mm=-10.0)
-    path = (np.zeros(0), np.zeros(0), None)
-    session = SimpleNamespace(
-        progress=Progress(), picture=lambda: (np.zeros((40, 60)), grid), path=lambda: path, voxels=None
-    )
-    shown = _Viewer(session, str)._picture[1].data
-    assert (shown["x"], shown["dw"]) == ([-10.25], [20.0])

@@ -52,14 +52,11 @@ def test_what_has_no_page_is_one_line_and_exit_code_2(shipped, log, tmp_path, ca
 
 def test_a_notebook_shows_the_same_pages(log):
     from bokeh.document import Document
-    from bokeh.plotting import figure
 
     document = Document()
     shown = speckle3d.app.view(log)
     document.add_root(shown.get_root(document))
     document.to_json()  # as it is sent to the notebook
     assert len(document.roots) == 1
-    plots = list(document.select({"type": figure}))
-    assert {each.yaxis.axis_label for each in plots} >= {"dip, \N{DEGREE SIGN}", "heading, \N{DEGREE SIGN}"}
     (drawn,) = (model.data for model in document.models if "heading" in getattr(model, "data", {}))
     assert np.isfinite(drawn["dip"]).any()

@@ -33,18 +33,12 @@ def test_columns_are_those_of_the_fusion(readings, motion, found):
     columns = readings.columns()
     at = np.searchsorted(motion.log.time_s, found.rotations.time_s - 1e-9)
     np.testing.assert_allclose(columns["z"], np.degrees(motion.log.gyroscope_rad_s[at, 2]))
-    half = 1.96 * np.degrees(found.standard_deviation_rad[:, 2])
-    np.testing.assert_allclose(columns["high"] - columns["heading"], half)
     assert np.abs(np.diff(columns["heading"])).max() < 20.0
     np.testing.assert_array_equal(
         np.isfinite(columns["doubt"]), found.disturbed & np.isfinite(columns["field"])
     )
     # The fields of these scenes: 45 down over 18 north.
     assert np.nanmedian(columns["dip"]) == pytest.approx(np.degrees(np.arctan2(45, 18)), abs=1.0)
-    stream = found.rotations
-    for k in (0, 500, len(stream) - 1):
-        held = readings.orientation_at(float(stream.time_s[k] - motion.log.time_s[0]))
-        assert (held * stream.world_from_sensor[k].inv()).magnitude() < 1e-6
 
 
 def live(elapsed_s, heading_deg=0.0, started=True, stray=0.01, disturbed=False, **more):
@@ -77,7 +71,6 @@ def test_live_columns_run_to_now_without_a_jump_of_the_heading():
     ("states", "trust", "words"),
     [
         ([live(1.0, connected=False, note="the port is gone")], Trust.UNKNOWN, "the port is gone"),
-        ([live(1.0)], Trust.YES, "can be trusted here"),
         ([live(0.1 * k, disturbed=k > 7) for k in range(10)], Trust.CARE, "20.0"),
         ([live(1.0, stray=0.08)], Trust.NO, "8.0"),
     ],

@@ -75,7 +75,7 @@ def test_a_cut_is_what_its_command_makes(viewer, page, cut, mode):
     command = commands(viewer._commands)[["along", "frame", "depth"].index(cut)]
     printed(page, command.replace(f"{cut}.png", f"{cut}-{mode}.nrrd"))
     levels = read_volume(page.folder.path / f"{cut}-{mode}.nrrd").voxels[..., 0].T.astype(float)
-    (packed,) = viewer._plots[cut]._image.data["image"]
+    (packed,) = viewer._plots[cut].source.data["image"]
     grey = (packed & 0xFF).astype(float)
     assert levels.shape == grey.shape
     seen = levels > 0

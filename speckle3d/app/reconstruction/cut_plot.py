@@ -6,14 +6,12 @@ from collections.abc import Callable
 
 import numpy as np
 from bokeh.events import Tap
-from bokeh.models import ColumnDataSource, DataRange1d
+from bokeh.models import ColumnDataSource
 from bokeh.models.annotations import Span
-from bokeh.plotting import figure
-from matplotlib import colormaps
 
+from speckle3d.app.plots import ImagePlot, greys
 from speckle3d.core.arrays import FloatArray
 from speckle3d.imaging.cuts.planes import ReslicePlane
-from speckle3d.study.figures import UNSEEN
 from speckle3d.study.reslices.cuts import CutPicture
 
 _OVERLAY_PERCENTILES = (5.0, 99.5)
@@ -22,7 +20,7 @@ _NEAR_MM = 0.3
 """A point is drawn in the cuts as near as this."""
 
 
-class CutPlot:
+class CutPlot(ImagePlot):
     """A plot of one cut.
 
     Parameters
@@ -36,24 +34,9 @@ class CutPlot:
     """
 
     def __init__(self, name: str, colours: tuple[str, str], tapped: Callable[[FloatArray], None]) -> None:
+        super().__init__("", "", name=f"cut-{name}", title=" ", active_drag=None)
         self.plane: ReslicePlane | None = None
-        self.plot = figure(
-            name=f"cut-{name}",
-            sizing_mode="stretch_both",
-            match_aspect=True,
-            title=" ",
-            y_range=DataRange1d(flipped=True),
-            background_fill_color=UNSEEN,
-            tools="pan,wheel_zoom,reset,save",
-            active_drag=None,
-            active_scroll="wheel_zoom",
-        )
-        self.plot.toolbar.logo = None
-        self.plot.grid.visible = False
         self.plot.title.update(text_font_size="12px", text_font_style="normal")
-        self.plot.axis.axis_label_text_font_style = "normal"
-        self._image = ColumnDataSource({name: [] for name in ("image", "x", "y", "dw", "dh")})
-        self.plot.image_rgba("image", "x", "y", "dw", "dh", source=self._image)
         self._lines = tuple(
             Span(dimension=dimension, line_color=colour, line_width=1.5)
             for dimension, colour in zip(("height", "width"), colours, strict=True)
@@ -66,14 +49,13 @@ class CutPlot:
         self.plot.text("x", "y", "number", x_offset=6, y_offset=-3, color="#ffe600", source=self._points)
         self.plot.on_event(Tap, lambda event: self._tapped(tapped, event))
 
-    def show(self, picture: CutPicture, mode: str, other: str | None) -> None:
+    def show_cut(self, picture: CutPicture, mode: str, other: str | None) -> None:
         """Show a cut at the poses of one mode, or of another (magenta) laid over it (green)."""
         drawn = picture.cuts[mode]
         assert isinstance(drawn.cut, ReslicePlane)  # only along a curve there is another kind
         low, high = picture.levels
         if other is None:
-            greys = colormaps["gray"].with_extremes(bad=UNSEEN)
-            colours = greys(np.clip((drawn.image - low) / (high - low), 0.0, 1.0), bytes=True)
+            colours = greys(drawn.image, low, high)
         else:
             # Of what the other is laid over: dark and bright, so that the colours are strong.
             dark, bright = np.nanpercentile(drawn.image, _OVERLAY_PERCENTILES)
@@ -81,9 +63,7 @@ class CutPlot:
             magenta, green = np.nan_to_num(np.clip((both - dark) / max(bright - dark, 1e-3), 0.0, 1.0))
             seen = np.isfinite(both).any(axis=0)
             colours = np.rint(255 * np.dstack([magenta, green, magenta, seen])).astype(np.uint8)
-        left, right, bottom, top = drawn.cut.extent_mm
-        place = {"x": [left], "y": [top], "dw": [right - left], "dh": [bottom - top]}
-        self._image.data = {"image": [np.ascontiguousarray(colours).view(np.uint32)[..., 0]], **place}
+        self.show(colours, drawn.cut.first_mm, (drawn.cut.pixel_mm,) * 2)
         self.plane = drawn.cut
         self.plot.title.text = picture.place.split(", seen")[0]
         self.plot.xaxis.axis_label, self.plot.yaxis.axis_label = (f"{name} / mm" for name in picture.axes)

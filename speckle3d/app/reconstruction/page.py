@@ -259,7 +259,7 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
         except Speckle3DError as error:
             plot.plot.title.text = str(error).split(";")[0]
             return
-        plot.show(picture, *self._pair)
+        plot.show_cut(picture, *self._pair)
         said = "".join(f"{label_of(mode)}: {length}<br>" for mode, length in picture.lengths.items())
         if self._pair[1]:
             said += "green: this mode alone, magenta: the other alone, grey: both"

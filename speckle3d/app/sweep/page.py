@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
-from functools import cached_property, partial
 from html import escape
 from typing import Any
 
@@ -13,15 +12,14 @@ import panel as pn
 import param
 from panel.viewable import Viewable
 
-from speckle3d.app.folder import Folder
 from speckle3d.app.look import batched
+from speckle3d.app.plots import greys
 from speckle3d.app.sweep.findings import FrameFindings
 from speckle3d.app.sweep.pairs import NEIGHBOURS, PatchValues, SweepPairs
-from speckle3d.app.sweep.plots import FLAGGED, ImagePlot, TimePlots
+from speckle3d.app.sweep.plots import FLAGGED, PatchPlot, TimePlots
 from speckle3d.config import Config, stored_config
-from speckle3d.core.arrays import ByteArray, Float32Array, FloatArray
+from speckle3d.core.arrays import FloatArray
 from speckle3d.core.doubts import Doubt
-from speckle3d.core.grid import ImageGrid
 from speckle3d.core.reconstruction import Reconstruction
 from speckle3d.core.sweep import OrientationSensor, Sweep, Tracker
 from speckle3d.study.images import GreyImages
@@ -43,8 +41,6 @@ class SweepPage:
     Parameters
     ----------
     sweep : Sweep
-    folder : Folder
-        Of its file.
     reconstruction : Reconstruction, optional
         Made from the sweep, with its frame pairs.
     doubts : sequence of Doubt, optional
@@ -56,7 +52,6 @@ class SweepPage:
     def __init__(
         self,
         sweep: Sweep,
-        folder: Folder,
         reconstruction: Reconstruction | None = None,
         doubts: Sequence[Doubt] | None = None,
     ) -> None:
@@ -64,6 +59,12 @@ class SweepPage:
         toml = "" if reconstruction is None else reconstruction.config_toml
         config = stored_config(toml) if toml else Config()
         self._images = GreyImages(sweep, _MOST_DB, settings=config.intensity)
+        grid = self._images.grid
+        # Rows that are shown are means of so many samples.
+        self._pooled = -(-grid.samples // MOST_ROWS)
+        row_mm = self._pooled * grid.sample_spacing_mm
+        first_mm = grid.first_sample_depth_mm + (row_mm - grid.sample_spacing_mm) / 2
+        self.place = (grid.first_vector_mm, first_mm), (grid.vector_pitch_mm, row_mm)
         self.pairs = SweepPairs(sweep, config, None if reconstruction is None else reconstruction.pairs)
         self.findings = FrameFindings(sweep, config, reconstruction, doubts)
 
@@ -71,19 +72,11 @@ class SweepPage:
         """Frames with a player."""
         return _Player(self).layout()
 
-    @cached_property
-    def grid(self) -> ImageGrid:
-        """Of the images that are shown."""
-        return pooled_grid(self._images.grid)
-
-    def image(self, frame: int) -> ByteArray:
-        """Picture of a frame, shape (row, column): 255 is the maximum, a level less 90/255 dB less."""
-        grid, grey = self.grid, self._images[frame]
-        pool = self._images.grid.samples // grid.samples
-        parts: Float32Array = grey[:, : pool * grid.samples].reshape(grid.vectors, grid.samples, pool)
-        # NumPy's mean takes more than twice as long over so short an axis.
-        mean = np.einsum("vrp->rv", parts) / np.float32(pool)
-        return np.asarray(np.rint(np.clip(np.nan_to_num(mean), 0, 255)), dtype=np.uint8, order="C")
+    def image(self, frame: int) -> FloatArray:
+        """Picture of a frame, shape (row, column), dB: 0 is white."""
+        levels = self._images[frame].T
+        rows = levels[: len(levels) // self._pooled * self._pooled].reshape(-1, self._pooled, levels.shape[1])
+        return np.asarray(_MOST_DB * (rows.mean(axis=1) / 255.0 - 1.0))
 
 
 class _Player(param.Parameterized):  # type: ignore[misc]
@@ -101,14 +94,12 @@ class _Player(param.Parameterized):  # type: ignore[misc]
         self.param.frame.bounds = (0, max(last, 1))
         self.param.colour.objects = ["none", *quantities]
         super().__init__(colour=quantities[0] if page.pairs.are_reconstructed else "none")
-        self._picture = ImagePlot(page.grid, page.pairs.patch_mm)
+        self._picture = PatchPlot(page.pairs.patch_mm)
         self._times = TimePlots(page.sweep, self.go)
         self._told = pn.pane.HTML("", sizing_mode="stretch_width")
         self._state = pn.pane.HTML("", sizing_mode="stretch_width")
-        self.param.watch(self._draw, ["frame", "colour", "lag"])
-        self.param.watch(self._draw_levels, "range_db")
+        self.param.watch(self._draw, ["frame", "colour", "lag", "range_db"])
         self._draw()
-        self._draw_levels()
         self._draw_findings()
 
     def layout(self) -> Viewable:
@@ -136,7 +127,7 @@ class _Player(param.Parameterized):  # type: ignore[misc]
             ),
             self._told,
             self._state,
-            *self._doubts(),
+            *(pn.pane.HTML(f"&bull; {escape(doubt.consequence)}") for doubt in self._findings.doubts),
             pn.pane.Bokeh(self._times.marks, **wide),
             *(streams or [pn.pane.HTML("No sensor was recorded with this sweep.")]),
             sizing_mode="stretch_both",
@@ -148,17 +139,6 @@ class _Player(param.Parameterized):  # type: ignore[misc]
     def go(self, frame: int) -> None:
         """Show a frame."""
         self.frame = int(np.clip(frame, 0, len(self._page.sweep) - 1))
-
-    def _doubts(self) -> Iterator[Viewable]:
-        """What is doubted of the recording, with buttons that lead to the frames of each."""
-        for doubt in self._findings.doubts:
-            yield pn.pane.HTML(f"&bull; {escape(doubt.consequence)}")
-            buttons = []
-            for first, last in doubt.frames[:6]:
-                name = f"frame {first}" if first == last else f"frames {first}–{last}"
-                buttons.append(pn.widgets.Button(name=name, button_style="outline", margin=(0, 3)))
-                buttons[-1].on_click(partial(lambda frame, _: self.go(frame), first))
-            yield pn.Row(*buttons, margin=(0, 10))
 
     def _judge(self) -> None:
         """Look at more frames, as long as some are not judged."""
@@ -176,10 +156,6 @@ class _Player(param.Parameterized):  # type: ignore[misc]
         self._state.object = escape(self._findings.state())
 
     @batched
-    def _draw_levels(self, *_: Any) -> None:
-        self._picture.levels.low = 255.0 * (1.0 - self.range_db / _MOST_DB)
-
-    @batched
     def _draw(self, *_: Any) -> None:
         frame, pairs = self.frame, self._page.pairs
         # Where the sweep ends, the other way.
@@ -187,9 +163,8 @@ class _Player(param.Parameterized):  # type: ignore[misc]
         values = None
         if self.colour != "none" and self.lag and 0 <= other < len(self._page.sweep):
             values = pairs.values(frame, other, self.colour == "correlation")
-        self._picture.show(self._page.image(frame))
-        most = pairs.most(self.colour, self.lag)
-        self._picture.colour(values, self.colour, most)
+        self._picture.show(greys(self._page.image(frame), -self.range_db, 0.0), *self._page.place)
+        self._picture.colour(values, self.colour, pairs.most(self.colour))
         self._times.move(frame)
         self._told.object = "<br>".join(self._words(frame, other, values))
 
@@ -215,14 +190,6 @@ class _Player(param.Parameterized):  # type: ignore[misc]
             yield f"{values.used.sum()} patches used, {left_out.sum()} left out (red crosses)"
         elif self._page.pairs.are_reconstructed:
             yield "The reconstruction did not use this pair."
-
-
-def pooled_grid(grid: ImageGrid) -> ImageGrid:
-    """Grid of images whose rows are means of so many samples that at most `MOST_ROWS` are left."""
-    pool = -(-grid.samples // MOST_ROWS)
-    first_mm = grid.first_sample_depth_mm + (pool - 1) / 2 * grid.sample_spacing_mm
-    rows, row_mm = grid.samples // pool, pool * grid.sample_spacing_mm
-    return ImageGrid(grid.vectors, rows, grid.vector_pitch_mm, row_mm, first_mm)
 
 
 def streams_of(sweep: Sweep) -> Iterator[Stream]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -73,13 +74,11 @@ class SweepPairs:
         width, height = (self._matcher.patches.size * self._matcher.patches.spacing_mm).tolist()
         return width, height
 
-    def most(self, by: str, lag: int) -> float:
-        """End of a colour scale: what all but a hundredth of the patches of pairs so far apart stay below."""
+    def most(self, by: str) -> float:
+        """End of a colour scale: what all but a hundredth of the patches of all pairs stay below."""
         if by not in ("distance", "sigma") or self._pairs is None:
             return 1.0
-        values = self._pairs.distance_mm if by == "distance" else self._pairs.sigma_mm
-        alike = values[self._pairs.second - self._pairs.first == abs(lag)]
-        return float(np.nanpercentile(alike if np.isfinite(alike).any() else values, 99))
+        return float(np.nanpercentile(getattr(self._pairs, f"{by}_mm"), 99))
 
     def values(self, frame: int, other: int, with_correlation: bool) -> PatchValues:
         """Patches of a frame by its pair with another.
@@ -90,24 +89,17 @@ class SweepPairs:
             Whether to correlate the two frames, which takes as long as some pictures.
         """
         first, second = sorted((frame, other))
-        row, correlation = self._row(first, second), np.full(len(self._matcher.patches), np.nan)
-        nothing, first_from_second = correlation, RigidTransform.identity()
+        row, nothing = self._row(first, second), np.full(len(self._matcher.patches), np.nan)
+        correlation, first_from_second = nothing, RigidTransform.identity()
         if with_correlation or row is None:
             correlation, first_from_second = self._matched(first, second)
-        if row is None or self._pairs is None:
-            return PatchValues(
-                *self._placed(first_from_second, frame == second), correlation, nothing, nothing
-            )
-        first_from_second = RigidTransform.from_matrix(self._pairs.first_from_second[row])
-        apart = abs(float(first_from_second.apply(self._matcher.centre_mm)[2]))
-        return PatchValues(
-            *self._placed(first_from_second, frame == second),
-            correlation,
-            self._pairs.distance_mm[row].astype(float),
-            self._pairs.sigma_mm[row].astype(float),
-            self._pairs.used[row],
-            (apart, float(np.sqrt(self._pairs.covariance[row, 2, 2]))),
-        )
+        kept: dict[str, Any] = {"distance_mm": nothing, "sigma_mm": nothing}
+        if row is not None and (pairs := self._pairs) is not None:
+            first_from_second = RigidTransform.from_matrix(pairs.first_from_second[row])
+            apart = abs(float(first_from_second.apply(self._matcher.centre_mm)[2]))
+            kept = {name: getattr(pairs, name)[row].astype(float) for name in kept}
+            kept |= {"used": pairs.used[row], "moved_mm": (apart, float(pairs.covariance[row, 2, 2] ** 0.5))}
+        return PatchValues(*self._placed(first_from_second, frame == second), correlation, **kept)
 
     def _matched(self, first: int, second: int) -> tuple[FloatArray, RigidTransform]:
         """Correlation of every patch, and the motion in the plane if the frames have anything in common."""

@@ -9,8 +9,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from speckle3d.cli.calibrations import require_free
-from speckle3d.cli.common import Json, MaybePath, MaybeText, OptionalOut, PixelMm, emit, note
+from speckle3d.cli.common import MaybePath, MaybeText, OptionalOut, PixelMm, Result, note
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError, naming
 from speckle3d.core.progress import progress_bar
 
@@ -25,9 +24,8 @@ def clock(
     region: MaybeText = None,
     search_s: Annotated[float, typer.Option(min=0.02)] = 0.5,
     calibration: MaybePath = None,
-    out: OptionalOut = None,
-    as_json: Json = False,
-) -> None:
+    out: Annotated[OptionalOut, "calibration"] = None,
+) -> Result:
     """Find a sensor's clock offset: a motion forward and back, or up and down (or rolling) over a plane.
 
     The offset is added to the sensor's times; PLUS's LocalTimeOffsetSec, of the image device, is the same
@@ -64,10 +62,7 @@ def clock(
     from speckle3d.calibrating.recordings import open_recording
     from speckle3d.calibrating.settings import region_of
     from speckle3d.io.calibrations import read_calibration, write_calibration
-    from speckle3d.study.results import json_text
 
-    if out is not None:
-        require_free(out, images, poses, calibration)
     if by == "images" and sensor != "tracker":
         raise InvalidInputError(f"--by images: expected --sensor tracker, which knows places, got {sensor}")
     known = None if calibration is None else read_calibration(calibration)
@@ -96,16 +91,16 @@ def clock(
     else:
         with naming("--region"):
             corners = region_of(region or "")
+        times, columns = recording.frame_time_s, recording.images.shape[1]
         with progress_bar(f"finding lines in {images.name}") as progress, naming(str(images)):
             seen = detect_lines(recording.images, recording.pixel_mm, None, corners, progress)
-        frames, times = len(seen), recording.frame_time_s
-        if frames < FEWEST_FRAMES:
-            raise InsufficientDataError(
-                f"{images}: expected a line in at least {FEWEST_FRAMES} frames, got one in {frames} of "
-                f"{len(times)}: record a plane's echo, for longer; of tissue use --by images"
-            )
-        with naming(str(images)):
-            signal = line_signal(seen.pixels, recording.pixel_mm, (recording.images.shape[1] - 1) / 2)
+            frames = len(seen)
+            if frames < FEWEST_FRAMES:
+                raise InsufficientDataError(
+                    f"expected a line in at least {FEWEST_FRAMES} frames, got one in {frames} of "
+                    f"{len(times)}: record a plane's echo, for longer; of tissue use --by images"
+                )
+            signal = line_signal(seen.pixels, recording.pixel_mm, (columns - 1) / 2)
             readings, around_s = recording.readings, recording.time_offset_s
             delay = delay_from_lines(signal, times[seen.frame], readings, around_s, search_s)
         words = f"the sensor explains {100 * delay.followed:.0f} % of the line's motion in {frames} frames"
@@ -113,9 +108,6 @@ def clock(
         write_calibration(out, replace(known, time_offset_s=delay.seconds))
         note(f"calibration with this offset in {out}")
     error_s = delay.standard_error_s
-    if as_json:
-        offset = {"time_offset_s": delay.seconds, "standard_error_s": error_s}
-        emit(json_text({**offset, "followed": delay.followed, "frames": frames}))
-        return
-    emit(f"sensor clock offset  {delay.seconds:+.4f} +- {1.96 * error_s:.4f} s (95 %)")
-    emit(words)
+    offset = {"time_offset_s": delay.seconds, "standard_error_s": error_s}
+    numbers = offset | {"followed": delay.followed, "frames": frames}
+    return numbers, f"sensor clock offset  {delay.seconds:+.4f} +- {1.96 * error_s:.4f} s (95 %)\n{words}"

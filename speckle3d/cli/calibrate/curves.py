@@ -8,17 +8,14 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from speckle3d.cli.common import (
-    Json,
     MaybePath,
     MaybeText,
     Out,
-    emit,
-    emit_json,
+    Result,
     load_settings,
     note,
     part_of,
 )
-from speckle3d.cli.outputs import require_own_place
 from speckle3d.core.errors import naming
 from speckle3d.core.progress import progress_bar
 
@@ -27,7 +24,7 @@ if TYPE_CHECKING:
 
 
 def curves(
-    out: Out,
+    out: Annotated[Out, "curves"],
     sweeps: Annotated[list[Path] | None, typer.Argument(metavar="SWEEP...")] = None,
     probe: MaybePath = None,
     like: MaybePath = None,
@@ -35,8 +32,7 @@ def curves(
     region: MaybeText = None,
     frames: MaybeText = None,
     config_file: MaybePath = None,
-    as_json: Json = False,
-) -> None:
+) -> Result:
     """Measure decorrelation curves on sweeps with known positions, or calculate them from a data sheet.
 
     One of SWEEPS or --probe. Positions are a sweep's /truth, or else its /tracker.
@@ -73,7 +69,6 @@ def curves(
     from speckle3d.sheet_curves import ProbeSheet, data_sheet_curves
     from speckle3d.tracked_curves import jitters, tracked_curves
 
-    require_own_place(out, "curves", *(sweeps or []), config_file, probe, like, start)
     settings = load_settings(config_file).with_choices(region=region)
     if probe is not None:
         with naming(str(probe)):
@@ -90,30 +85,27 @@ def curves(
             else:
                 found = calibrate_curves(loaded, settings, progress)
     write_curves(out, found)
-    _show(found, as_json)
+    return _shown(found)
 
 
-def _show(curves: DecorrelationCurves, as_json: bool) -> None:
+def _shown(curves: DecorrelationCurves) -> Result:
     import numpy as np
 
     first = (curves.correlation < 0.5).argmax(axis=1)
-    below = curves.correlation.min(axis=1) < 0.5
-    half = [float(curves.distance_mm[i]) if b else float("nan") for i, b in zip(first, below, strict=True)]
-    if as_json:
-        half_mm = [width if np.isfinite(width) else None for width in half]
-        by_depth = {"depth_mm": curves.depth_mm.tolist(), "half_mm": half_mm, "cells": curves.cells.tolist()}
-        tilt = {} if curves.tilt is None else {name: v.tolist() for name, v in vars(curves.tilt).items()}
-        about = {"pairs": curves.pairs_used, "origin": curves.origin, "scale_sigma": curves.scale_sigma}
-        emit_json(by_depth | tilt | about)
-        return
+    half_mm = np.where(curves.correlation.min(axis=1) < 0.5, curves.distance_mm[first], np.nan)
+    by_depth = {"depth_mm": curves.depth_mm, "half_mm": half_mm, "cells": curves.cells}
+    tilt = {} if curves.tilt is None else vars(curves.tilt)
+    about = {"pairs": curves.pairs_used, "origin": curves.origin, "scale_sigma": curves.scale_sigma}
     made = (
         "calculated, not measured" if curves.origin == "data sheet" else "corrected to the tracker's length"
     )
     seen = f"{curves.pairs_used} frame pairs" if curves.pairs_used else made
-    emit(f"{seen}; correlation falls to one half at")
-    for depth, distance, cells in zip(curves.depth_mm, half, curves.cells, strict=True):
+    lines = [f"{seen}; correlation falls to one half at"]
+    for depth, distance, cells in zip(curves.depth_mm, half_mm, curves.cells, strict=True):
         width = f"{distance:.2f}" if np.isfinite(distance) else f"more than {curves.distance_mm[-1]:.2f}"
-        emit(f"  {depth:5.1f} mm depth: {width} mm  ({cells:.0f} independent cells in a patch)")
-    emit(f"lengths read with them on sweeps of a probe like this: +- {196 * curves.scale_sigma:.1f} % (95 %)")
+        lines.append(f"  {depth:5.1f} mm depth: {width} mm  ({cells:.0f} independent cells in a patch)")
+    error = f"+- {196 * curves.scale_sigma:.1f} % (95 %)"
+    lines.append(f"lengths read with them on sweeps of a probe like this: {error}")
     if curves.tilt is None:
         note("the phantom sweeps hardly turned: tilt will be taken to be about the image's centre")
+    return by_depth | tilt | about, "\n".join(lines)

@@ -8,18 +8,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from speckle3d.cli.calibrations import report_written, require_free
+from speckle3d.cli.calibrations import report_of
 from speckle3d.cli.commands import Fields
 from speckle3d.cli.common import (
-    Json,
     MaybeNumber,
     MaybePath,
     MaybeText,
     Out,
     Paths,
     PixelMm,
-    from_options,
-    require_finite,
+    Result,
 )
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.progress import progress_bar
@@ -34,7 +32,7 @@ Triple = tuple[float, float, float]
 def images(
     first: Annotated[Path, typer.Argument(metavar="A")],
     second: Annotated[Path, typer.Argument(metavar="B")],
-    out: Out,
+    out: Annotated[Out, "calibration"],
     *,
     start: MaybePath = None,
     start_mm: Triple | None = None,
@@ -42,10 +40,9 @@ def images(
     poses: Paths = None,
     transform: MaybeText = None,
     pixel_mm: PixelMm = None,
-    settings: Annotated[dict[str, Any], Fields("calibration.settings:ImageFit")],
+    settings: Annotated[Any, Fields("calibration.settings:ImageFit")],
     time_offset_s: MaybeNumber = None,
-    as_json: Json = False,
-) -> None:
+) -> Result:
     """Calibrate a position sensor from two crossing sweeps of anything with visible structure.
 
     Parameters
@@ -81,16 +78,12 @@ def images(
     from calibration.images.angulation import angulation
     from calibration.images.report import calibration_from_images, figure_of, notes_of
     from calibration.images.solver import calibrate_images
-    from calibration.settings import ImageFit
     from speckle3d.calibrating.recordings import open_recording
     from speckle3d.calibrating.written import write_with_report
     from speckle3d.io.calibrations import read_calibration
 
-    require_finite("--time-offset-s", time_offset_s)
     if poses and len(poses) != 2:
         raise InvalidInputError(f"--poses: expected it twice, for A and for B, got {len(poses)}")
-    require_free(out, first, second, start, *(poses or ()))
-    fit = from_options(ImageFit, settings)
     known = None if start is None else read_calibration(start)
     offset_s = known.time_offset_s if time_offset_s is None and known is not None else time_offset_s
     readings = poses or (None, None)
@@ -107,11 +100,11 @@ def images(
     posed = [sweep.world_from_sensor(sweep.covered()) for sweep in sweeps]
     angulation(posed[0], posed[1], begin).require(0.5)
     with progress_bar("comparing sweeps") as bar:
-        found = calibrate_images(one, other, begin, fit, bar)
+        found = calibrate_images(one, other, begin, settings, bar)
     notes = notes_of(found)
     made = calibration_from_images(found, sweeps)
     written = write_with_report(made, (first, second), out, lambda _: figure_of(found, sweeps), notes)
-    report_written(written, notes, as_json=as_json)
+    return report_of(written, notes)
 
 
 def _start(
@@ -127,8 +120,6 @@ def _start(
     from speckle3d.core.geometry import rotation_from_fixed_angles
 
     if start_mm is not None and start_deg is not None:
-        require_finite("--start-mm", *start_mm)
-        require_finite("--start-deg", *start_deg)
         roll, yaw, tilt = np.deg2rad(start_deg)
         return RigidTransform.from_components(start_mm, rotation_from_fixed_angles(roll, yaw, tilt))
     if mounting is None:

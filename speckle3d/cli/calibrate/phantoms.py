@@ -5,11 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
-
-from speckle3d.cli.calibrations import report_written, require_free
+from speckle3d.cli.calibrations import report_of
 from speckle3d.cli.commands import Fields
-from speckle3d.cli.common import Json, Out, emit, emit_json, from_options, note
+from speckle3d.cli.common import Out, Result, note
 from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.progress import progress_bar
 
@@ -19,10 +17,9 @@ if TYPE_CHECKING:
 
 def plane(
     images: Path,
-    out: Out,
-    settings: Annotated[dict[str, Any], Fields("speckle3d.calibrating.settings:PlaneSettings")],
-    as_json: Json = False,
-) -> None:
+    out: Annotated[Out, "calibration"],
+    settings: Annotated[Any, Fields("speckle3d.calibrating.settings:PlaneSettings")],
+) -> Result:
     """Calibrate a position sensor with the floor of a water bath, or the Cambridge phantom.
 
     Parameters
@@ -36,17 +33,14 @@ def plane(
     --------
     $ speckle3d calibrate plane bath.h5 -o tracker.h5 --reflector bar
     """
-    from speckle3d.calibrating.settings import PlaneSettings
-
-    _calibrate(images, from_options(PlaneSettings, settings), out, as_json)
+    return _calibrate(images, settings, out)
 
 
 def orientation(
     images: Path,
-    out: Out,
-    settings: Annotated[dict[str, Any], Fields("speckle3d.calibrating.settings:OrientationSettings")],
-    as_json: Json = False,
-) -> None:
+    out: Annotated[Out, "calibration"],
+    settings: Annotated[Any, Fields("speckle3d.calibrating.settings:OrientationSettings")],
+) -> Result:
     """Calibrate an orientation sensor with the floor of a water bath.
 
     Parameters
@@ -60,18 +54,14 @@ def orientation(
     --------
     $ speckle3d calibrate orientation bath.h5 -o imu.h5
     """
-    from speckle3d.calibrating.settings import OrientationSettings
-
-    _calibrate(images, from_options(OrientationSettings, settings), out, as_json)
+    return _calibrate(images, settings, out)
 
 
 def wires(
     images: Path,
-    out: Out,
-    phantom: Annotated[str, typer.Option()],
-    settings: Annotated[dict[str, Any], Fields("speckle3d.calibrating.settings:WireSettings")],
-    as_json: Json = False,
-) -> None:
+    out: Annotated[Out, "calibration"],
+    settings: Annotated[Any, Fields("speckle3d.calibrating.settings:WireSettings")],
+) -> Result:
     """Calibrate a position sensor with crossing wires, three orthogonal wires or N-shapes.
 
     Parameters
@@ -79,28 +69,21 @@ def wires(
     images
     out
         Calibration file to write; .txt, .png and .csv beside it.
-    phantom
-        cross, three, or a PLUS configuration of N-wires.
-    points, poses, transform, pixel_mm, time_offset_s, as_json
+    phantom, points, poses, transform, pixel_mm, time_offset_s, as_json
 
     Examples
     --------
     $ speckle3d calibrate wires scan.mha -o tracker.h5 --phantom cross
     """
-    from speckle3d.calibrating.settings import WireSettings
-
-    _calibrate(images, from_options(WireSettings, {**settings, "phantom": phantom}), out, as_json)
+    return _calibrate(images, settings, out)
 
 
-def _calibrate(images: Path, settings: ScanSettings, out: Path, as_json: bool) -> None:
+def _calibrate(images: Path, settings: ScanSettings, out: Path) -> Result:
     """Calibrate, check on the other recording, and write the calibration, its report and the dots."""
     from speckle3d.calibrating.phantoms import found, opened, remarks, solved, validated, write_outcome
 
     if settings.validation is None and getattr(settings, "validation_points", None) is not None:
         raise InvalidInputError("--validation-points: expected the recording in --validation, got none")
-    files = [getattr(settings, name, None) for name in ("points", "validation_points", "phantom")]
-    others = [None if file is None else Path(file) for file in files]
-    require_free(out, images, settings.poses, settings.validation, *others)
     recording = opened(images, settings)
     with progress_bar(f"looking into {images.name}") as progress, naming(str(images)):
         seen = found(recording, settings, progress)
@@ -111,12 +94,10 @@ def _calibrate(images: Path, settings: ScanSettings, out: Path, as_json: bool) -
         with progress_bar(f"looking into {settings.validation.name}") as progress:
             notes += validated(outcome, settings, progress)
     written = write_outcome(outcome, settings, images, out, notes)
-    report_written(written, notes, outcome.beam, as_json)
+    return report_of(written, notes, outcome.beam)
 
 
-def repeatability(
-    calibrations: list[Path], size_px: tuple[int, int] | None = None, as_json: Json = False
-) -> None:
+def repeatability(calibrations: list[Path], size_px: tuple[int, int] | None = None) -> Result:
     """Compare repeated calibrations: scatter of roll, yaw and tilt, and of the image's centre and corners.
 
     Parameters
@@ -136,23 +117,23 @@ def repeatability(
     from calibration.repeatability import repeatability as repeated
     from speckle3d.io.calibrations import read_calibration
 
-    found = repeated([read_calibration(path) for path in calibrations], size_px)
-    angles = np.rad2deg(found.roll_yaw_tilt_sd_rad).tolist()
-    shifts = found.centre_shift_mm
-    if as_json:
-        table = {
-            "trials": found.trials,
-            "roll_yaw_tilt_sd_deg": angles,
-            "centre_sd_mm": found.centre_sd_mm,
-            "corner_sd_mm": found.corner_sd_mm,
-            "centre_shift_mm": None if shifts is None else shifts.tolist(),
-        }
-        emit_json(table)
-        return
-    emit(f"standard deviation over {found.trials} calibrations")
-    emit("  roll {:.3f}, yaw {:.3f}, tilt {:.3f} deg".format(*angles))
-    if shifts is None:
+    scatter = repeated([read_calibration(path) for path in calibrations], size_px)
+    angles_deg, shifts_mm = np.rad2deg(scatter.roll_yaw_tilt_sd_rad), scatter.centre_shift_mm
+    lines = [
+        f"standard deviation over {scatter.trials} calibrations",
+        "  roll {:.3f}, yaw {:.3f}, tilt {:.3f} deg".format(*angles_deg),
+    ]
+    if shifts_mm is None:
         note("with --size-px COLUMNS ROWS also the scatter of the image's centre and corners")
-        return
-    emit(f"  centre {found.centre_sd_mm:.3f} mm, corners {found.corner_sd_mm:.3f} mm")
-    emit(f"centre against the first calibration: {', '.join(f'{shift:.2f}' for shift in shifts)} mm")
+    else:
+        lines.append(f"  centre {scatter.centre_sd_mm:.3f} mm, corners {scatter.corner_sd_mm:.3f} mm")
+        shifts = ", ".join(f"{shift:.2f}" for shift in shifts_mm)
+        lines.append(f"centre against the first calibration: {shifts} mm")
+    numbers = {
+        "trials": scatter.trials,
+        "roll_yaw_tilt_sd_deg": angles_deg,
+        "centre_sd_mm": scatter.centre_sd_mm,
+        "corner_sd_mm": scatter.corner_sd_mm,
+        "centre_shift_mm": shifts_mm,
+    }
+    return numbers, "\n".join(lines)

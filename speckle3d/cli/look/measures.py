@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from speckle3d.cli.common import Json, MaybeNumber, MaybePath, MaybeText, Out, emit, emit_json, note
+from speckle3d.cli.common import MaybeNumber, MaybePath, MaybeText, Out, Result, note, notes
 from speckle3d.cli.outputs import require_own_place
 from speckle3d.core.errors import InvalidInputError
 
@@ -25,9 +25,8 @@ def measure(
     points: MaybePath = None,
     on: MaybePath = None,
     mode: MaybeText = None,
-    pick_mm: MaybeNumber = None,
-    as_json: Json = False,
-) -> None:
+    pick_mm: Annotated[MaybeNumber, typer.Option(min=0.0)] = None,
+) -> Result:
     """Say how long it is between points, and how sure that is: distances, the line's length, angles.
 
     One of --point or --points. Standard errors are those of the poses of the frames on either side of each
@@ -64,8 +63,6 @@ def measure(
     from speckle3d.study.reslices.cut_geometry import read_plane
 
     columns = WORLD if on is None else PICTURE
-    if pick_mm is not None and not 0.0 <= pick_mm < float("inf"):
-        raise InvalidInputError(f"--pick-mm: expected zero or more, got {pick_mm}")
     places = read_places(points, columns) if points is not None else parse_places(point or [], columns)
     if (kind := kind_of(reconstruction_file)) != FORMAT:
         raise InvalidInputError(
@@ -80,16 +77,11 @@ def measure(
     elif mode is None:
         mode, why = default_mode(made)
     picked = PICKED * made.grid.vector_pitch_mm if pick_mm is None else pick_mm
-    found = measure_points(made, places, mode, picked)
-    if as_json:
-        emit_json({"mode": mode, "pick_mm": picked, "measurements": [_plain(each) for each in found]})
-    else:
-        for each in found:
-            emit(each.line)
-        emit(f"mode {mode}; points picked to {picked:.2g} mm per axis; +- a standard error, 95 % in brackets")
-    for words in (why, caution(made, mode)):
-        if words:
-            note(words)
+    measured = measure_points(made, places, mode, picked)
+    notes(filter(None, (why, caution(made, mode))))
+    how = f"mode {mode}; points picked to {picked:.2g} mm per axis; +- a standard error, 95 % in brackets"
+    numbers = {"mode": mode, "pick_mm": picked, "measurements": [_plain(each) for each in measured]}
+    return numbers, "\n".join([*(each.line for each in measured), how])
 
 
 def _plain(measured: Measurement) -> dict[str, Any]:
@@ -112,7 +104,7 @@ def _plain(measured: Measurement) -> dict[str, Any]:
 
 def surface(
     volume_file: Path,
-    out: Out,
+    out: Annotated[Out, "surface"],
     level: MaybeNumber = None,
     below: bool = False,
     labels: bool = False,
@@ -121,8 +113,7 @@ def surface(
     reconstruction: MaybePath = None,
     mode: MaybeText = None,
     state: MaybePath = None,
-    as_json: Json = False,
-) -> None:
+) -> Result:
     """Find the surface where a volume crosses a grey level, or those of its labels, and measure them.
 
     One of --level or --labels. Where the sweep ends the surface stays open, and what is open has no volume.
@@ -166,28 +157,23 @@ def surface(
     from speckle3d.io.voxels.volumes import read_states, read_volume
 
     suffix = require_suffix(out, SUFFIXES)
-    if not labels:
-        require_own_place(out, "surface", volume_file, reconstruction, state)
     volume = read_volume(volume_file)
     errors = _errors(reconstruction, mode, volume, volume_file)
     known = None if state is None else read_states(state, volume) != EMPTY
     if level is not None:
-        found = {out: surface_of(volume, level, "below" if below else "above", known)}
+        surfaces = {out: surface_of(volume, level, "below" if below else "above", known)}
     else:
         by_label = surfaces_of_labels(volume).items()
-        found = {out.with_name(f"{out.stem}-{label}{suffix}"): each for label, each in by_label}
-        for place in found:
-            require_own_place(place, "surface", volume_file, reconstruction)
+        surfaces = {out.with_name(f"{out.stem}-{label}{suffix}"): each for label, each in by_label}
+        for place in surfaces:
+            require_own_place(place, "surface")
     sizes = []
-    for place, rough in found.items():
+    for place, rough in surfaces.items():
         whole = largest_part(rough) if largest else rough
         final = smoothed(whole, smooth) if smooth else whole
         write_surface(place, final)
-        sizes.append(_sizes(place, whole, final, *(errors or ())))
-    if as_json:
-        emit_json(sizes)
-    else:
-        emit("\n".join(map(_line, sizes)))
+        sizes.append(_sizes(place, final, *(errors or ())))
+    return sizes, "\n".join(map(_line, sizes))
 
 
 def _errors(
@@ -211,38 +197,26 @@ def _errors(
     return errors_of(made, made_at), made.grid
 
 
-def _sizes(place: Path, rough: Surface, surface: Surface, *errors: Any) -> dict[str, Any]:
+def _sizes(place: Path, surface: Surface, *errors: Any) -> dict[str, Any]:
     """What is said of one surface."""
     from dataclasses import asdict
 
+    import numpy as np
+
     from speckle3d.imaging.measures.surface import measures_of
 
-    measures = measures_of(surface, *errors)
-    extent = surface.vertices_mm.max(axis=0) - surface.vertices_mm.min(axis=0)
-    sizes = {"file": str(place), **asdict(measures), "parts": int(surface.parts().max()) + 1}
-    sizes["size_mm"] = extent.tolist()
-    if surface is not rough:
-        before = measures_of(rough).volume_mm3
-        if measures.volume_mm3 is not None and before:
-            sizes["smoothing_changed_volume"] = measures.volume_mm3 / before - 1.0
-    return sizes
+    about = {"parts": int(surface.parts().max()) + 1, "size_mm": np.ptp(surface.vertices_mm, axis=0)}
+    return {"file": str(place), **asdict(measures_of(surface, *errors)), **about}
 
 
 def _line(sizes: dict[str, Any]) -> str:
-    def with_error(name: str, unit: str) -> str:
-        value, sigma = (sizes[f"{name}{end}_{unit}"] for end in ("", "_sigma"))
-        return f"{name} {value:.1f}" + ("" if sigma is None else f" +- {1.96 * sigma:.1f}") + f" {unit}"
-
-    words = [f"{sizes['triangles']} triangles", f"{sizes['parts']} part{'s' if sizes['parts'] > 1 else ''}"]
+    words = [f"{sizes['triangles']} triangles", f"{sizes['parts']} part(s)"]
     words.append(" x ".join(f"{size:.1f}" for size in sizes["size_mm"]) + " mm")
-    words.append(with_error("area", "mm2"))
-    if sizes["volume_mm3"] is not None:
-        words.append(with_error("volume", "mm3"))
-    if sizes["area_sigma_mm2"] is not None:
-        words.append("+- 95 %")
+    for name, unit in (("area", "mm2"), ("volume", "mm3")):
+        value, sigma = sizes[f"{name}_{unit}"], sizes[f"{name}_sigma_{unit}"]
+        if value is not None:
+            error = "" if sigma is None else f" +- {1.96 * sigma:.1f} (95 %)"
+            words.append(f"{name} {value:.1f}{error} {unit}")
     if sizes["open_mm"] > 0:
-        closed = "" if sizes["volume_mm3"] is None else " (volume of the closed parts)"
-        words.append(f"open along {sizes['open_mm']:.1f} mm where the sweep or the grid ends{closed}")
-    if "smoothing_changed_volume" in sizes:
-        words.append(f"smoothing changed the volume by {100 * sizes['smoothing_changed_volume']:+.2f} %")
+        words.append(f"open along {sizes['open_mm']:.1f} mm where the sweep or the grid ends")
     return f"{sizes['file']}: {', '.join(words)}"

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
-from speckle3d.cli.calibrations import files_of, given_settings
-from speckle3d.cli.common import MaybeNumber, MaybePath, MaybeText, Out, Paths, notes
-from speckle3d.cli.look.volumes import Imported, region_of
-from speckle3d.cli.outputs import require_own_place
+from speckle3d.cli.common import MaybeNumber, MaybePath, MaybeText, Out
+from speckle3d.cli.look.volumes import Imported, Statement, open_sweep_at
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.progress import progress_bar
 
@@ -16,12 +14,10 @@ if TYPE_CHECKING:
     from speckle3d.core.arrays import FloatArray
     from speckle3d.study.posed import OpenedModes
 
-Triple = tuple[float, float, float]
-
 
 def reslice(
     input_file: Path,
-    out: Out,
+    out: Annotated[Out, "picture volume"],
     *,
     mode: list[str] | None = None,
     difference_to: MaybeText = None,
@@ -30,19 +26,14 @@ def reslice(
     frame: int | None = None,
     angle_deg: float = 0.0,
     points: MaybeText = None,
-    origin: Triple | None = None,
-    right: Triple | None = None,
-    down: Triple | None = None,
+    down: tuple[float, float, float] | None = None,
     curve: MaybePath = None,
     on: MaybePath = None,
     straight: bool = False,
     pixel_mm: float = 0.2,
     reach_mm: float = 0.5,
-    region: MaybeText = None,
-    sweep_file: MaybePath = None,
+    stated: Statement,
     dynamic_range_db: MaybeNumber = None,
-    calibration: Paths = None,
-    transform: MaybeText = None,
     imported: Imported,
 ) -> None:
     """Cut a plane or along a curve, straight from the frames at the poses of one or more modes.
@@ -55,14 +46,14 @@ def reslice(
     mode
         Which poses to use, as in `volume`; repeated, modes stand side by side.
     lateral_mm
-        Cut along the sweep at this lateral position (middle). Not with --depth-mm or --points or --origin
-        or --curve.
+        Cut along the sweep at this lateral position (middle). Not with --depth-mm or --points or --curve.
     depth_mm
-        Cut parallel to the skin at this depth. Not with --frame or --points or --origin or --curve.
+        Cut parallel to the skin at this depth. Not with --frame or --points or --curve.
     frame
-        Cut in the plane of this frame, from 0. Not with --points or --origin or --curve.
+        Cut in the plane of this frame, from 0. Not with --points or --curve.
     points
-        Cut through three points of the world, 'X,Y,Z X,Y,Z X,Y,Z' in mm. Not with --origin or --curve.
+        Cut through three points of the world, 'X,Y,Z X,Y,Z X,Y,Z' in mm: of the first row and, in it, the
+        first column, farther along it, and on the side of the columns. Not with --curve.
     curve
         CSV of a curve's points x_mm,y_mm,z_mm in the world: cut along it and into the depth.
     on
@@ -74,12 +65,8 @@ def reslice(
         What modes are compared with (truth or tracker if known, else the first).
     angle_deg
         With --frame: turn out of it about its depth line; 90 is along the sweep.
-    origin
-        With --right: cut through this point of the world, mm. Not with --curve.
-    right
-        With --origin: direction of the picture's rows. With --down.
     down
-        With --origin or --curve: direction of its columns (curve: depth).
+        With --curve: direction of the picture's columns (depth).
     straight
         Join the curve's points by straight lines, not by a spline.
     pixel_mm
@@ -88,7 +75,7 @@ def reslice(
         Frames farther from a pixel do not count (0.5).
     dynamic_range_db
         Range of log-compressed grey levels (60).
-    region, sweep_file, calibration, transform
+    region, sweep_file, calibration, tracker_transform
 
     Examples
     --------
@@ -98,28 +85,23 @@ def reslice(
     from speckle3d.io.points import parse_places
     from speckle3d.io.voxels.volume_writer import SUFFIXES, write_volume
     from speckle3d.study.figures import RANGE_DB
-    from speckle3d.study.posed import at_modes, open_posed
+    from speckle3d.study.posed import at_modes
     from speckle3d.study.reslices.cuts import cut_as_volume, cut_posed
     from speckle3d.study.reslices.places import along_curve, along_sweep, in_frame, in_world
     from speckle3d.study.reslices.reslice_figures import save_reslices
 
-    as_volume = out.name.lower().endswith(SUFFIXES)
-    read = (input_file, sweep_file, curve, on, *files_of(imported, calibration))
-    require_own_place(out, "volume" if as_volume else "picture", *read)
+    is_picture = out.suffix.lower() == ".png"
+    if not (is_picture or out.name.lower().endswith(SUFFIXES)):
+        raise InvalidInputError(f"{out}: expected a name ending in .png, {', '.join(SUFFIXES)}")
     plane = None
     if points is not None:
         corners = parse_places(points.split(), option="--points")
         if len(corners) != 3:
             raise InvalidInputError(f"--points: expected three, got {len(corners)}")
         plane = spanned_plane(corners[0], *(corners[1:] - corners[0]))
-    elif origin is not None and right is not None and down is not None:
-        plane = spanned_plane(origin, right, down)
-    imports = given_settings(input_file, imported, transform)
-    stated = sweep_file, imports, calibration or (), dynamic_range_db
-    first = open_posed(input_file, mode[0] if mode else None, *stated)
+    modes = mode[:1] if mode else [None]
+    (first,), part = open_sweep_at(modes, input_file, imported, stated, dynamic_range_db)
     opened = at_modes(first, mode or (), difference_to)
-    notes(opened.posed.notes())
-    part = region_of(region, input_file, stated, first)
     range_db = dynamic_range_db or RANGE_DB
     images, grid = opened.posed.images(range_db)
     if curve is not None:
@@ -133,10 +115,10 @@ def reslice(
         place = along_sweep(opened, grid, lateral_mm, depth_mm, pixel_mm)
     with progress_bar(f"reslicing {out.name}"):
         picture = cut_posed(opened, place, range_db, (images, grid), part, reach_mm)
-    if as_volume:
-        write_volume(out, cut_as_volume(picture))
-    else:
+    if is_picture:
         save_reslices(picture, out)
+    else:
+        write_volume(out, cut_as_volume(picture))
 
 
 def _curve(path: Path, picture: Path | None, opened: OpenedModes) -> FloatArray:

@@ -5,29 +5,28 @@ from __future__ import annotations
 import webbrowser
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
-from speckle3d.cli.common import MaybeNumber, MaybePath, MaybeText, PixelMm, Written, from_options, note
-from speckle3d.core.errors import InvalidInputError
+from speckle3d.cli.commands import Fields
+from speckle3d.cli.common import MaybeNumber, MaybePath, Written, note
 from speckle3d.core.extras import require_extra
+
+_SETTINGS = "speckle3d.calibrating.settings"
+_SCAN = ("phantom", "points", "poses", "transform", "pixel_mm")
 
 
 def view(
     file: Path,
+    *,
     reconstruction: MaybePath = None,
     sweep_file: MaybePath = None,
     record: Written = None,
     calibrate: Literal["plane", "orientation", "wires"] | None = None,
-    phantom: MaybeText = None,
-    points: MaybePath = None,
-    poses: MaybePath = None,
-    transform: MaybeText = None,
-    pixel_mm: PixelMm = None,
+    scan: Annotated[Any, Fields(f"{_SETTINGS}:WireSettings", _SCAN)],
+    plane: Annotated[Any, Fields(f"{_SETTINGS}:OrientationSettings", ("sensor", "level"))],
     dynamic_range_db: MaybeNumber = None,
-    sensor: Literal["orientation", "tracker"] | None = None,
-    level: bool = False,
     port: Annotated[int, typer.Option(min=0, max=65535)] = 0,
     browser: bool = True,
 ) -> None:
@@ -80,26 +79,23 @@ def view(
     from speckle3d.app.server import AppServer
     from speckle3d.calibrating.settings import model_of
     from speckle3d.io.import_settings import ImportSettings
+    from speckle3d.io.toml import validated
 
-    scan = {"phantom": phantom, "points": points, "poses": poses, "transform": transform, "sensor": sensor,
-            "level": level or None, "pixel_mm": pixel_mm}  # fmt: skip
     with ExitStack() as running:
         if calibrate is None:
-            column_mm, row_mm = pixel_mm or (None, None)
-            stated = {
-                "column_pitch_mm": column_mm,
-                "row_spacing_mm": row_mm,
-                "dynamic_range_db": dynamic_range_db,
-            }
-            settings = from_options(ImportSettings, {k: v for k, v in stated.items() if v is not None})
+            column_mm, row_mm = scan.pixel_mm or (None, None)
+            stated = {"column_pitch_mm": column_mm, "row_spacing_mm": row_mm}
+            settings = validated(
+                stated | {"dynamic_range_db": dynamic_range_db},
+                "--pixel-mm, --dynamic-range-db",
+                ImportSettings,
+            )
             pages = running.enter_context(
                 opened(file, record, reconstruction=reconstruction, sweep=sweep_file, settings=settings)
             )
         else:
-            model, chosen = model_of(calibrate), {k: v for k, v in scan.items() if v is not None}
-            for name in chosen.keys() - model.model_fields:
-                raise InvalidInputError(f"--{name.replace('_', '-')}: is of another method than {calibrate}")
-            pages = phantom_pages(file, from_options(model, chosen))
+            chosen = scan.model_dump(exclude_unset=True) | plane.model_dump(exclude_unset=True)
+            pages = phantom_pages(file, validated(chosen, f"--calibrate {calibrate}", model_of(calibrate)))
         server = AppServer(pages, file.name, port)
         note(server.address)
         if browser:

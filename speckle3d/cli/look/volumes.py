@@ -2,29 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from speckle3d.cli.calibrations import files_of, given_settings
+from speckle3d.cli.calibrations import clip_of
 from speckle3d.cli.commands import Fields
 from speckle3d.cli.common import (
-    Json,
     MaybePath,
     MaybeText,
     Out,
-    Paths,
+    Result,
     Written,
-    emit_json,
-    from_options,
     load_settings,
     note,
     notes,
 )
-from speckle3d.cli.outputs import require_own_place
-from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.progress import progress_bar
 
 if TYPE_CHECKING:
@@ -33,76 +28,89 @@ if TYPE_CHECKING:
     from speckle3d.io.import_settings import ImportSettings
     from speckle3d.study.posed import PosedSweep
 
-    Statement = tuple[Path | None, ImportSettings, Sequence[Path], float | None]
-
-_IMPORTED = ("plus_config", "reference_transform", "column_pitch_mm", "row_spacing_mm", "frame_rate_hz")
-Imported = Annotated[dict[str, Any], Fields("speckle3d.io.import_settings:ImportSettings", _IMPORTED)]
+_IMPORTED = (
+    "plus_config",
+    "reference_transform",
+    "tracker_transform",
+    "column_pitch_mm",
+    "row_spacing_mm",
+    "frame_rate_hz",
+)
+Imported = Annotated[Any, Fields("speckle3d.io.import_settings:ImportSettings", _IMPORTED)]
 """Options of what a recording does not say; the range of its grey levels is that of the levels made."""
 _SETTINGS = "speckle3d.imaging.voxels.settings:CompoundingSettings"
 _SCENE = ("voxel_mm", "splat", "rule", "fill_radius", "dynamic_range_db")
 
 
-def compounding_settings(config_file: Path | None, options: Mapping[str, Any]) -> CompoundingSettings:
+@dataclass(frozen=True)
+class Stated:
+    """What options say of a sweep at poses, and of what counts of it."""
+
+    region: str | None = None
+    sweep_file: Path | None = None
+    calibration: list[Path] | None = None
+
+
+Statement = Annotated[Any, Fields("speckle3d.cli.look.volumes:Stated")]
+
+
+def compounding_settings(config_file: Path | None, options: CompoundingSettings) -> CompoundingSettings:
     """Group `volume` of a configuration, with the options that were given in its place."""
-    from speckle3d.imaging.voxels.settings import CompoundingSettings
+    from speckle3d.io.toml import validated
 
-    base = load_settings(config_file).volume.model_dump()
-    if options.get("levels") == "linear" and base["voxel_type"] == "uint8":
-        base["voxel_type"] = "float32"  # amplitudes may be less than one, or thousands
-    return from_options(CompoundingSettings, base | dict(options))
+    base, stated = load_settings(config_file).volume, options.model_dump(exclude_unset=True)
+    return validated(base.model_dump() | stated, "volume", type(base))
 
 
-def open_sweep_at(modes: Sequence[str | None], source: Path, stated: Statement) -> list[PosedSweep]:
+def open_sweep_at(
+    modes: Sequence[str | None],
+    source: Path,
+    imported: ImportSettings,
+    stated: Stated,
+    range_db: float | None,
+) -> tuple[list[PosedSweep], Region | None]:
     """Open a sweep at the poses of each mode (None: the best), and say on stderr which frames have none.
 
     Of a recording it is told what was assumed of its images; nothing where a calibration gives its pixels.
+    The second result is the part of the images that counts: as asked for, else that to which a device set of
+    PLUS clips volumes.
     """
-    from speckle3d.io.import_settings import MissingSettingsError
+    from speckle3d.calibrating.recordings import require_unsaid
+    from speckle3d.core.region import Region
+    from speckle3d.io.import_settings import MissingSettingsError, settings_for
     from speckle3d.io.load import open_recording
     from speckle3d.study.posed import open_posed
 
-    opened = [open_posed(source, mode, *stated) for mode in modes]
+    require_unsaid(source, imported)
+    more = stated.sweep_file, imported, stated.calibration or (), range_db
+    opened = [open_posed(source, mode, *more) for mode in modes]
     if opened[0].reconstruction is None:
         # Grey levels as stored need no dynamic range.
-        ranged = stated[1].model_copy(update={"dynamic_range_db": 60.0})
+        ranged = imported.model_copy(update={"dynamic_range_db": 60.0})
         with suppress(MissingSettingsError):
             notes(
                 line for line in open_recording(source, ranged).notes if not line.startswith("dynamic range")
             )
     notes(opened[0].notes())
-    return opened
-
-
-def region_of(text: str | None, source: Path, stated: Statement, posed: PosedSweep) -> Region | None:
-    """Part of the images that counts: as asked for, else that to which a device set of PLUS clips volumes."""
-    from speckle3d.core.region import Region
-    from speckle3d.io.import_settings import settings_for
-    from speckle3d.io.plus.device_set import read_device_set
-
-    config = settings_for(source, stated[1]).plus_config
-    clip = None if text or config is None else read_device_set(config).clip
-    if clip is not None:
-        text = clip.region_text(replace(posed.sweep.grid, skew_rad=posed.skew_rad))
-    return None if text is None else Region(text)
+    region = stated.region or clip_of(
+        settings_for(source, imported).plus_config, opened[0].sweep.grid, opened[0].skew_rad
+    )
+    return opened, None if region is None else Region(region)
 
 
 def volume(
     input_file: Path,
-    out: Out,
+    out: Annotated[Out, "volume"],
     *,
     mode: MaybeText = None,
-    settings: Annotated[dict[str, Any], Fields(_SETTINGS)],
-    grid: Annotated[dict[str, Any], Fields("speckle3d.study.scenes.voxels:GridRequest")],
-    region: MaybeText = None,
-    state: Written = None,
-    deviation: Written = None,
-    sweep_file: MaybePath = None,
-    calibration: Paths = None,
-    transform: MaybeText = None,
+    settings: Annotated[Any, Fields(_SETTINGS)],
+    grid: Annotated[Any, Fields("speckle3d.study.scenes.voxels:GridRequest")],
+    stated: Statement,
+    state: Annotated[Written, "volume"] = None,
+    deviation: Annotated[Written, "volume"] = None,
     imported: Imported,
     config_file: MaybePath = None,
-    as_json: Json = False,
-) -> None:
+) -> Result:
     """Compound the frames into voxels, at the poses of one mode or of the recording itself.
 
     Parameters
@@ -144,35 +152,26 @@ def volume(
         Write which voxels are measured and filled, as labels.
     deviation
         Write each voxel's standard deviation of position along the sweep, mm.
-    max_memory_gb, sweep_file, config_file, transform
+    max_memory_gb, sweep_file, config_file, tracker_transform
 
     Examples
     --------
     $ speckle3d volume out/reconstruction.h5 -o volume.nrrd
     """
     from speckle3d.study.pose_errors import caution
-    from speckle3d.study.scenes.voxels import GridRequest, VolumeRequest, write_voxels
+    from speckle3d.study.scenes.voxels import VolumeRequest, write_voxels
 
-    inputs = (input_file, sweep_file, grid.get("like"), *files_of(imported, calibration))
-    outputs = [path.resolve() for path in (out, state, deviation) if path is not None]
-    for path in outputs:
-        require_own_place(path, "volume", *inputs)
-        if outputs.count(path) > 1:
-            raise InvalidInputError(f"{path}: expected a file for each of --output, --state and --deviation")
     checked = compounding_settings(config_file, settings)
-    imports = given_settings(input_file, imported, transform)
-    stated = sweep_file, imports, calibration or (), settings.get("dynamic_range_db")
-    (posed,) = open_sweep_at([mode], input_file, stated)
-    part = region_of(region, input_file, stated, posed)
-    request = VolumeRequest(checked, GridRequest(**grid), part)
+    range_db = settings.model_dump(exclude_unset=True).get("dynamic_range_db")
+    (posed,), part = open_sweep_at([mode], input_file, imported, stated, range_db)
+    request = VolumeRequest(checked, grid, part)
     with progress_bar(f"compounding {out.name}"):
         report = write_voxels(posed, request, out, state, deviation)
-    if as_json:
-        emit_json(report.summary())
     made = posed.reconstruction
     if deviation is not None and made is not None and (words := caution(made, posed.mode)) is not None:
         note(words)
     note(report.line)
+    return report.summary(), ""
 
 
 def scene(
@@ -182,11 +181,8 @@ def scene(
     mode: list[str] | None = None,
     images: bool = False,
     deviation: bool = False,
-    settings: Annotated[dict[str, Any], Fields(_SETTINGS, _SCENE)],
-    region: MaybeText = None,
-    sweep_file: MaybePath = None,
-    calibration: Paths = None,
-    transform: MaybeText = None,
+    settings: Annotated[Any, Fields(_SETTINGS, _SCENE)],
+    stated: Statement,
     imported: Imported,
     config_file: MaybePath = None,
 ) -> None:
@@ -207,7 +203,7 @@ def scene(
     ----------------
     deviation
         Also each voxel's standard deviation of position, mm.
-    splat, rule, fill_radius, region, dynamic_range_db, sweep_file, config_file, transform
+    splat, rule, fill_radius, region, dynamic_range_db, sweep_file, config_file, tracker_transform
 
     Examples
     --------
@@ -216,12 +212,10 @@ def scene(
     from speckle3d.study.scenes.scene import require_scene_place, write_scene
     from speckle3d.study.scenes.voxels import VolumeRequest
 
-    require_scene_place(out, input_file, sweep_file, *files_of(imported, calibration))
-    imports = given_settings(input_file, imported, transform)
-    stated = sweep_file, imports, calibration or (), settings.get("dynamic_range_db")
+    require_scene_place(out, input_file, stated.sweep_file, *(stated.calibration or ()))
     checked = compounding_settings(config_file, settings)
-    posed = open_sweep_at(mode or [None], input_file, stated)
-    part = region_of(region, input_file, stated, posed[0])
+    range_db = settings.model_dump(exclude_unset=True).get("dynamic_range_db")
+    posed, part = open_sweep_at(mode or [None], input_file, imported, stated, range_db)
     request = VolumeRequest(checked, region=part)
     with progress_bar(f"writing {out.name}") as progress:
         reports = write_scene(out, posed, request, images, deviation, progress)

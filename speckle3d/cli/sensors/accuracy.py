@@ -8,17 +8,14 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from speckle3d.cli.common import (
-    Json,
     MaybeNumber,
     MaybePath,
     Paths,
+    Result,
     Written,
-    emit,
-    emit_rows,
     note,
-    require_finite,
+    rows_of,
 )
-from speckle3d.cli.outputs import require_own_place
 from speckle3d.cli.sensors.imu import Method, World, orientation_of, read, tell
 from speckle3d.core.errors import naming
 
@@ -38,11 +35,10 @@ def accuracy(
     time_offset_s: float = 0.0,
     method: Method = "smoother",
     magnetometer: bool = True,
-    figure: Written = None,
+    figure: Annotated[Written, "picture"] = None,
     rate_hz: MaybeNumber = None,
     world: World = None,
-    as_json: Json = False,
-) -> None:
+) -> Result:
     """Compare the angles between all pairs of orientations with a reference's (Housden 2008, Table 2).
 
     One of --reference or --optical.
@@ -83,9 +79,6 @@ def accuracy(
     from xsens.accuracy.figures import figure_turns
     from xsens.accuracy.mechanism import read_mechanism_csv, readings_at
 
-    require_finite("--time-offset-s", time_offset_s)
-    if figure is not None:
-        require_own_place(figure, "picture", log_file, reference, optical, *(calibration or ()))
     log = read(log_file, rate_hz, world)
     tell(log)
     mountings = Rotation.identity(1)
@@ -104,11 +97,8 @@ def accuracy(
     table = AccuracyTable.of({log_file.stem: errors})
     if figure is not None:
         save_figure(figure_turns({log_file.stem: errors}, log_file.name), figure)
-    if as_json:
-        emit_rows(table.values(), as_json)
-        return
-    emit(table.text())
-    emit(f"{len(errors)} errors: pairs of {errors.frames} orientations, {len(mountings)} calibrations")
+    how = f"{len(errors)} errors: pairs of {errors.frames} orientations, {len(mountings)} calibrations"
+    return rows_of(table.values())[0], f"{table.text()}\n{how}"
 
 
 def _beside_tracker(

@@ -10,18 +10,15 @@ import typer
 
 from speckle3d.cli.commands import Fields
 from speckle3d.cli.common import (
-    Json,
     MaybeNumber,
     MaybePath,
     OptionalOut,
     OutArgument,
-    emit_json,
-    emit_rows,
+    Result,
     note,
     notes,
-    require_finite,
+    rows_of,
 )
-from speckle3d.cli.outputs import require_own_place
 from speckle3d.core.errors import InvalidInputError, naming
 
 if TYPE_CHECKING:
@@ -75,7 +72,7 @@ def orientation_of(
     return found.rotations, found
 
 
-def info(log_file: Path, rate_hz: MaybeNumber = None, world: World = None, as_json: Json = False) -> None:
+def info(log_file: Path, rate_hz: MaybeNumber = None, world: World = None) -> Result:
     """Tell what a log holds, what is missing and what was skipped.
 
     Parameters
@@ -110,10 +107,12 @@ def info(log_file: Path, rate_hz: MaybeNumber = None, world: World = None, as_js
             norm = np.nanmedian(np.linalg.norm(values, axis=1))
             rows.append((f"{spoken}, median norm", f"{norm:.4f}", unit))
     notes = (*log.notes, *filter(None, contradictions(log).values()))
-    emit_rows([*rows, *(("note", text, "") for text in notes)], as_json)
+    return rows_of([*rows, *(("note", text, "") for text in notes)])
 
 
-def convert(log_file: Path, out: OutArgument, rate_hz: MaybeNumber = None, world: World = None) -> None:
+def convert(
+    log_file: Path, out: Annotated[OutArgument, "log"], rate_hz: MaybeNumber = None, world: World = None
+) -> None:
     """Turn a log of any kind into a plain CSV in SI units, on the sensor's own clock.
 
     Parameters
@@ -129,7 +128,6 @@ def convert(log_file: Path, out: OutArgument, rate_hz: MaybeNumber = None, world
     """
     from xsens.logs.textlogs import write_csv
 
-    require_own_place(out, "log", log_file)
     log = read(log_file, rate_hz, world)
     write_csv(out, log)
     tell(log)
@@ -138,7 +136,7 @@ def convert(log_file: Path, out: OutArgument, rate_hz: MaybeNumber = None, world
 def orient(
     log_file: Path,
     into: MaybePath = None,
-    out: OptionalOut = None,
+    out: Annotated[OptionalOut, "log"] = None,
     method: Method = "smoother",
     magnetometer: bool = True,
     time_offset_s: MaybeNumber = None,
@@ -146,8 +144,7 @@ def orient(
     replace_stream: Annotated[bool, typer.Option("--replace")] = False,
     rate_hz: MaybeNumber = None,
     world: World = None,
-    as_json: Json = False,
-) -> None:
+) -> Result:
     """Find the sensor's orientation from its log, and put it into a sweep, on its own clock.
 
     Parameters
@@ -181,9 +178,6 @@ def orient(
 
     if into is None and out is None:
         raise InvalidInputError("expected --into SWEEP.h5, -o CSV or both, got neither")
-    require_finite("--time-offset-s", time_offset_s)
-    if out is not None:
-        require_own_place(out, "log", log_file, into, calibration)
     if into is not None and not replace_stream and load_sweep(into).orientation is not None:
         raise InvalidInputError(
             f"{into}: expected no orientation sensor's stream, got one: --replace replaces it"
@@ -205,16 +199,14 @@ def orient(
         write_csv(out, with_orientation(log, rotations))
     tell(log)
     rows = _orientation_rows(log, "sensor" if found is None else method, rotations, found)
-    if as_json:
-        emit_json({name: value for name, value, _ in rows})
-        return
-    emit_rows([(name, v if isinstance(v, str) else f"{v:.5g}", unit) for name, v, unit in rows], as_json)
+    shown = [(name, v if isinstance(v, str) else f"{v:.5g}", unit) for name, v, unit in rows]
+    return {name: value for name, value, _ in rows}, rows_of(shown)[1]
 
 
 def record(
     port: str,
     out: OutArgument,
-    settings: Annotated[dict[str, Any], Fields("xsens.live.device:DeviceSettings")],
+    settings: Annotated[Any, Fields("xsens.live.device:DeviceSettings")],
     duration_s: MaybeNumber = None,
     append: bool = False,
 ) -> None:
@@ -248,13 +240,12 @@ def record(
     from rich.live import Live
     from rich.text import Text
 
-    from xsens.live.device import DeviceSettings
     from xsens.live.recording import record as record_port
 
-    console, device, state = Console(stderr=True), DeviceSettings(**settings), None
+    console, state = Console(stderr=True), None
     try:
         with Live(Text("connecting"), console=console, refresh_per_second=8, transient=True) as live:
-            for state in record_port(port, out, device, append, duration_s=duration_s or float("inf")):
+            for state in record_port(port, out, settings, append, duration_s=duration_s or float("inf")):
                 live.update(Text(state.line()))
     except KeyboardInterrupt:
         note("stopped")

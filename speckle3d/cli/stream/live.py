@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import shutil
+import re
 import signal
 import sys
 import time
 import webbrowser
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -20,7 +20,6 @@ from speckle3d.cli.common import (
     MaybeText,
     Out,
     Paths,
-    from_options,
     load_settings,
     note,
 )
@@ -34,7 +33,7 @@ from speckle3d.core.progress import progress_bar
 if TYPE_CHECKING:
     from types import FrameType
 
-    from speckle3d.io.igtl.link import Connection
+    from speckle3d.io.igtl.link import Connection, LinkState
     from speckle3d.live.progress import Progress
     from speckle3d.live.session import Session
 
@@ -70,7 +69,7 @@ def live(
     transform: MaybeText = None,
     orientation: MaybeText = None,
     calibration: Paths = None,
-    imported: Annotated[dict[str, Any], Fields("speckle3d.io.import_settings:ImportSettings", _IMPORTED)],
+    imported: Annotated[Any, Fields("speckle3d.io.import_settings:ImportSettings", _IMPORTED)],
     view: bool = False,
     serve: Annotated[int | None, typer.Option(min=0, max=65535)] = None,
     volume: bool = True,
@@ -78,7 +77,6 @@ def live(
     crossing_file: MaybePath = None,
     region: MaybeText = None,
     drift: list[Drift] | None = None,
-    compression: Literal["none", "gzip"] = "none",
     duration_s: Annotated[float | None, typer.Option(min=0.0)] = None,
     config_file: MaybePath = None,
 ) -> None:
@@ -121,8 +119,6 @@ def live(
     region
         Part of the image to look at, in mm: 'rectangle x,y x,y', 'polygon x,y x,y x,y ...' or 'fan x,y
         angle,angle radius,radius'; several joined by ' and '.
-    compression
-        Of the recording.
     duration_s
         End after so long.
 
@@ -136,7 +132,6 @@ def live(
         from speckle3d.app.live import LivePage, watched
     from speckle3d.io.curves import read_curves
     from speckle3d.io.igtl.link import Connection, Server
-    from speckle3d.io.import_settings import ImportSettings
     from speckle3d.io.load import load_sweep
     from speckle3d.live.crossing import CrossingCheck
     from speckle3d.live.session import Session, SessionSettings
@@ -144,8 +139,8 @@ def live(
     from speckle3d.study.job import RESULTS
     from speckle3d.study.results import require_own
 
-    host, _, port = server.rpartition(":")
-    if not (host and port.isascii() and port.isdecimal() and 0 < int(port) < 2**16):
+    match = re.fullmatch(r"\[?(.+?)\]?:([0-9]{1,5})", server)
+    if match is None or not 0 < int(match[2]) < 2**16:
         raise InvalidInputError(f"expected HOST:PORT, as localhost:18944, got {server!r}")
     config, curves = load_settings(config_file).with_choices(region=region), read_curves(curves_file)
     recorded = out / "sweep.h5"
@@ -153,8 +148,7 @@ def live(
         raise InvalidInputError(f"{recorded}: there already; expected a folder without a recorded sweep")
     require_own(out, RESULTS)
     out.mkdir(parents=True, exist_ok=True)
-    known, packed = from_options(ImportSettings, imported), compression == "gzip"
-    settings = SessionSettings(recorded, image, transform, orientation, known, config, volume, check, packed)
+    settings = SessionSettings(recorded, image, transform, orientation, imported, config, volume, check)
     note("loading")
     warm_up(curves, config)
     first = None
@@ -165,24 +159,23 @@ def live(
         served = None if serve is None else links.enter_context(Server(serve))
         if served is not None:
             note(f"poses and volume at 127.0.0.1:{served.port}")
-        connection = links.enter_context(Connection(host.strip("[]"), int(port)))
+        connection = links.enter_context(Connection(match[1], int(match[2])))
         outlets = [connection.send] if served is None else [connection.send, served.send]
         note(f"listening to {server}")
-        session, sender = Session(connection, outlets, curves, settings, first), _Sender(connection, server)
+        session, ends = Session(connection, outlets, curves, settings, first), list[str]()
         if view:
-            address, address_for_once = pages.enter_context(watched(LivePage(session, lambda: sender.words)))
+            page = LivePage(session, lambda: ends[-1] if ends else _trouble(connection.state, server))
+            address, address_for_once = pages.enter_context(watched(page))
             note(address)
             webbrowser.open(address_for_once)
-        _run(session, duration_s, sender)
-        done, sender.words = session.progress, f"the sweep has ended; reconstructing it into {out} ..."
+        _run(session, duration_s, connection, server)
+        done = session.progress
+        ends.append(f"the sweep has ended; reconstructing it into {out} ...")
         if not done.recorded:
-            reasons = filter(None, (done.missing, sender.trouble()))
+            reasons = filter(None, (done.missing, _trouble(connection.state, server)))
             raise InvalidInputError(f"{server}: no images came: {'; '.join(reasons) or 'none was sent'}")
         links.close()
-        if done.recorded < 2:
-            raise InvalidInputError(f"{recorded}: expected two images to reconstruct, got {done.recorded}")
-        left = f"; {done.left} were left for now" if done.left else ""
-        note(f"{done.recorded} frames in {recorded}, {done.matched} placed as they came{left}")
+        note(f"{done.recorded} frames in {recorded}, {done.matched} placed as they came")
         if done.missing:
             note(done.missing)
         reconstruct(
@@ -195,60 +188,48 @@ def live(
             calibration=calibration,
             config_file=config_file,
         )
-        sender.words = f"the sweep has ended; its results: speckle3d view {out}"
+        ends.append(f"the sweep has ended; its results: speckle3d view {out}")
         if view:
             time.sleep(_LAST_LOOK_S)
     if session.failure is not None:
         raise session.failure
 
 
-class _Sender:
-    """The server of a session: what is wrong with it, and whether it has gone for good.
+def _trouble(state: LinkState, name: str) -> str:
+    """What is wrong with a server; empty if nothing is."""
+    words = []
+    if not state.peers:
+        why = f" ({state.last_failure})" if state.last_failure else ""
+        words.append(f"waiting for {name}{why}")
+    elif state.silent_s > _SILENT_S:
+        words.append(f"nothing comes from {name}")
+    if state.refused:
+        words.append(f"{state.refused} messages refused ({state.last_refused})")
+    return ", ".join(words)
 
-    Attributes
-    ----------
-    words : str
-        Of the last `trouble`, or what comes after it.
+
+def _run(session: Session, duration_s: float | None, connection: Connection, name: str) -> None:
+    """Run until Ctrl-C, for so long, or until the server has left.
+
+    Other signals that ask for the end are heard once all is recorded. How it goes is a line in place on a
+    terminal; a log has it now and then, and when there is something else to say.
     """
+    from rich.console import Console
+    from rich.text import Text
 
-    def __init__(self, connection: Connection, name: str) -> None:
-        self._connection, self._name = connection, name
-        self._left_s: float | None = None
-        self.words = ""
-
-    def trouble(self) -> str:
-        """What is wrong; empty if nothing is."""
-        state, words = self._connection.state, []
-        if not state.peers:
-            why = f" ({state.last_failure})" if state.last_failure else ""
-            words.append(f"waiting for {self._name}{why}")
-        elif state.silent_s > _SILENT_S:
-            words.append(f"nothing comes from {self._name}")
-        if state.refused:
-            words.append(f"{state.refused} messages refused ({state.last_refused})")
-        self.words = ", ".join(words)
-        return self.words
-
-    def has_left(self) -> bool:
-        """Whether it has been away for as long as one that does not come back."""
-        if self._connection.state.peers:
-            self._left_s = None
-        elif self._left_s is None:
-            self._left_s = time.monotonic()
-        return self._left_s is not None and time.monotonic() - self._left_s > _LEFT_S
-
-
-def _run(session: Session, duration_s: float | None, sender: _Sender) -> None:
-    """Run until Ctrl-C, for so long, or until the sender has left.
-
-    Other signals that ask for the end are heard once all is recorded.
-    """
-    heard, line = list[int](), _Line()
+    heard, console, logged = list[int](), Console(stderr=True), (-_LOG_EVERY_S, "")
 
     def show(progress: Progress) -> None:
-        line.show(" | ".join(filter(None, (progress.line, sender.trouble()))), progress.words)
-        if progress.recorded and sender.has_left():
-            note(f"{sender.trouble()}: taken for the end of the sweep")
+        nonlocal logged
+        state, now = connection.state, time.monotonic()
+        trouble = _trouble(state, name)
+        text = " | ".join(filter(None, (progress.line, trouble)))
+        line.update(Text(printable(text), no_wrap=True, overflow="ellipsis"))
+        if not console.is_terminal and (progress.words != logged[1] or now - logged[0] > _LOG_EVERY_S):
+            note(text)
+            logged = now, progress.words
+        if progress.recorded and not state.peers and state.silent_s > _LEFT_S:
+            note(f"{trouble}: taken for the end of the sweep")
             session.end()
 
     def end(number: int, _frame: FrameType | None) -> None:
@@ -257,35 +238,11 @@ def _run(session: Session, duration_s: float | None, sender: _Sender) -> None:
 
     interval_s = sys.getswitchinterval()
     sys.setswitchinterval(_SWITCH_S)
-    with handled(end, *ENDS):
+    with handled(end, *ENDS), console.status("") as line:
         try:
             session.run(duration_s, show)
         finally:
             sys.setswitchinterval(interval_s)
-            line.end()
     for number in heard:
         if number != signal.SIGINT:
             signal.raise_signal(number)
-
-
-class _Line:
-    """The line that is looked at: in place on a terminal, in a log now and then and with other words."""
-
-    def __init__(self) -> None:
-        self._is_terminal = sys.stderr.isatty()
-        self._told_s, self._words, self._last = 0.0, "", ""
-
-    def show(self, text: str, words: str) -> None:
-        """Show how it goes; `words` are those of it that a log has at once."""
-        now = time.monotonic()
-        if self._is_terminal:
-            sys.stderr.write(f"\r\x1b[K{printable(text)[: shutil.get_terminal_size().columns - 1]}")
-            sys.stderr.flush()
-        elif words != self._words or (now - self._told_s > _LOG_EVERY_S and text != self._last):
-            note(text)
-            self._told_s, self._words, self._last = now, words, text
-
-    def end(self) -> None:
-        """Leave the line."""
-        if self._is_terminal:
-            sys.stderr.write("\n")

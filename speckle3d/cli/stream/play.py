@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -12,6 +13,7 @@ import typer
 from speckle3d.cli.common import note
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.extras import require_extra
+from speckle3d.core.progress import progress_bar
 
 if TYPE_CHECKING:
     from speckle3d.core.grid import ImageGrid
@@ -19,7 +21,7 @@ if TYPE_CHECKING:
 
 Kind = Literal["rf", "bmode"]
 
-_TELL_S = 1.0
+_DEVICES = "Image_Reference", "ProbeToReference", "ProbeToWorld"
 _LAST_S = 5.0
 """Longest wait for a client to take what is left at the end."""
 
@@ -31,15 +33,12 @@ def play(
     rate: Annotated[float, typer.Option(min=1e-3, max=1e3)] = 1.0,
     kind: Annotated[Kind | None, typer.Option("--as")] = None,
     loop: bool = False,
-    image: str = "Image_Reference",
-    transform: str = "ProbeToReference",
-    orientation: str = "ProbeToWorld",
 ) -> None:
     """Serve a recorded sweep over OpenIGTLink at its own rate, as PLUS serves a scanner.
 
     It begins when the first client connects. Messages carry the sweep's own times, shifted if some are below
-    zero. RF is sent with the samples of a vector along the columns, as PLUS sends it; the readings of a
-    tracker or an orientation sensor are TRANSFORM messages.
+    zero. RF is sent with the samples of a vector along the columns, as PLUS sends it. Devices are
+    Image_Reference, and ProbeToReference and ProbeToWorld of a tracker's and an orientation sensor's poses.
 
     Parameters
     ----------
@@ -57,12 +56,6 @@ def play(
     ----------------
     address
         0.0.0.0: also for other machines.
-    image
-        Device of the IMAGE messages.
-    transform
-        Device of the tracker's TRANSFORM messages.
-    orientation
-        Device of the orientation sensor's TRANSFORM messages.
 
     Examples
     --------
@@ -75,38 +68,29 @@ def play(
 
     read = load_sweep(images)
     frames, grid, upright = _frames(read, kind)
-    devices = image, transform, orientation
+    send = partial(played, read, frames, grid, upright, _DEVICES)
     times, shift_s = read.frame_time_s, clock_shift_s(read)
     round_s = float(times[-1] - times[0] + (times[-1] - times[-2] if len(times) > 1 else 1.0))
-    next(played(read, frames, grid, upright, devices, shift_s))  # refused at once if messages cannot hold it
+    next(send(shift_s))  # refused at once if messages cannot hold it
     if shift_s:
         note(f"times in the messages are the sweep's and {shift_s:g} s")
-    with Server(port, address) as server:
+    with Server(port, address) as server, progress_bar(f"playing {read.name}") as progress:
         note(f"{address}:{server.port}: {len(read)} frames of {read.name}; waiting for a client")
         while not server.wait_connected(1.0):
             server.receive(0.0)
         sent, start_s = 0, time.monotonic()
-        said_s = start_s
-
-        def tell() -> None:
-            server.receive(0.0)
-            dropped = server.state.dropped
-            slow = f", {dropped} messages dropped: a client is too slow" if dropped else ""
-            note(f"{sent} frames sent to {server.state.peers} client(s){slow}")
-
         for turn in range(sys.maxsize if loop else 1):
-            for at_s, message, is_frame in played(
-                read, frames, grid, upright, devices, shift_s + turn * round_s
-            ):
+            for at_s, message, is_frame in send(shift_s + turn * round_s):
                 due_s = start_s + (turn * round_s + at_s) / rate
                 time.sleep(max(0.0, due_s - time.monotonic()))
                 server.send(message)
+                server.receive(0.0)
                 sent += is_frame
-                if time.monotonic() - said_s >= _TELL_S:
-                    said_s = time.monotonic()
-                    tell()
+                progress(sent, len(read) * (turn + 1))
         server.drain(_LAST_S)
-        tell()
+        dropped = server.state.dropped
+        slow = f", {dropped} messages dropped: a client is too slow" if dropped else ""
+        note(f"{sent} frames sent{slow}")
 
 
 def _frames(sweep: Sweep, kind: Kind | None) -> tuple[Frames, ImageGrid, bool]:

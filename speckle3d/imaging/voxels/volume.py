@@ -123,6 +123,11 @@ def compound(
     """
     if (voxel_mm is None) == (voxel_grid is None):
         raise InvalidInputError("compound: expected either voxel_mm or voxel_grid")
+    without_effect = {"levels", "dynamic_range_db"}  # those of the images
+    if settings.get("backward_mm"):
+        without_effect |= {"splat", "rule", "fill_radius", "fill_mm"}
+    if names := sorted(without_effect & settings.keys()):
+        raise InvalidInputError(f"compound: {', '.join(names)}: without effect on these images: leave it out")
     source = PosedImages(images, grid, world_from_image)
     if voxel_grid is None:
         voxel_grid = grid_around(grid, world_from_image, float(voxel_mm or 0.0), world_from_axes)

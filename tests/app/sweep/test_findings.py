@@ -5,7 +5,6 @@ import pytest
 
 from speckle3d.app.sweep.findings import FrameFindings
 from speckle3d.config import Config
-from speckle3d.matching.quality import FrameFlag
 
 
 @pytest.fixture(scope="module")
@@ -24,13 +23,5 @@ def test_without_a_reconstruction_frames_are_judged_here_and_say_why(spoilt):
     findings = FrameFindings(spoilt, Config(), None, None)
     while findings.flags is None:
         findings.judge_next()
-    flagged = {k: FrameFlag(int(flag)) for k, flag in enumerate(findings.flags) if flag}
-    assert flagged == {
-        3: FrameFlag.FROZEN, 5: FrameFlag.LIFTED, 6: FrameFlag.LIFTED, 8: FrameFlag.SATURATED,
-    }  # fmt: skip
-    assert findings.reasons(0) == []
-    (frozen,), (lifted,), (saturated,) = (findings.reasons(k) for k in (3, 5, 8))
-    assert "frame 2" in frozen
-    assert "0 % of its patches hold speckle, expected at least 15 %" in lifted
-    clipped = 100 * float((np.abs(spoilt.frames[8]) == np.abs(spoilt.frames[8]).max()).mean())
-    assert f"{clipped:.2g} %" in saturated
+    names = {k: reason.split(":")[0] for k in range(10) for reason in findings.reasons(k)}
+    assert names == {3: "frozen", 5: "lifted", 6: "lifted", 8: "saturated"}

@@ -93,6 +93,7 @@ def test_what_cannot_be_compounded_is_refused():
     scene = {"images": images, "grid": GRID, "world_from_image": poses, "voxel_grid": voxel_grid}
     for how, error in (
         ({"rule": "weighted"}, InvalidInputError),
+        ({"backward_mm": 1.0, "splat": "linear"}, InvalidInputError),
         ({"images": [*images[:5], images[5].astype(np.int16)]}, MismatchError),
         ({"max_memory_gb": 1e-9}, InvalidInputError),
         ({"images": np.full(images.shape, np.nan)}, InsufficientDataError),
