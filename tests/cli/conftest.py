@@ -78,11 +78,10 @@ def reconstructed(bench, tmp_path_factory):
 def changed(bench, tmp_path):
     """The small sweep with something changed in it."""
 
-    def change(edit, name="sweep.h5"):
-        path = tmp_path / name
-        shutil.copy(bench / name, path)
-        if name == "sweep.h5":
-            shutil.copy(bench / "curves.h5", tmp_path / "curves.h5")
+    def change(edit):
+        path = tmp_path / "sweep.h5"
+        shutil.copy(bench / "sweep.h5", path)
+        shutil.copy(bench / "curves.h5", tmp_path)
         with h5py.File(path, "r+") as file:
             edit(file)
         return path

@@ -58,6 +58,3 @@ def test_files_that_are_not_there_or_not_sweeps(refused, bench, tmp_path):
     assert "none.h5" in refused("reconstruct", bench / "none.h5", "-o", out)
     curves = bench / "curves.h5"
     assert "speckle3d.sweep" in refused("reconstruct", curves, "--curves", curves, "-o", out)
-    whole = (bench / "sweep.h5").read_bytes()
-    (tmp_path / "half.h5").write_bytes(whole[: len(whole) // 2])
-    assert "half.h5" in refused("reconstruct", tmp_path / "half.h5", "--curves", curves, "-o", out)

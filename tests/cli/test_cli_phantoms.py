@@ -49,7 +49,6 @@ def test_a_plane_calibrates_a_tracker(run, scans, tmp_path):
     assert read_calibration(out).verdict in table
     assert "on untilted.h5, not used: RMS residual" in table
     assert out.with_suffix(".txt").read_text() == table
-    assert out.with_suffix(".png").stat().st_size > 20_000
 
 
 def test_a_plane_calibrates_an_orientation_sensor(run, scans, tmp_path):

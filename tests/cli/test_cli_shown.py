@@ -44,7 +44,5 @@ def test_a_sweep_of_any_name_is_reconstructed(run, tmp_path, small_sweeps):
         "reconstruct", tmp_path / f"{name}.h5", "-o", tmp_path / "out", "--curves", small_sweeps / "curves.h5"
     )
     assert code == 0, err
-    assert is_plain(out)
-    assert is_plain(err)
+    assert is_plain(out + err)
     assert is_plain((tmp_path / "out" / "table.txt").read_text(encoding="utf-8"))
-    json.loads((tmp_path / "out" / "summary.json").read_text(encoding="utf-8"))

@@ -23,7 +23,6 @@ from speckle3d.app.phantom.viewer import PhantomViewer
 from speckle3d.calibrating.phantoms import Wired, found, picked
 from speckle3d.calibrating.settings import ScanSettings, WireSettings, with_values
 from speckle3d.core.errors import InvalidInputError, Speckle3DError
-from speckle3d.core.progress import Progress
 from speckle3d.io.points import PickedPoints, read_points, write_points
 
 _HINT = "Click: add. Drag: move. Click a point and press Backspace: delete."
@@ -32,8 +31,8 @@ _DIGITS = 3
 _NO_POINTS: dict[str, list[Any]] = {"column": [], "row": [], "wire": []}
 
 
-class Picks:
-    """Points by frame; of each wire one in a frame, the last that was put there.
+class Picks(dict[tuple[int, str], tuple[float, float]]):
+    """Column and row by frame and wire; of each wire one in a frame, the last that was put there.
 
     Parameters
     ----------
@@ -42,42 +41,34 @@ class Picks:
     """
 
     def __init__(self, names: Iterable[str]) -> None:
+        super().__init__()
         self.names = tuple(names) or ("",)
-        self._frames: dict[int, dict[str, tuple[float, float]]] = {}
 
     def of(self, frame: int) -> dict[str, tuple[float, float]]:
         """Column and row by wire, in the order of the wires."""
-        held = self._frames.get(frame, {})
-        return {name: held[name] for name in self.names if name in held}
+        return {name: self[frame, name] for name in self.names if (frame, name) in self}
 
     def put(self, frame: int, points: Iterable[tuple[float, float, str]]) -> None:
         """Take these columns, rows and wires as the points of a frame, in place of those it had."""
-        self._frames[frame] = {
-            wire: (round(column, _DIGITS), round(row, _DIGITS))
-            for column, row, wire in points
-            if wire in self.names
-        }
+        for name in self.of(frame):
+            del self[frame, name]
+        for column, row, wire in points:
+            if wire in self.names:
+                self[frame, wire] = round(column, _DIGITS), round(row, _DIGITS)
 
     def take(self, points: PickedPoints | Seen) -> None:
         """Take points of many frames, in place of all that were there."""
         wires = np.zeros(len(points.frame), int) if points.wire is None else points.wire
-        self._frames = {}
-        for frame in np.unique(points.frame):
-            at = points.frame == frame
-            named = [self.names[wire] for wire in wires[at]]
-            self.put(
-                int(frame),
-                [(*place, name) for place, name in zip(points.pixels[at].tolist(), named, strict=True)],
-            )
+        self.clear()
+        for frame, wire, (column, row) in zip(
+            points.frame.tolist(), wires.tolist(), points.pixels.round(_DIGITS).tolist(), strict=True
+        ):
+            self[frame, self.names[wire]] = column, row
 
     def points(self) -> PickedPoints:
         """All points, by frame and wire, as they are written into a file."""
-        rows = [
-            (frame, *place, self.names.index(wire))
-            for frame in sorted(self._frames)
-            for wire, place in self.of(frame).items()
-        ]
-        frame, column, row, wire = np.array(rows, dtype=float).reshape(-1, 4).T
+        rows = sorted((frame, self.names.index(wire), *place) for (frame, wire), place in self.items())
+        frame, wire, column, row = np.array(rows, dtype=float).reshape(-1, 4).T
         wires = None if self.names == ("",) else wire.astype(np.int64)
         return PickedPoints(frame.astype(np.int64), np.column_stack([column, row]), wires)
 
@@ -141,7 +132,7 @@ class PointsViewer(PhantomViewer):
         save.on_click(self._save)
         self._work.button.on_click(self._find_all)
         wires = [self._wire] if self._wired.names else []
-        buttons = pn.Row(self._work.button, clear, *wires, self._work.bar)
+        buttons = pn.Row(self._work.button, clear, *wires)
         return self.layout(pn.pane.HTML(_HINT, width=600), buttons, pn.Row(save, self._name), self._saved)
 
     def show(self, image: npt.NDArray[Any], settings: ScanSettings) -> str:
@@ -160,7 +151,7 @@ class PointsViewer(PhantomViewer):
         frames = len(np.unique(every.frame))
         return f"frame {self.frame}: {len(points)} points{lacking}; {len(every)} in {frames} frames"
 
-    def find(self, settings: ScanSettings, progress: Progress) -> Seen:
+    def find(self, settings: ScanSettings) -> Seen:
         """Take the points that are there."""
         self._run_with = self.picks.points()
         if not len(self._run_with):
@@ -196,10 +187,10 @@ class PointsViewer(PhantomViewer):
         self.tell("finding points in all frames ...")
         self._work.start(partial(self._search, settings), self._searched)
 
-    def _search(self, settings: ScanSettings, progress: Progress) -> Seen | str:
+    def _search(self, settings: ScanSettings) -> Seen | str:
         """Points, or why there are none."""
         try:
-            seen = found(self.recording, settings.model_copy(update={"points": None}), progress)
+            seen = found(self.recording, settings.model_copy(update={"points": None}))
             if self._wired.names:
                 return seen
             return choose_crossings(self.recording, seen, [self.recording.time_offset_s])

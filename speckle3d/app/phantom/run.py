@@ -22,7 +22,6 @@ from speckle3d.calibrating.phantoms import remarks, solved, write_outcome
 from speckle3d.calibrating.settings import ScanSettings
 from speckle3d.calibrating.written import BESIDE
 from speckle3d.core.errors import Speckle3DError
-from speckle3d.core.progress import Progress
 
 _LACKING = "#9a6700"
 """Dark amber: a result that more motion would improve."""
@@ -31,33 +30,26 @@ _POOL = ThreadPoolExecutor(2, "speckle3d-calibration")
 
 
 class Work:
-    """A button whose work runs in a thread, and a bar for its progress.
+    """A button whose work runs in a thread, and which turns and cannot be clicked meanwhile.
 
     Parameters
     ----------
     name : str
-        Of the button, which cannot be clicked again while its work runs.
+        Of the button.
     """
 
     def __init__(self, name: str, **look: Any) -> None:
         self.button = pn.widgets.Button(name=name, **look)
-        self.bar = pn.indicators.Progress(value=0, max=100, width=250, visible=False, margin=(14, 8))
-        self._share = 0.0
 
-    def start(self, work: Callable[[Progress], Any], ended: Callable[[Any], None]) -> None:
-        """Do the work, which is given where to count frames done and frames in all; then show its result."""
-        self.button.disabled = self.bar.visible = True
-        future = _POOL.submit(work, self._count)
-        self._clock = pn.state.add_periodic_callback(partial(self._look, future, ended), _POLL_MS)
-
-    def _count(self, done: int, total: int) -> None:
-        self._share = done / max(total, 1)
+    def start(self, work: Callable[[], Any], ended: Callable[[Any], None]) -> None:
+        """Do the work, then show its result."""
+        self.button.disabled = self.button.loading = True
+        self._clock = pn.state.add_periodic_callback(partial(self._look, _POOL.submit(work), ended), _POLL_MS)
 
     def _look(self, future: Future[Any], ended: Callable[[Any], None]) -> None:
-        self.bar.value = int(100 * self._share)
         if future.done():
             self._clock.stop()
-            self.button.disabled = self.bar.visible = False
+            self.button.disabled = self.button.loading = False
             ended(future.result())
 
 
@@ -103,7 +95,7 @@ class RunPane:
         images: Path,
         folder: Folder,
         settings: Callable[[], ScanSettings],
-        find: Callable[[ScanSettings, Progress], Seen],
+        find: Callable[[ScanSettings], Seen],
         done: Callable[[Solved], None],
         before_saving: Callable[[ScanSettings, Path], ScanSettings],
     ) -> None:
@@ -125,7 +117,7 @@ class RunPane:
     def view(self) -> Viewable:
         """The button, the verdict, saving, and the table."""
         return pn.Column(
-            pn.Row(self._work.button, self._work.bar),
+            self._work.button,
             self._verdict,
             pn.Row(self._save, self._name),
             self._saved,
@@ -147,10 +139,10 @@ class RunPane:
             return
         self._work.start(partial(self._solve, settings), self._show)
 
-    def _solve(self, settings: ScanSettings, progress: Progress) -> Solved:
+    def _solve(self, settings: ScanSettings) -> Solved:
         seen = None
         try:
-            seen = self._find(settings, progress)
+            seen = self._find(settings)
             return Solved(settings, seen, solved(self._recording, seen, settings))
         except Speckle3DError as error:
             return Solved(settings, seen, refusal=str(error))

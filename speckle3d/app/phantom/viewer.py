@@ -23,7 +23,6 @@ from speckle3d.calibrating.settings import (
     with_values,
 )
 from speckle3d.core.errors import InvalidInputError, Speckle3DError
-from speckle3d.core.progress import Progress
 
 _REFLECTORS = {"(choose before the first run)": "", "a bare wall": "wall", "a thin bar (Cambridge)": "bar"}
 
@@ -130,9 +129,9 @@ class PhantomViewer:
         """Draw what is found in a frame, and return what to say; raise `Speckle3DError` where nothing is."""
         raise NotImplementedError
 
-    def find(self, settings: ScanSettings, progress: Progress) -> Seen:
+    def find(self, settings: ScanSettings) -> Seen:
         """Find the phantom in all frames."""
-        return found(self.recording, settings, progress)
+        return found(self.recording, settings)
 
     def before_saving(self, settings: ScanSettings, out: Path) -> ScanSettings:
         """Bring the settings of a run into what a command can be given."""

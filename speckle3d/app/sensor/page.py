@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import panel as pn
 import param
-from bokeh.events import RangesUpdate, Tap
 from bokeh.models import ColumnDataSource, Range1d
 from bokeh.models.annotations import Span
 from bokeh.plotting import figure
@@ -16,8 +15,9 @@ from panel.viewable import Viewable
 from scipy.spatial.transform import Rotation
 
 from speckle3d.app.look import batched
+from speckle3d.app.plots import time_plot
 from speckle3d.app.sensor.probe import figure_probe, turn_probe
-from speckle3d.app.sensor.source import COLUMNS, Source, thinned
+from speckle3d.app.sensor.source import Source
 from speckle3d.app.sensor.watch import SHOWN_S
 from xsens.fusion.field import Trust
 
@@ -83,9 +83,8 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
     def __init__(self, source: Source, mounting: Rotation | None) -> None:
         super().__init__()
         self._source, self._mounting = source, mounting
-        self._columns = source.columns()
-        self._data = ColumnDataSource({name: [] for name in COLUMNS})
-        end_s = 0.0 if source.is_live else max(float(self._columns["t"][-1]), 1e-3)
+        self._data = ColumnDataSource(source.columns())
+        end_s = 0.0 if source.is_live else max(float(self._data.data["t"][-1]), 1e-3)
         self.param.step.bounds = (0, max(int(end_s / _STEP_S), 1))
         self._range = Range1d(-SHOWN_S if source.is_live else 0.0, end_s)
         self._cursor = Span(location=0.0, dimension="height", line_dash="dotted")
@@ -93,7 +92,6 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
         self._facts = pn.pane.HTML("", width=_LEFT_PX - 10)
         self._banner = pn.pane.HTML("", margin=(8, 10), sizing_mode="stretch_width")
         self.param.watch(self._show, "step")
-        self._draw()
         self._show()
 
     def layout(self) -> Viewable:
@@ -101,7 +99,7 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
         shown = {
             label: names
             for label, names in _PLOTS.items()
-            if self._source.is_live or np.isfinite(self._columns[names[0]]).any()
+            if self._source.is_live or np.isfinite(self._data.data[names[0]]).any()
         }
         plots = [self._plot(label, names) for label, names in (shown or _PLOTS).items()]
         plots[-1].xaxis.axis_label = "time before now, s" if self._source.is_live else "time, s"
@@ -124,16 +122,7 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
         return pn.Column(self._banner, row, sizing_mode="stretch_both")
 
     def _plot(self, label: str, names: tuple[str, ...]) -> figure:
-        plot = figure(
-            x_range=self._range,
-            tools="xpan,xwheel_zoom,reset",
-            active_scroll="xwheel_zoom",
-            y_axis_label=label,
-            toolbar_location=None,
-            min_border_left=64,
-            sizing_mode="stretch_both",
-        )
-        plot.axis.axis_label_text_font_style = "normal"
+        plot = time_plot(label, self._range, self._cursor, self._go, min_border_left=64)
         for name in names:
             legend = {"legend_label": name} if len(names) > 1 else {}
             plot.line("t", name, source=self._data, color=_LINES.get(name, "#1c2730"), **legend)
@@ -145,26 +134,16 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
             legend.update(orientation="horizontal", location="top_left", padding=2, margin=2)
         if gaps := self._source.gaps_s():
             plot.vspan(x=gaps, line_color="#b3261e", line_width=1.5)
-        plot.add_layout(self._cursor)
-        plot.on_event(Tap, lambda event: self._go(event.x))
-        plot.on_event(RangesUpdate, lambda event: self._draw(event.x0, event.x1))
         return plot
 
     def _go(self, time_s: float) -> None:
         low, high = self.param.step.bounds
         self.step = int(np.clip(round(time_s / _STEP_S), low, high))
 
-    def _refresh(self) -> None:
-        self._columns = self._source.columns()
-        self._draw()
-        self._show()
-
     @batched
-    def _draw(self, from_s: float = -np.inf, until_s: float = np.inf) -> None:
-        """Draw what is in sight, as fine as a screen shows it."""
-        first, last = np.searchsorted(self._columns["t"], [from_s, until_s])
-        part = slice(max(first - 1, 0), last + 1)
-        self._data.data = thinned({name: values[part] for name, values in self._columns.items()})
+    def _refresh(self) -> None:
+        self._data.data = self._source.columns()
+        self._show()
 
     @batched
     def _show(self, *_: Any) -> None:

@@ -39,21 +39,6 @@ class Source(Protocol):
         """Return names and values of what there is to say at a time."""
 
 
-def thinned(columns: Columns, most: int = 4000) -> Columns:
-    """All rows, or the least and the greatest of every column in as many equal pieces of time as do."""
-    rows = len(columns["t"])
-    width = rows // (most // 2)
-    if width < 2:
-        return columns
-    pieces = rows // width
-
-    def ends(values: FloatArray) -> FloatArray:
-        block = values[: pieces * width].reshape(pieces, width)
-        return np.column_stack([np.fmin.reduce(block, axis=1), np.fmax.reduce(block, axis=1)]).ravel()
-
-    return {name: ends(values) for name, values in columns.items()}
-
-
 def heading_rad(rotation: Rotation) -> FloatArray:
     """Heading about up, from north to west, without jumps."""
     matrices = rotation.as_matrix().reshape(-1, 3, 3)
