@@ -50,7 +50,6 @@ _ENTRY = re.compile(r"^(\S.*)\n?((?:[ \t]+.*\n?|\n)*)", re.MULTILINE)
 _RULE = re.compile(r"\b(With|Not with) (--[\w-]+(?: or --[\w-]+)*)[:.]")
 _CHOICE = re.compile(r"\bOne of ((?:[A-Z]+|--[\w-]+) or --[\w-]+)")
 _OUTPUT = re.compile(r"(?:-o|--output=)(.+)|-o|--output", re.DOTALL)
-_FUSED = "`fused` takes any sensor there is, `crossed` a second sweep"
 _ANY_VIEWER = "frames are cut here, and volumes by any viewer, as 3D Slicer"
 _REMOVED = {
     ("reconstruct", "--volume-mode"): "`speckle3d volume --mode` writes a volume at any mode's poses",
@@ -61,9 +60,7 @@ _REMOVED = {
     ("reslice", "--outlines"): "`view` and the report of `compare` draw where frames are",
     ("images", "--clock"): "`calibrate clock --by images` finds the offset, --time-offset-s takes it",
     ("images", "--scales"): "calipers tell pixel sizes better; --pixel-mm takes them",
-    ("images", "--method"): "there is one optimiser, which finds what Nelder-Mead did",
-    ("reconstruct", "inertial"): _FUSED,
-    ("compare", "inertial"): _FUSED,
+    ("reconstruct", "inertial"): "`fused` takes any sensor there is, `crossed` a second sweep",
     ("export", "--frame"): "`convert` and `scene` write poses as 3D Slicer reads them",
     ("live", "--compression"): "`convert --compression gzip` compresses its recording",
     ("simulate", "--reverse"): "--preset reversal comes back",
@@ -236,8 +233,11 @@ def _option(name: str, kind: Any, default: Any, info: Any, words: Words) -> insp
     info.help = words.options.get(name) or info.help or _SHARED.get(name)
     if isinstance(info, typer.models.ArgumentInfo):
         info.metavar = info.metavar or flag.strip("-").upper()
-    elif info.default is ... and not info.param_decls:
-        info.param_decls = (f"{flag}/--no-{flag[2:]}" if default is True else flag,)
+    else:
+        if match := re.match(r"list\[(?:.*\.)?(\w+)", str(kind)):
+            info.metavar = f"<{match[1].lower()}>"  # which may be repeated, as the help says
+        if info.default is ... and not info.param_decls:
+            info.param_decls = (f"{flag}/--no-{flag[2:]}" if default is True else flag,)
     return inspect.Parameter(name, only, default=default, annotation=Annotated[kind, info])
 
 

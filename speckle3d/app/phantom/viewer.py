@@ -4,18 +4,18 @@ from __future__ import annotations
 
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args, get_origin
 
 import numpy.typing as npt
 import panel as pn
 from panel.viewable import Viewable
+from pydantic import BaseModel
 
 from calibration.points import Recording, Seen
 from speckle3d.app.folder import Folder
 from speckle3d.app.look import batched
 from speckle3d.app.phantom.plots import DROPPED, USED, FramePlot, FrameStrip
 from speckle3d.app.phantom.run import RunPane, Solved, sentence
-from speckle3d.app.phantom.widgets import widget
 from speckle3d.calibrating.phantoms import BY_HAND, found, require_frames
 from speckle3d.calibrating.settings import (
     PlaneSettings,
@@ -24,6 +24,15 @@ from speckle3d.calibrating.settings import (
 )
 from speckle3d.core.errors import InvalidInputError, Speckle3DError
 
+_WIDTH_PX = 285
+_SLIDERS: dict[str, tuple[str, float, float, float]] = {
+    "columns": ("n, columns", 5, 240, 1),
+    "smoothing_mm": ("σ, smoothing / mm", 0.05, 3.05, 0.05),
+    "threshold": ("T / levels per mm, 0: automatic", 0.0, 300.0, 1.0),
+    "tolerance_mm": ("d, tolerance / mm", 0.05, 3.05, 0.05),
+    "consensus": ("p, share that agrees", 0.05, 1.0, 0.01),
+}
+"""Label, least, greatest and step of settings that are tuned by sliders."""
 _REFLECTORS = {"(choose before the first run)": "", "a bare wall": "wall", "a thin bar (Cambridge)": "bar"}
 
 
@@ -67,7 +76,7 @@ class PhantomViewer:
         if isinstance(given, PlaneSettings):
             # A thin bar that is taken for a wall is warned of for a bias that it does not have.
             self.widgets["reflector"] = pn.widgets.Select(
-                name="what the plane is", options=_REFLECTORS, width=285
+                name="what the plane is", options=_REFLECTORS, width=_WIDTH_PX
             )
         self._slider.param.watch(self._show, "value")
         for each in self.widgets.values():
@@ -183,3 +192,24 @@ class PhantomViewer:
             frames = run.outcome.calibration.frames
             self._used, self._dropped = dict.fromkeys(frames.used, "used"), dict(frames.dropped)
         self._show()
+
+
+def widget(settings: BaseModel, name: str) -> Any:
+    """Make the widget of a setting, which has its value; its description is the field's."""
+    field, value = type(settings).model_fields[name], getattr(settings, name)
+    label, look = name.replace("_", " "), {"width": _WIDTH_PX, "margin": (2, 8)}
+    options = {"description": field.description, **look}
+    if name in _SLIDERS:
+        label, low, high, step = _SLIDERS[name]
+        kind = pn.widgets.IntSlider if isinstance(field.default, int) else pn.widgets.FloatSlider
+        value, default = value or 0.0, field.default or 0.0
+        ends = {"start": min(low, value), "end": max(high, value), "step": step}
+        return kind(name=f"{label} (default {default:g})", value=value, **ends, **look)
+    if isinstance(field.default, bool):
+        return pn.widgets.Checkbox(name=field.description, value=value, **look)
+    if get_origin(field.annotation) is Literal:
+        return pn.widgets.Select(name=label, options=list(get_args(field.annotation)), value=value, **options)
+    if isinstance(field.default, float):
+        return pn.widgets.FloatInput(name=f"{label} (default {field.default:g})", value=value, **options)
+    text = "" if value is None else str(value)
+    return pn.widgets.TextInput(name=label, value=text, placeholder=field.description, **look)
