@@ -31,7 +31,6 @@ def test_a_package_without_frames_still_has_its_sensor(realdata):
     (page,) = pages_of(realdata / "clarius" / "wirephantom")
     assert page.title == "Sensor"
     assert "frames are not shown: " in page._source._log.notes[-1]
-    assert "sidecars alone" in page._source._log.notes[-1]
 
 
 def test_what_has_no_page_is_one_line_and_exit_code_2(shipped, log, tmp_path, capsys, monkeypatch):
