@@ -96,6 +96,7 @@ def convert(
     """
     from speckle3d.calibrating.recordings import require_unsaid
     from speckle3d.io.calibrations import fitted_pixels, resized
+    from speckle3d.io.hdf5 import require_suffix
     from speckle3d.io.load import kind_of, open_recording
     from speckle3d.io.plus.write import SUFFIXES, write_sequence
     from speckle3d.io.reconstructions import FORMAT
@@ -104,11 +105,10 @@ def convert(
     from speckle3d.study.posed import open_posed
     from speckle3d.study.scenes.sequences import slicer_sequence
 
-    suffix = out.suffix.lower()
     is_made = source.is_file() and kind_of(source) == FORMAT
-    known = SUFFIXES if is_made else (".h5", ".hdf5", *SUFFIXES)
-    if out.name.lower().endswith(LABELS_ALONE) or suffix not in known:
-        raise InvalidInputError(f"{out}: expected a name ending in {', '.join(known)}, got {out.name!r}")
+    suffix = require_suffix(out, SUFFIXES if is_made else (".h5", ".hdf5", *SUFFIXES))
+    if out.name.lower().endswith(LABELS_ALONE):
+        raise InvalidInputError(f"{out}: expected a sequence's name, got one of labels alone")
     packs = compression != "none"
     if is_made:
         range_db = imported.dynamic_range_db or 60.0

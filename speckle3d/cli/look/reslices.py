@@ -82,6 +82,7 @@ def reslice(
     $ speckle3d reslice out/reconstruction.h5 -o cut.png --mode image --mode pose
     """
     from speckle3d.imaging.cuts.oblique import spanned_plane
+    from speckle3d.io.hdf5 import require_suffix
     from speckle3d.io.points import parse_places
     from speckle3d.io.voxels.volume_writer import SUFFIXES, write_volume
     from speckle3d.study.figures import RANGE_DB
@@ -90,9 +91,7 @@ def reslice(
     from speckle3d.study.reslices.places import along_curve, along_sweep, in_frame, in_world
     from speckle3d.study.reslices.reslice_figures import save_reslices
 
-    is_picture = out.suffix.lower() == ".png"
-    if not (is_picture or out.name.lower().endswith(SUFFIXES)):
-        raise InvalidInputError(f"{out}: expected a name ending in .png, {', '.join(SUFFIXES)}")
+    is_picture = require_suffix(out, (".png", *SUFFIXES)) == ".png"
     plane = None
     if points is not None:
         corners = parse_places(points.split(), option="--points")
