@@ -23,16 +23,6 @@ def test_lost_samples_are_found_wherever_the_counter_wraps(first, lost, stride):
         assert gap.duration_s == pytest.approx((gap.lost + 1) * PERIOD_S)
 
 
-def test_a_new_start_is_as_long_as_the_computers_clock_says():
-    counter = np.concatenate((50_000 + np.arange(50), np.arange(50), 7 + np.arange(50)))
-    starts = np.isin(np.arange(150), [0, 50, 100])
-    computer_s = np.where(starts, np.array([1000.0, 1010.0, 1020.5])[np.arange(150) // 50], np.nan)
-    line = timeline(Stamps(counter=counter, period_s=0.01, starts=starts, computer_s=computer_s))
-    np.testing.assert_allclose(line.time_s[[0, 50, 100]], [0.0, 10.0, 20.5])
-    assert [(g.after_index, g.lost) for g in line.gaps] == [(49, 0), (99, 0)]
-    assert (np.diff(line.time_s) > 0).all()
-
-
 @pytest.mark.parametrize(
     "at", [[0, 1, 2, 4, 3], [*range(300), *range(301, 1500), 300], [*range(800), *range(600, 700)]]
 )

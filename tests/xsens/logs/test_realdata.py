@@ -1,14 +1,10 @@
 """Recordings of others, against what their own or the vendor's software says of them."""
 
-import re
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from xsens.logs.read import read_log
-from xsens.messages.framing import find_frames
-from xsens.messages.mtdata2 import read_items
 
 pytestmark = pytest.mark.realdata
 
@@ -33,52 +29,6 @@ def test_the_mt9_at_rest_feels_gravity(mt9b):
     # Bias of an uncorrected rate sensor of 900 deg/s; the field is of the order of 1 by its unit.
     assert np.degrees(np.abs(log.gyroscope_rad_s.mean(axis=0))).max() < 1.5
     assert 0.5 < np.linalg.norm(log.magnetometer_au, axis=1).mean() < 2.0
-
-
-# MTData2 of an MTi-G, with the decoding of einride/xsens-go
-
-
-NAMES = {
-    "PacketCounter": "packet_counter",
-    "SampleTimeFine": "sample_time_fine",
-    "Acceleration": "acceleration_m_s2",
-    "DeltaV": "delta_v_m_s",
-    "RateOfTurn": "rate_of_turn_rad_s",
-    "DeltaQ": "delta_q_wxyz",
-    "EulerAngles": "euler_deg",
-    "Quaternion": "quaternion_wxyz",
-    "MagneticField": "magnetic_field_au",
-}
-"""The package's name of an item by those of the two programs."""
-
-
-def decoded_rows(frames):
-    """Values of the items of every message by name."""
-    values, _, _, damaged = read_items(frames)
-    assert not damaged.any()
-    rows = [{name: column[row] for name, column in values.items()} for row in range(len(frames))]
-    return [{name: v for name, v in row.items() if np.isfinite(v).all()} for row in rows]
-
-
-def golden_items(text):
-    """Values of the items of every message by name; the golden text separates messages by a blank line."""
-    for block in text.strip("\n").split("\n\n"):
-        items = re.findall(r"^(\w+)(?:\(.*\))?:\n((?:  .*\n?)+)", block, re.MULTILINE)
-        yield {
-            NAMES[name]: [float(line.rpartition(":")[2]) for line in lines.split("\n") if line]
-            for name, lines in items
-            if name in NAMES
-        }
-
-
-@pytest.mark.parametrize("which", ["1", "2"])
-def test_messages_of_an_mti_g_are_the_golden_ones(realdata, which):
-    folder = realdata / "xsens-go" / which
-    found = decoded_rows(find_frames((folder / "output.bin").read_bytes()))
-    golden = list(golden_items((folder / "output.golden").read_text()))
-    assert len(found) == len(golden) == 100
-    for message, expected in zip(found, golden, strict=True):
-        assert {name: values.tolist() for name, values in message.items()} == expected
 
 
 # Text

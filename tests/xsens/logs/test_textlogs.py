@@ -26,18 +26,13 @@ def angle_to(log, world_from_sensor):
 # The MT9 software's exports
 
 
-def test_angles_of_the_mt9_software(s):
-    angles = s["world_from_sensor"].as_euler("xyz", degrees=True)
-    log = parse_text(lines([s["time_s"], angles]))
-    assert angle_to(log, s["world_from_sensor"]) < 1e-6
-    np.testing.assert_allclose(log.time_s, s["time_s"], atol=1e-6)
-    assert (log.accelerometer_m_s2, log.counter, log.gaps) == (None, None, ())
-
-
-def test_matrices_of_the_mt9_software_are_told_from_vectors(s):
-    log = parse_text(lines([s["time_s"], s["world_from_sensor"].as_matrix().reshape(-1, 9)]))
-    assert angle_to(log, s["world_from_sensor"]) < 2e-6
-    assert any("row by row" in note for note in log.notes)
+def test_angles_and_matrices_of_the_mt9_software_are_told_from_vectors(s):
+    turns = s["world_from_sensor"]
+    for numbers in (turns.as_euler("xyz", degrees=True), turns.as_matrix().reshape(-1, 9)):
+        log = parse_text(lines([s["time_s"], numbers]))
+        assert angle_to(log, turns) < 2e-6
+        np.testing.assert_allclose(log.time_s, s["time_s"], atol=1e-6)
+        assert (log.accelerometer_m_s2, log.counter, log.gaps) == (None, None, ())
 
 
 # MT Manager's
