@@ -122,9 +122,9 @@ def start(motion, amount, rng):
 
 
 def drift(motion, amount, rng):
-    """A field that wanders over minutes, as of a magnet that is carried about far away."""
-    away = wandering(motion.log.time_s, rng, amount, 60.0)
-    return seen_by(motion, room_ut(motion, rng) + away - away[0])
+    """A field that turns about up by so many degrees in a minute."""
+    turns = Rotation.from_euler("z", amount * motion.log.time_s[:, None] / 60.0, degrees=True)
+    return seen_by(motion, turns.apply(room_ut(motion, rng)))
 
 
 FIELDS = {

@@ -193,7 +193,8 @@ class HeadingFilter:
         rows = self._run(bins, filtered)
         weights, best = (values[-1] for values in self._weights(rows))
         many = np.full(len(bins), best)
-        more = np.median(self._unsteady(rows, many, bins))  # what passes is smoothed
+        later = self._unsteady(rows, many, bins)[_STEADY:]  # what passes, as iron at the start, is smoothed
+        more = np.median(later) if later.size > _STEADY // 4 else 0.0
         weights[weights < _NEGLIGIBLE] = 0.0
         for j in np.union1d(np.flatnonzero(weights), best):
             rows["turn_rad"][:, j], rows["variance"][:, j] = _backward(*(each[j] for each in filtered))
@@ -218,7 +219,10 @@ class HeadingFilter:
         return likely / likely.sum(axis=1, keepdims=True), best
 
     def _unsteady(self, rows: Any, best: IntArray, bins: Any) -> FloatArray:
-        """Square of what the best filter's north has moved against the gyroscope, beyond its error."""
+        """Square of what the best filter's north has moved against the gyroscope, beyond its error.
+
+        Zero in the first minute, in which filters find what the field is.
+        """
         lately = np.vstack([self._lately, np.column_stack([rows["turn_rad"], bins["slip_rad2"]])])
         last = len(self._lately) + np.arange(len(bins))
         first = np.maximum(last - _STEADY, 0)
@@ -226,7 +230,7 @@ class HeadingFilter:
         gyroscope = slip[last] - slip[first] + bins["bias_variance"] * _STEADY_S**2
         self._lately = lately[-_STEADY:]
         moved = _angle(lately[last, best] - lately[first, best])
-        return np.asarray(np.maximum(moved**2 - gyroscope, 0.0))
+        return np.where(last < _STEADY, 0.0, np.maximum(moved**2 - gyroscope, 0.0))
 
     def _run(self, bins: Any, filtered: list[FloatArray] | None = None) -> Any:
         """What each filter finds in each bin, shape (n, filters)."""

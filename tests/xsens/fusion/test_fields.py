@@ -17,7 +17,7 @@ KINDS = [
     ("attached", 5.0),
     ("attached", 30.0),
     ("start", 20.0),
-    ("drift", 4.0),
+    ("drift", 15.0),
     ("truncated", 0.25),
 ]
 
@@ -25,7 +25,7 @@ KINDS = [
 @cache
 def made(kind, amount):
     rng = np.random.default_rng([20, *kind.encode()])
-    return scene(simulated(rng, 60.0), kind, amount, rng)
+    return scene(simulated(rng, 120.0 if kind == "drift" else 60.0), kind, amount, rng)
 
 
 @pytest.mark.parametrize("methods", [ONLINE, OFFLINE], ids=["on-line", "off-line"])
@@ -35,4 +35,7 @@ def test_no_heading_is_confident_and_wrong(kind, amount, methods):
     theirs, ours = (estimate(one.log, method) for method in methods)
     peer, own = (errors_deg(each.wxyz, one.true_wxyz, one.moving)[1] for each in (theirs, ours))
     sigma = rms_deg(ours.sigma_rad[counting(one.true_wxyz, one.moving), 2])
-    assert own <= max(SIGMAS * sigma, WORSE * peer), f"{own:.2f}, claimed {sigma:.2f}, VQF {peer:.2f}"
+    # No filter follows north by a field that turns: its error is claimed.
+    assert own <= max(SIGMAS * sigma, WORSE * peer * (kind != "drift")), (
+        f"{own:.2f}, claimed {sigma:.2f}, VQF {peer:.2f}"
+    )
