@@ -119,6 +119,19 @@ def test_every_message_comes_in_order_to_every_client_and_back():
         assert [message.device for message in taken(server, 1)] == ["Pose"]
 
 
+def test_a_peer_that_is_too_slow_is_left_out_and_costs_others_nothing():
+    message = packed_image("I", 1.0, np.zeros((1000, 1000), np.uint8), np.eye(4))
+    with Server(0) as server, Connection("127.0.0.1", server.port) as quick:
+        with socket.create_connection(("127.0.0.1", server.port)):
+            until(lambda: server.state.peers == 2)
+            for _ in range(40):
+                server.send(message)
+                assert len(taken(quick, 1)) == 1
+            assert server.state.dropped > 0
+            assert not server.drain(0.1)
+        until(lambda: server.state.peers == 1)
+
+
 def test_a_connection_waits_for_its_server_and_reconnects():
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
