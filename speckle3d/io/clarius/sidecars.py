@@ -110,7 +110,7 @@ class Description(BaseModel):
         Literal["RF", "IQ", "envelope"],
         BeforeValidator(lambda text: _KINDS.get(str(text).strip().lower(), text)),
     ] = Field(alias="type")
-    compression: Annotated[Literal["", "none"], BeforeValidator(lambda text: str(text).lower())] = ""
+    compression: Literal["", "none"] = ""
     frames: Count
     size: _Size
     lines: list[_Line]
