@@ -150,7 +150,8 @@ class Texture:
         """Frequencies, Hz, increasing, and the power of the samples as read; None of grey levels."""
         if not isinstance(self.signal, RFSettings):
             return None
-        power = np.mean([look.sampled for look in self._looks.values()], axis=0)
+        # In the order of the frames, which threads do not keep: sums are the same to the last bit.
+        power = np.mean([self._looks[k].sampled for k in self.frames.tolist()], axis=0)
         frequency = self.signal.bin_frequency_hz(power.size)
         rising = np.argsort(frequency)
         return frequency[rising], power[rising]
@@ -183,7 +184,7 @@ class Texture:
 
     def _rows(self, name: str, usable: BoolArray | None) -> FloatArray:
         """Values of the usable frames, or of all if none is, by rows and columns, shape (n, k, r, c)."""
-        sound = [look for k, look in self._looks.items() if usable is None or usable[k]]
+        sound = [self._looks[k] for k in self.frames.tolist() if usable is None or usable[k]]
         return self._patches.rows_of(
             np.stack([getattr(look, name) for look in sound or self._looks.values()])
         )
