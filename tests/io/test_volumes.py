@@ -1,7 +1,5 @@
 """Volumes and labels written in slabs and read, as SimpleITK, nibabel and Slicer's own reader find them."""
 
-import itertools
-
 import nibabel
 import numpy as np
 import pytest
@@ -113,11 +111,9 @@ def test_a_left_handed_file_is_turned_about_and_nothing_moves(tmp_path):
     affine[:3, 3] = 10, 20, 30
     nibabel.save(nibabel.Nifti1Image(voxels, RAS_FROM_LPS @ affine), tmp_path / "left.nii.gz")
     got = read_volume(tmp_path / "left.nii.gz")
-    for index in itertools.product(range(3), range(4), range(5)):
-        place = np.array([*index, 1]) @ affine.T
-        at = np.rint(np.linalg.solve(got.world_from_index, place)[:3]).astype(int)
-        np.testing.assert_allclose(np.array([*at, 1]) @ got.world_from_index.T, place, atol=SINGLE_MM)
-        assert got.voxels[tuple(at)] == voxels[index]
+    np.testing.assert_array_equal(got.voxels, voxels[:, :, ::-1])
+    np.testing.assert_allclose(got.world_from_index @ [1, 2, 0, 1], affine @ [1, 2, 4, 1], atol=SINGLE_MM)
+    np.testing.assert_allclose(got.world_from_index @ [1, 2, 4, 1], affine @ [1, 2, 0, 1], atol=SINGLE_MM)
 
 
 @pytest.mark.parametrize(("unit", "factor"), [("meter", 1e3), (None, 1.0)])
