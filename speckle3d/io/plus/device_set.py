@@ -11,6 +11,7 @@ References
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -101,10 +102,17 @@ class Clip:
         """The part as a region of images in mm; None where it is all of them."""
         if not self.is_part_of((grid.vectors, grid.samples)):
             return None
-        outlines = []
+        matrix = grid.image_from_sample[:2]
+        outlines = (pixels @ matrix[:, :2].T + matrix[:, 2] for pixels in self._outlines())
+        return " and ".join(
+            "polygon " + " ".join(f"{x:.6f},{y:.6f}" for x, y in outline) for outline in outlines
+        )
+
+    def _outlines(self) -> Iterator[FloatArray]:
+        """Polygons in pixels, shape (corner, 2), whose common part it is."""
         if self.rectangle is not None:
             left, top, right, bottom = np.add(self.rectangle, [-_HAIR, -_HAIR, _HAIR, _HAIR])
-            outlines.append(np.array([(left, top), (right, top), (right, bottom), (left, bottom)]))
+            yield np.array([(left, top), (right, top), (right, bottom), (left, bottom)])
         if self.fan is not None:
             x, y, inner, outer, first, stop = self.fan
             angles = np.deg2rad(np.linspace(first, stop, _ARC_POINTS))
@@ -112,12 +120,7 @@ class Clip:
             outline = np.concatenate([outer * arc, inner * arc[::-1]])
             # PLUS moves both halves a pixel towards the middle (vtkIGSIOPasteSliceIntoVolume).
             outline[:, 0] -= (1 - _HAIR) * np.sign(outline[:, 0])
-            outlines.append(np.add(outline, [x, y]))
-        parts = []
-        for pixels in outlines:
-            places = np.column_stack([pixels, np.ones(len(pixels))]) @ grid.image_from_sample[:2].T
-            parts.append("polygon " + " ".join(f"{x:.6f},{y:.6f}" for x, y in places))
-        return " and ".join(parts)
+            yield np.add(outline, [x, y])
 
 
 @dataclass(frozen=True)

@@ -99,7 +99,7 @@ def write_sequence(
             f"{path}: expected parallel vectors, got a fan's, which a sequence does not hold: write .h5"
         )
     fields = _standard_fields(sweep) | _timed(sweep.frame_time_s)
-    omitted = _add_sensors(fields, sweep)
+    omitted = [*_add_sensors(fields, sweep)]
     for transform, matrices in (transforms or {}).items():
         _add(fields, transform, matrices)
         fields["ElementSpacing"] = "1 1 1"
@@ -169,9 +169,9 @@ def _add(fields: dict[str, str], name: str, matrices: FloatArray, valid: BoolArr
         fields[f"Seq_Frame{i:04d}_{name}TransformStatus"] = "OK" if is_valid else "INVALID"
 
 
-def _add_sensors(fields: dict[str, str], sweep: Sweep) -> list[str]:
+def _add_sensors(fields: dict[str, str], sweep: Sweep) -> Iterator[str]:
     """Give each frame the sensors' poses, and tell what a sequence does not hold of the sweep."""
-    times, grid, omitted, count = sweep.frame_time_s, sweep.grid, list[str](), len(sweep)
+    times, grid, count = sweep.frame_time_s, sweep.grid, len(sweep)
     fields |= {f"Seq_Frame{i:04d}_ImageStatus": "OK" for i in range(count)}
     sizes = grid.vector_pitch_mm, grid.sample_spacing_mm, grid.first_sample_depth_mm
     sensors: tuple[tuple[Tracker | OrientationSensor | None, str, str], ...] = (
@@ -186,7 +186,7 @@ def _add_sensors(fields: dict[str, str], sweep: Sweep) -> list[str]:
             matrices[covered] = _rigid(sensor.readings.at(at[covered])).as_matrix()
         _add(fields, f"{own}To{world}", matrices, covered)
         if sensor is sweep.orientation or not np.array_equal(sensor.readings.time_s, at[covered]):
-            omitted.append(
+            yield (
                 f"the {sensor.label}'s {len(sensor.readings)} readings with all that it measured: "
                 f"{np.count_nonzero(covered)} interpolated ones are at the times of {count} frames"
             )
@@ -195,7 +195,8 @@ def _add_sensors(fields: dict[str, str], sweep: Sweep) -> list[str]:
             first = RigidTransform.from_translation([grid.first_vector_mm, 0.0, 0.0])
             pixels = image_matrix(_rigid(mounting) * first, *sizes, skew_rad)
             _add(fields, f"{IMAGE}To{own}", np.tile(pixels, (count, 1, 1)))
-    return omitted if sweep.truth is None else [*omitted, "the true poses"]
+    if sweep.truth is not None:
+        yield "the true poses"
 
 
 def _rigid(pose: RigidTransform | Rotation) -> RigidTransform:

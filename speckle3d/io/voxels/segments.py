@@ -8,7 +8,7 @@ References
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.labels import Segment
@@ -49,7 +49,7 @@ def is_segmentation(fields: Mapping[str, str]) -> bool:
     return any(name.startswith("Segmentation_") or _FIELD.fullmatch(name) for name in fields)
 
 
-def read_segments(fields: Mapping[str, str], where: str) -> tuple[Segment, ...]:
+def read_segments(fields: Mapping[str, str], where: str) -> Iterator[Segment]:
     """Read what labels mean; those without a name or colour get one.
 
     Raises
@@ -61,7 +61,6 @@ def read_segments(fields: Mapping[str, str], where: str) -> tuple[Segment, ...]:
     for name, value in fields.items():
         if match := _FIELD.fullmatch(name):
             rows.setdefault(int(match[1]), {})[match[2]] = unescaped(value)
-    segments: list[Segment] = []
     for i, row in sorted(rows.items()):
         place = f"{where}: Segment{i}"
         if row.get("Layer", "0") != "0":
@@ -71,5 +70,4 @@ def read_segments(fields: Mapping[str, str], where: str) -> tuple[Segment, ...]:
         if label != int(label):
             raise InvalidInputError(f"{place}_LabelValue: expected a whole number, got {label}")
         name = row.get("Name") or row.get("ID") or f"Segment {i}"
-        segments.append(Segment(int(label), name, (red, green, blue)))
-    return tuple(segments)
+        yield Segment(int(label), name, (red, green, blue))

@@ -108,7 +108,7 @@ def read_volume(path: PathLike) -> Volume:
     with naming(str(path)):
         voxels, spacing, pose = _placed(voxels.astype(voxels.dtype.newbyteorder("="), copy=False), matrix)
         if is_labels:
-            return LabelMap(_labels(voxels), spacing, pose, own, read_segments(fields, str(path)))
+            return LabelMap(_labels(voxels), spacing, pose, own, tuple(read_segments(fields, str(path))))
         kept = voxels if voxels.dtype.name in VOXEL_TYPES else voxels.astype(np.float32)
         return Volume(kept, spacing, pose, own)
 
