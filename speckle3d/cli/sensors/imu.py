@@ -58,11 +58,18 @@ def orientation_of(
     log: ImuLog, method: Method, magnetometer: bool
 ) -> tuple[TimedRotations, Orientation | None]:
     """Find the orientation of a log; the second result is None for the sensor's own orientation."""
+    from xsens.logs.contradictions import contradictions
+
     readings = log.gyroscope_rad_s is not None or log.accelerometer_m_s2 is not None
     if method != "sensor" and log.oriented.any() and not readings:
         note("no gyroscope and no accelerometer: the orientation is the sensor's own")
         method = "sensor"
     if method == "sensor":
+        against = contradictions(log)
+        if against.get("own orientation") and against.get("accelerometer") == "":
+            raise InvalidInputError(
+                f"{against['own orientation']} The accelerometer agrees with the gyroscope"
+            )
         return log.rotations(), None
     from xsens.fusion.orient import orient
     from xsens.fusion.settings import FusionSettings
