@@ -93,7 +93,9 @@ def info(log_file: Path, rate_hz: MaybeNumber = None, world: World = None) -> Re
     import numpy as np
 
     from speckle3d.core.sweep import INERTIAL
+    from xsens.fusion.readings import require_metres
     from xsens.logs.contradictions import contradictions
+    from xsens.logs.samples import finite_rows
 
     log = read(log_file, rate_hz, world)
     rate = (f"{log.rate_hz:.2f}", "samples/s") if math.isfinite(log.rate_hz) else ("unknown", "")
@@ -113,7 +115,12 @@ def info(log_file: Path, rate_hz: MaybeNumber = None, world: World = None) -> Re
         else:
             norm = np.nanmedian(np.linalg.norm(values, axis=1))
             rows.append((f"{spoken}, median norm", f"{norm:.4f}", unit))
-    notes = (*log.notes, *filter(None, contradictions(log).values()))
+    notes = [*log.notes, *filter(None, contradictions(log).values())]
+    if (force := log.accelerometer_m_s2) is not None:
+        try:
+            require_metres(force[finite_rows(force)], "accelerometer")
+        except InvalidInputError as error:
+            notes.append(str(error))
     return rows_of([*rows, *(("note", text, "") for text in notes)])
 
 
