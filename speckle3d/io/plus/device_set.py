@@ -254,16 +254,17 @@ def _open(path: Path, _: ImportSettings) -> Facts:
         known = ", ".join(_DOCUMENTS)
         raise InvalidInputError(f"{path}: expected a document of PLUS ({known}), got {root.tag}")
     what, use = _DOCUMENTS[root.tag]
+    pixel, clip = device.pixel_mm(), str(device.clip or "none")  # a fault in them is one of the document
     yield "content", what, ""
     if root.tag == "TemporalCalibrationResults":  # whose sign is the other way round: a lag is negative there
         yield "time offset of the tracker", f"{-vector(root, 'TrackerLagSec', 1)[0]:+.4f}", "s"
     if use == _CONFIG:
-        pixel, transducer = device.pixel_mm(), f"{device.text('TransducerName')} {device.geometry}"
+        transducer = f"{device.text('TransducerName')} {device.geometry}"
         for a, b in device.transforms:
             yield f"{a} to {b}", "transform", ""
         yield "pixel", "unknown" if pixel is None else " x ".join(f"{mm:.5f} mm" for mm in pixel), ""
         yield "transducer", transducer.strip() or "not said", ""
-        yield "clip of volumes", str(device.clip or "none"), ""
+        yield "clip of volumes", clip, ""
         if root.find(".//PhantomDefinition/Geometry/Pattern/Wire") is not None:
             use += ", --phantom of calibrate wires"
     yield "for", use, ""
