@@ -33,6 +33,25 @@ def shadowed(sweep, columns, rows):
     return spoiled(sweep, np.rint(frames + rng.normal(0.0, 3.0, frames.shape)))
 
 
+def ringing(sweep, columns):
+    """Vectors without contact: ringing that is the same in every frame, and fresh noise."""
+    rng = np.random.default_rng(6)
+    frames = np.array([sweep.frames[k] for k in range(len(sweep))], np.float32)
+    sample = np.arange(frames.shape[2])
+    frames[:, columns] = 800.0 * np.exp(-sample / 150.0) * np.sin(0.7 * sample)
+    return spoiled(sweep, np.rint(frames + rng.normal(0.0, 3.0, frames.shape)))
+
+
+def labelled(sweep):
+    """Three blocks of white letters, each a quarter of the image wide and a twentieth of it high."""
+    rng = np.random.default_rng(7)
+    frames = np.array([sweep.frames[k] for k in range(len(sweep))], np.float32)
+    wide, high = frames.shape[1] // 4, frames.shape[2] // 20
+    for vector, sample in ((2, 5 * high), (2 * wide, 10 * high), (3 * wide - 1, 15 * high)):
+        frames[:, vector : vector + wide, sample : sample + high][:, rng.random((wide, high)) < 0.35] = 255
+    return spoiled(sweep, frames)
+
+
 def in_order(sweep, order):
     """Frames of a sweep in another order, some of them twice or not at all."""
     return spoiled(sweep, sweep.frames[np.asarray(order)], order)

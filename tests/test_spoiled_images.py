@@ -3,10 +3,13 @@
 import numpy as np
 import pytest
 import spoiled_images as spoil
+from accuracy_set import SHEET
 
 from speckle3d.config import Config
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.pipeline import track
+from speckle3d.sheet_curves import data_sheet_curves
+from speckle3d.simulation.receiver import received
 
 
 @pytest.fixture(scope="module")
@@ -47,6 +50,19 @@ def test_a_shadow_is_left_out_and_told_and_the_length_stays(sweep, curves):
     assert abs(seen / true - 1) < 0.03
     assert abs(seen - true) < 2 * claimed
     assert any("which is left out" in str(doubt) for doubt in found.doubts)
+
+
+@pytest.mark.parametrize("signal", ["rf", "bmode"])
+def test_what_stands_still_is_left_out_and_the_length_stays(sweep, curves, signal):
+    """Ringing in a gap of gel over a third of the image; text on images of grey."""
+    part = sweep.part(0, 48)
+    if signal == "rf":
+        spoilt, own = spoil.ringing(part, slice(0, 16)), curves
+    else:
+        part = received(part, dynamic_range_db=60.0)
+        spoilt, own = spoil.labelled(part), data_sheet_curves(SHEET, part)
+    clean, found = (length_of(some, track(some, own)) for some in (part, spoilt))
+    assert found[1] == pytest.approx(clean[1], rel=0.03)
 
 
 def test_what_stands_still_outside_the_region_changes_nothing(sweep, curves):

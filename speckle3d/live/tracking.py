@@ -31,7 +31,8 @@ from speckle3d.core.threads import on_one_thread
 from speckle3d.examine.processing import structure_openness
 from speckle3d.matching.frames import FrameByFrame, ImageSink
 from speckle3d.matching.matcher import FrameMatcher
-from speckle3d.matching.quality import DrawnOver, FrameFeatures, FrameFlag, flag_frames
+from speckle3d.matching.overlay import Overlay
+from speckle3d.matching.quality import FrameFeatures, FrameFlag, flag_frames
 from speckle3d.matching.schedule import PairSchedule
 from speckle3d.matching.table import CorrelationTable
 from speckle3d.matching.texture import FRAMES, Texture
@@ -125,7 +126,7 @@ class LiveTracker:
         matcher = FrameMatcher(example, c.intensity, c.patches, c.inplane, c.matching, c.quality, curves)
         self.image_grid = matcher.grid
         self._example, self._matcher = example, matcher
-        self._drawn, self._clear = DrawnOver(matcher.patches), np.ones(len(matcher.patches), dtype=bool)
+        self._overlay = Overlay()
         self._matched = FrameByFrame(matcher, PairSchedule(self._config.trajectory))
         read = curves, matcher.patches, matcher.centre_mm, 1
         self._problem = MotionProblem(*read, c.planes, c.trajectory)
@@ -203,9 +204,11 @@ class LiveTracker:
         ready = self._matcher.ready(frame)
         if self.images:
             self.images(number, ready.echo.intensity)
-        if isinstance(self._example.signal, BModeSettings):
-            self._drawn.keep(frame)
-            if number % EVERY == 0 and number < EVERY * FRAMES:
+        if number % EVERY == 0 and number < EVERY * FRAMES:
+            is_bmode = isinstance(self._example.signal, BModeSettings)
+            self._overlay.keep(frame, ready.echo.analytic, is_bmode)
+            self._matcher.leave_out(self._overlay.samples)
+            if is_bmode:
                 self._texture.keep(number, frame, ready)
         table = self._matched.advance(number, ready.frame)
         with self._lock:
@@ -250,7 +253,7 @@ class LiveTracker:
             return
         frames = np.unique([*range(max(0, number - BEFORE), number + 1), *self._tables[number].first])
         table = replace(
-            self._tables[number].among(self._clear),
+            self._tables[number].among(~self._matcher.overlaid),
             first=np.searchsorted(frames, self._tables[number].first),
             second=np.full(len(self._tables[number]), frames.size - 1),
         )
@@ -287,8 +290,7 @@ class LiveTracker:
         if count - begin < 2:
             return
         every = CorrelationTable.joined(tables[begin + 1 :])
-        self._clear = ~self._drawn.patches
-        table = every.where(every.first >= begin, -begin).among(self._clear)
+        table = every.where(every.first >= begin, -begin).among(~self._matcher.overlaid)
         bad = (flags[begin:] & ~FrameFlag.UNMATCHED) != 0
         sound = ~bad[table.first] & ~bad[table.second]
         if not sound.any():

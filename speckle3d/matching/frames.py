@@ -4,17 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from speckle3d.core.arrays import Float32Array, FloatArray, IntArray
 from speckle3d.core.sweep import BModeSettings, Sweep, read_frame
 from speckle3d.core.threads import ahead
 from speckle3d.kernels.inplane import Frame
 from speckle3d.matching.matcher import FrameMatcher, ReadyFrame, compose, inverse
-from speckle3d.matching.quality import DrawnOver, FrameFeatures, FrameFlag, QualitySettings, flag_frames
+from speckle3d.matching.overlay import Overlay
+from speckle3d.matching.quality import FrameFeatures, FrameFlag, QualitySettings, flag_frames
 from speckle3d.matching.schedule import KnownSchedule, PairSchedule
 from speckle3d.matching.table import CorrelationTable
 from speckle3d.matching.texture import FRAMES, Texture, spread_frames
@@ -70,28 +69,28 @@ def match_sweep(
     """
     matched = FrameByFrame(matcher, schedule)
     texture, chosen = Texture(matcher), spread_frames(len(sweep), FRAMES)
-    drawn, is_bmode = DrawnOver(matcher.patches), isinstance(sweep.signal, BModeSettings)
+    overlay, is_bmode = Overlay(), isinstance(sweep.signal, BModeSettings)
+    for samples in (read_frame(sweep.frames, number) for number in chosen):
+        overlay.keep(samples, None if is_bmode else matcher.echo(samples).analytic, is_bmode)
+    matcher.leave_out(overlay.samples)
 
-    def make(number: int) -> tuple[npt.NDArray[Any], ReadyFrame]:
+    def make(number: int) -> ReadyFrame:
         samples = read_frame(sweep.frames, number)
         ready = matcher.ready(samples)
         if number in chosen:
             texture.keep(number, samples, ready)
-        return samples, ready
+        return ready
 
     features, tables = [], []
-    for number, (samples, ready) in enumerate(ahead(make, range(len(sweep)))):
-        if is_bmode:
-            drawn.keep(samples)
+    for number, ready in enumerate(ahead(make, range(len(sweep)))):
         if images:
             images(number, ready.echo.intensity)
         features.append(ready.features)
         tables.append(matched.advance(number, ready.frame))
         if progress:
             progress(number + 1, len(sweep))
-    over = drawn.patches
-    left_out = matcher.patches.inside - np.mean([f.usable & ~over for f in features], axis=0)
-    return MatchedSweep(CorrelationTable.joined(tables).among(~over), features, texture, left_out)
+    left_out = matcher.patches.inside - np.mean([frame.usable for frame in features], axis=0)
+    return MatchedSweep(CorrelationTable.joined(tables), features, texture, left_out)
 
 
 class FrameByFrame:

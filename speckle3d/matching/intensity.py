@@ -16,7 +16,7 @@ import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
 from scipy import fft
 
-from speckle3d.core.arrays import Complex64Array, Float32Array, FloatArray, IntArray
+from speckle3d.core.arrays import BoolArray, Complex64Array, Float32Array, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.grid import ImageGrid
 from speckle3d.core.sweep import BModeSettings, RFSettings
@@ -132,18 +132,29 @@ class IntensityExtractor:
         """Intensity alone."""
         return self.echo(frame).intensity
 
-    def gain(self, intensity: Float32Array) -> Float32Array:
+    def gain(self, intensity: Float32Array, mask: BoolArray | None = None) -> Float32Array:
         """One over the local mean of intensity, of its shape; ones if nothing is to be equalised.
 
         Brightness that varies within a patch correlates between frames whatever the probe did: with the local
         mean divided out, echogenicity does not read as speckle that stays.
+
+        Parameters
+        ----------
+        mask : ndarray of bool, optional
+            Samples that count in the mean, of the same shape; by default all.
         """
         if self.settings.equalise_mm == 0:
             return np.ones_like(intensity)
         sides = (self.grid.vector_pitch_mm, self.grid.sample_spacing_mm)
         window = [2 * int(self.settings.equalise_mm / 2 / side) + 1 for side in sides]
         mean = np.empty_like(intensity)
-        box_means(intensity, window[0], window[1], mean)
+        box_means(intensity if mask is None else intensity * mask, window[0], window[1], mean)
+        if mask is not None:
+            share = np.empty_like(mean)
+            box_means(mask.astype(np.float32), window[0], window[1], share)
+            # Less than half a sample is rounding: nothing counts near.
+            counted, unknown = share > 0.5 / np.prod(window), np.full_like(mean, np.inf)
+            mean = np.divide(mean, share, out=unknown, where=counted)
         np.maximum(mean, np.finfo(np.float32).tiny, out=mean)
         return np.reciprocal(mean, out=mean)
 

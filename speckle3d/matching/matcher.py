@@ -32,6 +32,11 @@ _POOLED_BELOW_MM = 0.05
 in a speckle, and the peak is still found to the sample from which the matching goes on."""
 
 
+_OVERLAID, _OVER_SPECKLE = 0.01, 10.0
+"""Share of a patch's samples that stand still, from which it is left out, also over that of the median patch.
+Speckle that goes on by a quarter of a millimetre in all has up to 0.02 of such samples, by more none."""
+
+
 class MatchingSettings(BaseModel):
     """What of two frames is correlated once their in-plane motion is known."""
 
@@ -76,6 +81,8 @@ class FrameMatcher:
     signal : RFSettings or BModeSettings
     laid, patches : PatchGrid
         All that fit on the image, and those that are matched.
+    overlaid : ndarray of bool, shape (p,)
+        Patches on which something stands still, which are left out.
 
     Raises
     ------
@@ -103,7 +110,8 @@ class FrameMatcher:
         self.laid = lay_patches(self.grid, patches)
         self.patches = self.laid
         self._quality, self._least_overlap = quality, inplane.least_overlap
-        self._mask = Region(patches.region).mask(self.grid) if patches.region else None
+        self._region = Region(patches.region).mask(self.grid) if patches.region else None
+        self._mask = self._region
         spacing, sides = self.laid.spacing_mm, np.array([self.grid.vectors, self.grid.samples])
         self._pool = np.array([1, 2 if spacing[1] < _POOLED_BELOW_MM else 1])
         self._reach = np.minimum(np.ceil(inplane.search_mm / (spacing * self._pool)), sides // self._pool - 1)
@@ -128,11 +136,33 @@ class FrameMatcher:
         if curves is not None:
             curves.key.require_same(self.key)
             self.patches = self.laid.between(curves.depth_mm)
+        self.overlaid = np.zeros(len(self.patches), dtype=bool)
+
+    def leave_out(self, standing: BoolArray | None) -> None:
+        """Leave out the patches on which something stands still, and that from the others' local mean.
+
+        Parameters
+        ----------
+        standing : ndarray of bool, shape (vector, grid.samples), optional
+            See `speckle3d.matching.overlay.Overlay.samples`.
+        """
+        if standing is None:
+            return
+        share = self.patches.tiles(standing).mean(axis=(1, 2))
+        # Where the probe hardly moves, speckle stays here and there, but all over the image.
+        self.overlaid = share > max(_OVERLAID, _OVER_SPECKLE * float(np.median(share)))
+        wide, high = self.patches.size
+        mask = np.ones_like(standing) if self._region is None else self._region.copy()
+        for vector, sample in self.patches.first[self.overlaid]:
+            part = slice(vector, vector + wide), slice(sample, sample + high)
+            mask[part] &= ~standing[part]
+        self._mask = mask if self._region is not None or self.overlaid.any() else None
 
     def ready(self, samples: npt.NDArray[Any]) -> ReadyFrame:
         """Make a frame, as read, ready to be matched; on any thread."""
         echo, is_bmode = self.echo(samples), isinstance(self.signal, BModeSettings)
         features = inspect_frame(samples, echo.intensity, self.patches, is_bmode, self._quality)
+        features = replace(features, usable=features.usable & ~self.overlaid)
         return ReadyFrame(echo, features, self.prepare(echo, features.usable))
 
     def echo(self, frame: npt.NDArray[Any]) -> Echo:
@@ -142,7 +172,7 @@ class FrameMatcher:
 
     def equalised(self, echo: Echo) -> tuple[Float32Array, Float32Array]:
         """Intensity and, where there is phase, echo over their local mean; see `Frame`."""
-        gain = self.extractor.gain(echo.intensity)
+        gain = self.extractor.gain(echo.intensity, self._mask)
         if echo.analytic is None:
             return echo.intensity * gain, np.empty((2, 0, 0), np.float32)
         image, parts = np.empty_like(gain), np.empty((2, *gain.shape), np.float32)
@@ -159,7 +189,7 @@ class FrameMatcher:
         """
         image, parts = self.equalised(echo)
         kept = self.patches.inside if usable is None else self.patches.inside & usable
-        # Only what lies in the region is searched for.
+        # Only what lies in the region and moves is searched for.
         searched = image if self._mask is None else np.where(self._mask, image, image[self._mask].mean())
         if self._pool[1] == 2:
             even = searched.shape[1] // 2 * 2

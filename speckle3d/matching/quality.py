@@ -32,11 +32,6 @@ from speckle3d.matching.patches import PatchGrid
 _CONSTANT = 1e-4
 """Contrast of a patch up to which it is a constant, but for rounding. A step of grey in one pixel is 1e-3."""
 
-_DRAWN_SHARE, _DRAWN_OVER_SPECKLE = 0.01, 10.0
-"""Share of a patch's pixels that no frame changes, from which something is drawn on it, also over that of the
-median patch. Speckle that goes on by a quarter of a millimetre in all has up to 0.02 of such pixels, by more
-none."""
-
 _SAMPLES = 40
 """Samples in depth of which a patch's statistics are taken at least, where it has more: speckle has four."""
 
@@ -181,34 +176,6 @@ def _clipped(frame: npt.NDArray[Any], is_bmode: bool, settings: QualitySettings)
     if is_bmode:  # Black is no echo: it is neither clipped nor counted.
         return clipped / np.count_nonzero(samples) / settings.clipped_bmode
     return (clipped + np.count_nonzero(samples == low)) / samples.size / settings.clipped_rf
-
-
-class DrawnOver:
-    """Patches on which something is drawn that no frame changes: text, a ruler, a logo.
-
-    Parameters
-    ----------
-    patches : PatchGrid
-    """
-
-    def __init__(self, patches: PatchGrid) -> None:
-        self._patches = patches
-        self._extremes: tuple[npt.NDArray[Any], npt.NDArray[Any]] | None = None
-
-    def keep(self, frame: npt.NDArray[Any]) -> None:
-        """Look at one frame of grey levels."""
-        darkest, brightest = self._extremes or (frame, frame)
-        self._extremes = np.minimum(darkest, frame), np.maximum(brightest, frame)
-
-    @property
-    def patches(self) -> BoolArray:
-        """Which patches something is drawn on, shape (p,)."""
-        if self._extremes is None:
-            return np.zeros(len(self._patches), dtype=bool)
-        darkest, brightest = self._extremes
-        share = self._patches.tiles((darkest == brightest) & (darkest > 0)).mean(axis=(1, 2))
-        # Where the probe hardly moves, speckle agrees here and there, but all over the image.
-        return np.asarray(share > max(_DRAWN_SHARE, _DRAWN_OVER_SPECKLE * float(np.median(share))))
 
 
 def flag_frames(features: Sequence[FrameFeatures], settings: QualitySettings | None = None) -> IntArray:

@@ -13,7 +13,6 @@ from speckle3d.io.load import load_sweep
 from speckle3d.matching.intensity import IntensityExtractor
 from speckle3d.matching.patches import PatchSettings, lay_patches
 from speckle3d.matching.quality import (
-    DrawnOver,
     FrameFlag,
     QualitySettings,
     flag_frames,
@@ -196,18 +195,6 @@ def test_real_recordings(realdata, name):
     # and at most 0.09 of the others'. The bounds lie midway to the threshold.
     shares = [f.speckle_share for f in features]
     assert max(shares) < 0.12 if flag else min(shares) > 0.28
-
-
-def test_text_on_images_is_found_where_it_is_and_nowhere_else():
-    rng, grid = np.random.default_rng(2), GRID
-    patches = lay_patches(grid)
-    drawn = DrawnOver(patches)
-    (v, s), (wide, high) = patches.first[9], patches.size
-    for _ in range(8):
-        frame = rng.integers(0, 200, (grid.vectors, grid.samples)).astype(np.uint8)
-        frame[v : v + wide // 2, s : s + high // 4] = 255
-        drawn.keep(frame)
-    assert np.flatnonzero(drawn.patches).tolist() == [9]
 
 
 def test_frames_are_judged_by_the_region_alone():
