@@ -43,12 +43,13 @@ def ringing(sweep, columns):
 
 
 def labelled(sweep):
-    """Three blocks of white letters, each a quarter of the image wide and a twentieth of it high."""
+    """White dots among the letters' strokes, in three blocks of a third of the image by a tenth."""
     rng = np.random.default_rng(7)
     frames = np.array([sweep.frames[k] for k in range(len(sweep))], np.float32)
-    wide, high = frames.shape[1] // 4, frames.shape[2] // 20
-    for vector, sample in ((2, 5 * high), (2 * wide, 10 * high), (3 * wide - 1, 15 * high)):
-        frames[:, vector : vector + wide, sample : sample + high][:, rng.random((wide, high)) < 0.35] = 255
+    wide, high = frames.shape[1] // 3, frames.shape[2] // 10
+    for vector, sample in ((0, 2 * high), (wide + 8, 4.5 * high), (2, 7 * high)):
+        block = np.s_[:, vector : vector + wide, int(sample) : int(sample) + high]
+        frames[block][:, rng.random((wide, high)) < 0.02] = 255
     return spoiled(sweep, frames)
 
 

@@ -205,10 +205,9 @@ class LiveTracker:
         if self.images:
             self.images(number, ready.echo.intensity)
         if number % EVERY == 0 and number < EVERY * FRAMES:
-            is_bmode = isinstance(self._example.signal, BModeSettings)
-            self._overlay.keep(frame, ready.echo.analytic, is_bmode)
-            self._matcher.leave_out(self._overlay.samples)
-            if is_bmode:
+            self._overlay.keep(frame, ready.echo)
+            self._matcher.leave_out(self._overlay)
+            if isinstance(self._example.signal, BModeSettings):
                 self._texture.keep(number, frame, ready)
         table = self._matched.advance(number, ready.frame)
         with self._lock:

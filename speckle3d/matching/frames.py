@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from speckle3d.core.arrays import Float32Array, FloatArray, IntArray
-from speckle3d.core.sweep import BModeSettings, Sweep, read_frame
+from speckle3d.core.sweep import Sweep, read_frame
 from speckle3d.core.threads import ahead
 from speckle3d.kernels.inplane import Frame
 from speckle3d.matching.matcher import FrameMatcher, ReadyFrame, compose, inverse
@@ -69,10 +69,10 @@ def match_sweep(
     """
     matched = FrameByFrame(matcher, schedule)
     texture, chosen = Texture(matcher), spread_frames(len(sweep), FRAMES)
-    overlay, is_bmode = Overlay(), isinstance(sweep.signal, BModeSettings)
+    overlay = Overlay()
     for samples in (read_frame(sweep.frames, number) for number in chosen):
-        overlay.keep(samples, None if is_bmode else matcher.echo(samples).analytic, is_bmode)
-    matcher.leave_out(overlay.samples)
+        overlay.keep(samples, matcher.echo(samples))
+    matcher.leave_out(overlay)
 
     def make(number: int) -> ReadyFrame:
         samples = read_frame(sweep.frames, number)

@@ -23,6 +23,7 @@ from speckle3d.core.threads import in_parallel
 from speckle3d.kernels.box_means import amplify
 from speckle3d.kernels.inplane import Frame, Geometry, Matches, match_pair
 from speckle3d.matching.intensity import Echo, IntensityExtractor, IntensitySettings, two_way_wavenumber
+from speckle3d.matching.overlay import Overlay
 from speckle3d.matching.patches import PatchSettings, lay_patches
 from speckle3d.matching.quality import FrameFeatures, QualitySettings, inspect_frame
 from speckle3d.matching.table import CorrelationTable
@@ -32,9 +33,10 @@ _POOLED_BELOW_MM = 0.05
 in a speckle, and the peak is still found to the sample from which the matching goes on."""
 
 
-_OVERLAID, _OVER_SPECKLE = 0.01, 10.0
-"""Share of a patch's samples that stand still, from which it is left out, also over that of the median patch.
-Speckle that goes on by a quarter of a millimetre in all has up to 0.02 of such samples, by more none."""
+_OVERLAID, _OVER_SPECKLE = 0.1, 10.0
+"""Share of a patch's power in samples that stand still, from which it is left out, also over that of the
+median patch. Simulated sweeps of two physics have up to 0.009 where nothing stands, by chance; a white pixel
+of text among a thousand has 0.1. On a probe that hardly moves speckle stays, but all over the image."""
 
 
 class MatchingSettings(BaseModel):
@@ -112,6 +114,7 @@ class FrameMatcher:
         self._quality, self._least_overlap = quality, inplane.least_overlap
         self._region = Region(patches.region).mask(self.grid) if patches.region else None
         self._mask = self._region
+        self._standing: BoolArray | None = None
         spacing, sides = self.laid.spacing_mm, np.array([self.grid.vectors, self.grid.samples])
         self._pool = np.array([1, 2 if spacing[1] < _POOLED_BELOW_MM else 1])
         self._reach = np.minimum(np.ceil(inplane.search_mm / (spacing * self._pool)), sides // self._pool - 1)
@@ -138,25 +141,24 @@ class FrameMatcher:
             self.patches = self.laid.between(curves.depth_mm)
         self.overlaid = np.zeros(len(self.patches), dtype=bool)
 
-    def leave_out(self, standing: BoolArray | None) -> None:
-        """Leave out the patches on which something stands still, and that from the others' local mean.
-
-        Parameters
-        ----------
-        standing : ndarray of bool, shape (vector, grid.samples), optional
-            See `speckle3d.matching.overlay.Overlay.samples`.
-        """
-        if standing is None:
-            return
-        share = self.patches.tiles(standing).mean(axis=(1, 2))
-        # Where the probe hardly moves, speckle stays here and there, but all over the image.
+    def leave_out(self, overlay: Overlay) -> None:
+        """Leave out the patches on which something stands still, and that from the others' local mean."""
+        standing, patches = overlay.standing, self.patches
+        powers = (
+            patches.tiles(power).sum(axis=(1, 2)) for power in (standing * overlay.power, overlay.power)
+        )
+        share = np.divide(
+            *powers, out=np.zeros(len(patches), np.float32), where=np.isfinite(overlay.power.sum())
+        )
         self.overlaid = share > max(_OVERLAID, _OVER_SPECKLE * float(np.median(share)))
-        wide, high = self.patches.size
-        mask = np.ones_like(standing) if self._region is None else self._region.copy()
-        for vector, sample in self.patches.first[self.overlaid]:
-            part = slice(vector, vector + wide), slice(sample, sample + high)
-            mask[part] &= ~standing[part]
-        self._mask = mask if self._region is not None or self.overlaid.any() else None
+        (wide, high), over = patches.size, np.zeros_like(standing)
+        for vector, sample in patches.first[self.overlaid]:
+            over[vector : vector + wide, sample : sample + high] = True
+        over &= standing
+        self._standing = over if over.any() else None
+        self._mask = self._region
+        if self._standing is not None:
+            self._mask = ~over if self._region is None else self._region & ~over
 
     def ready(self, samples: npt.NDArray[Any]) -> ReadyFrame:
         """Make a frame, as read, ready to be matched; on any thread."""
@@ -173,6 +175,8 @@ class FrameMatcher:
     def equalised(self, echo: Echo) -> tuple[Float32Array, Float32Array]:
         """Intensity and, where there is phase, echo over their local mean; see `Frame`."""
         gain = self.extractor.gain(echo.intensity, self._mask)
+        if self._standing is not None:
+            gain[self._standing] = 0.0
         if echo.analytic is None:
             return echo.intensity * gain, np.empty((2, 0, 0), np.float32)
         image, parts = np.empty_like(gain), np.empty((2, *gain.shape), np.float32)

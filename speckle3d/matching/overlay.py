@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from speckle3d.core.arrays import BoolArray, Complex64Array
+from speckle3d.core.arrays import BoolArray
+from speckle3d.matching.intensity import Echo
 
 STANDING = 0.5
 """Share of a sample's power that is in the mean of the frames' echoes, from which it stands still. Of n
@@ -19,39 +20,36 @@ independent frames of speckle (1 - 0.5)^(n - 1) of the samples have it by chance
 
 
 class Overlay:
-    """Samples that no frame changes, of some frames that are far apart."""
+    """Samples that no frame changes, of some frames that are far apart.
+
+    Attributes
+    ----------
+    power : ndarray, shape (vector, grid.samples)
+        Sum of the frames' intensities.
+    """
 
     def __init__(self) -> None:
         self._count = 0
+        self.power: Any = np.float32(0.0)
+        self._total: Any = np.complex64(0.0)
         self._extremes: tuple[npt.NDArray[Any], npt.NDArray[Any]] | None = None
-        self._sums: tuple[npt.NDArray[Any], npt.NDArray[Any]] | None = None
 
-    def keep(self, samples: npt.NDArray[Any], analytic: Complex64Array | None, is_bmode: bool) -> None:
-        """Look at one frame.
-
-        Parameters
-        ----------
-        samples : ndarray, shape (vector, sample)
-            As read; grey levels are compared.
-        analytic : ndarray, shape (vector, grid.samples), optional
-            Of echoes with phase.
-        """
+    def keep(self, samples: npt.NDArray[Any], echo: Echo) -> None:
+        """Look at one frame, as read and its echo: where there is no phase, grey levels are compared."""
+        if not np.isfinite(echo.intensity.sum()):
+            return
         self._count += 1
-        if is_bmode:
+        self.power = self.power + echo.intensity
+        if echo.analytic is not None:
+            self._total = self._total + echo.analytic
+        elif samples.shape == echo.intensity.shape:
             darkest, brightest = self._extremes or (samples, samples)
             self._extremes = np.minimum(darkest, samples), np.maximum(brightest, samples)
-        elif analytic is not None:
-            power = analytic.real**2 + analytic.imag**2
-            total, powers = self._sums or (0.0, 0.0)
-            self._sums = total + analytic, powers + power
 
     @property
-    def samples(self) -> BoolArray | None:
-        """Which samples of the intensity images stand still; None where it is not known."""
+    def standing(self) -> BoolArray:
+        """Which samples of the intensity images stand still, shape (vector, grid.samples)."""
         if self._extremes is not None:
             darkest, brightest = self._extremes
             return np.asarray((darkest == brightest) & (darkest > 0))
-        if self._sums is not None:
-            total, powers = self._sums
-            return np.asarray(np.abs(total) ** 2 > STANDING * self._count * powers)
-        return None
+        return np.asarray(np.abs(self._total) ** 2 > STANDING * self._count * self.power)
