@@ -144,12 +144,9 @@ class FrameMatcher:
     def leave_out(self, overlay: Overlay) -> None:
         """Leave out the patches on which something stands still, and that from the others' local mean."""
         standing, patches = overlay.standing, self.patches
-        powers = (
-            patches.tiles(power).sum(axis=(1, 2)) for power in (standing * overlay.power, overlay.power)
-        )
-        share = np.divide(
-            *powers, out=np.zeros(len(patches), np.float32), where=np.isfinite(overlay.power.sum())
-        )
+        still = patches.tiles(standing * overlay.power).sum(axis=(1, 2))
+        power = patches.tiles(overlay.power).sum(axis=(1, 2))
+        share = still / np.maximum(power, np.finfo(np.float32).tiny)
         self.overlaid = share > max(_OVERLAID, _OVER_SPECKLE * float(np.median(share)))
         (wide, high), over = patches.size, np.zeros_like(standing)
         for vector, sample in patches.first[self.overlaid]:
