@@ -42,7 +42,7 @@ def main():
         "tracking": lambda: ([simulated(SWEEP), long(commands.FRAMES[0])], curves()),
         "patches": lambda: (simulated(SWEEP),),
     }
-    parts = ("tracking", "patches", "sensors", "commands", "voxels", "files", "memory")
+    parts = ("tracking", "patches", "sensors", "commands", "voxels", "memory")
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--runs", type=int, default=7)
     parser.add_argument("--only", nargs="*", choices=parts, default=parts)

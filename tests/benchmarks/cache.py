@@ -42,7 +42,7 @@ def to_and_fro(source, frames, folder=DEFAULT):
         time_s, poses = 0.04 * np.arange(frames), sweep.truth[index]
         return replace(
             sweep,
-            frames=InOrder(sweep.frames, index),
+            frames=_InOrder(sweep.frames, index),
             frame_time_s=time_s,
             truth=poses,
             tracker=Tracker(TimedPoses(time_s, poses), RigidTransform.identity()),
@@ -53,7 +53,7 @@ def to_and_fro(source, frames, folder=DEFAULT):
     return written(folder / f"{source.stem}-{frames}.h5", long)
 
 
-class InOrder:
+class _InOrder:
     """Frames of a sweep, in another order."""
 
     any_thread = False

@@ -19,7 +19,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.errors import Speckle3DError
 
@@ -75,17 +74,12 @@ def without_curves(tracked):
 
 
 def overcorrected(function, tracked, *arguments, **named):
-    """Steps that are turned the other way than the correction turned them."""
+    """Poses that are as far off the image's on the other side as the correction moved them."""
     corrections = function(tracked, *arguments, **named)
-    found = tracked.image[:-1].inv() * tracked.image[1:]
-    changed = {}
     for mode, each in corrections.items():
-        right = each.poses[:-1].inv() * each.poses[1:]
-        poses = [each.poses[0]]
-        for step in found * right.inv() * found:
-            poses.append(poses[-1] * step)
-        changed[mode] = replace(each, poses=RigidTransform.concatenate(poses))
-    return changed
+        right = each.poses[0].inv() * each.poses
+        corrections[mode] = replace(each, poses=each.poses[0] * tracked.image * right.inv() * tracked.image)
+    return corrections
 
 
 def late(sweep):

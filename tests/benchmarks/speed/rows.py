@@ -76,11 +76,6 @@ class Timing:
     seconds: float
     cores: float
 
-    @property
-    def busy_s(self):
-        """Processor time."""
-        return self.seconds * self.cores
-
 
 def timed(function, runs):
     """Time a function, after one run in which kernels are loaded."""
