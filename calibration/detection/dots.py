@@ -1,8 +1,8 @@
 """Automatic detection of bright dots in images: wires seen end on.
 
 A dot is a maximum of the difference of two Gaussians that is not part of a line. Side lobes make it wide and
-ringing gives it a tail, both weaker than the dot itself, so that its place is the centroid of the pixels
-above half of its peak.
+ringing gives it a tail, both weaker than the dot itself: its place is the centre of what is bright, by mean
+shift.
 """
 
 from __future__ import annotations
