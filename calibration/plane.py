@@ -29,7 +29,7 @@ from calibration.robust import absolute_weights, robust_linear
 from calibration.settings import PlaneFit
 from calibration.solution import Problem, Solution, apart
 from speckle3d.core.arrays import BoolArray, FloatArray
-from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.geometry import nearest_rotation, roll_yaw_tilt
 
 _NORMALS = 30
@@ -246,7 +246,7 @@ class Equations:
 
         Raises
         ------
-        InvalidInputError
+        InsufficientDataError, InvalidInputError
             If there are fewer residuals than parameters, or some are not finite.
         """
         columns = columns_of(free)
@@ -263,7 +263,9 @@ class Equations:
         chain, (normal, pull, cost) = start, at(start)
         count = self.offsets.size + (2 if prior else 0)
         if count < len(columns):
-            raise InvalidInputError(f"expected at least {len(columns)} residuals, got {count}")
+            raise InsufficientDataError(
+                f"expected at least {len(columns)} residuals, got {count}: the phantom in more frames"
+            )
         if not np.isfinite(cost):
             raise InvalidInputError("expected finite residuals at the starting point, got some that are not")
         damping, step = 1e-6, np.zeros(len(CHAIN))
