@@ -308,7 +308,10 @@ def folded(
     if rows.size < LEAST_COMPARED or len(patch_centre_mm) < FOLD_PATCHES:
         return None
     second = table.second[rows]
-    apart = _distance(poses[table.first[rows]].inv() * poses[second], patch_centre_mm)
+    # Median elevational distance of the patches between the frames of each pair.
+    centres = np.column_stack([patch_centre_mm, np.zeros(len(patch_centre_mm))])
+    matrix = (poses[table.first[rows]].inv() * poses[second]).as_matrix()
+    apart = np.median(np.abs(matrix[:, 2, :3] @ centres.T + matrix[:, 2, 3:]), axis=1)
     expected = np.asarray(isotonic_regression(apart).x)
     worst, at = 0.0, 0
     for start in range(0, len(poses), WINDOW // 4):
@@ -351,10 +354,3 @@ def severed(first: IntArray, second: IntArray, usable: BoolArray) -> Doubt | Non
     )
     where = tuple((k, k) for k in cuts)
     return Doubt(IMAGES, "too fast, lifted, or frames lost", evidence, False, where)
-
-
-def _distance(relative: RigidTransform, patch_centre_mm: FloatArray) -> FloatArray:
-    """Median elevational distance of the patches between the frames of each pair, shape (e,), mm."""
-    at = np.column_stack([patch_centre_mm, np.zeros(len(patch_centre_mm))])
-    matrix = relative.as_matrix()
-    return np.asarray(np.median(np.abs(matrix[:, 2, :3] @ at.T + matrix[:, 2, 3:]), axis=1))

@@ -6,8 +6,8 @@ What images and sensors say differently is in `speckle3d.examine.disagreements`:
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.ndimage import median_filter
@@ -44,8 +44,7 @@ _STILL = 1e-9
 """Readings closer than this are the same: noise moves the last digits of any sensor that is read."""
 
 
-@dataclass(frozen=True)
-class ExaminedSensors:
+class ExaminedSensors(NamedTuple):
     """What may be used of a sweep's sensors.
 
     Attributes
@@ -113,8 +112,6 @@ def cleaned_readings(sweep: Sweep) -> tuple[Sweep, tuple[Doubt, ...]]:
 def believed(sweep: Sweep, doubts: Iterable[Doubt]) -> Sweep:
     """The sweep without the sensors that are refuted."""
     refuted = {doubt.about for doubt in doubts if doubt.refuted}
-    if not refuted & {Tracker.label, OrientationSensor.label}:
-        return sweep
     return replace(
         sweep,
         tracker=None if Tracker.label in refuted else sweep.tracker,

@@ -254,10 +254,10 @@ def estimate_coherence(
     """
     binned, centres = _binned(problem, table, sound, path)
     determined, of_echo = binned.determined, problem.at_patches.of_echo
-    if not determined.any():
-        return Coherence(np.zeros(1), *fully_developed(len(problem.patches)), scale_sigma=UNADAPTED_SIGMA)
     # Curves of tissue hold its structure.
-    most_share = 0.0 if problem.curves.of_tissue else MOST_SHARE["echo" if of_echo else "intensity"]
+    if problem.curves.of_tissue or not determined.any():
+        return Coherence(np.zeros(1), *fully_developed(len(problem.patches)), scale_sigma=UNADAPTED_SIGMA)
+    most_share = MOST_SHARE["echo" if of_echo else "intensity"]
 
     def row_medians(values: FloatArray) -> FloatArray:
         by_piece = np.where(determined, values, np.nan).reshape(centres.size, -1)
@@ -290,8 +290,6 @@ def estimate_coherence(
     by_patch = standard_error(left[clear], 0)
     errors = max(by_row, by_patch), np.ptp(medians) / np.sqrt(12.0), CURVES_SIGMA
     sigma = float(np.linalg.norm(errors))
-    if problem.curves.of_tissue:
-        return Coherence(np.zeros(1), *fully_developed(len(problem.patches)), scale_sigma=sigma)
     shape = centres.size, -1
     return Coherence(
         centres, share.reshape(shape), gain.reshape(shape), float(np.exp(log_scale)), sigma, rows
