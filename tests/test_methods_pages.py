@@ -20,7 +20,9 @@ def settings_in(text):
         r"([a-z]+)\.([a-z_]+)\b(?:`|\})(?:\s(?:\(|\| )([-\d.]+)(?=[\s),;]))?", text.replace("\\_", "_")
     )
     return [
-        (group, name, value) for group, name, value in found if group in SETTINGS and name not in ("md", "py")
+        (group, name, value)
+        for group, name, value in found
+        if group in SETTINGS and name not in ("md", "png", "py")
     ]
 
 
