@@ -11,7 +11,8 @@ pytestmark = needs_browser
 def test_picture_length_and_end_are_shown(browser, shipped, tmp_path, monkeypatch):
     monkeypatch.setenv("BROWSER", "true")  # the one that this test brings looks at it
     port = free_port()
-    play = command("play", shipped / "phantom.h5", "--port", port)
+    # Slowly: a page on a busy machine takes seconds to open.
+    play = command("play", shipped / "phantom.h5", "--port", port, "--rate", "0.3")
     live = command("live", f"localhost:{port}", "-o", tmp_path / "out", "--curves", shipped / "curves.h5",
                    "--view", *RF)  # fmt: skip
     with running(play, stderr=subprocess.PIPE) as playing:
