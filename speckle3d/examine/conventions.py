@@ -69,14 +69,16 @@ def doubts_of_gyroscope(sensor: OrientationSensor) -> Iterator[Doubt]:
         if not _gravity_from_vertical(sensor, other) > TILTED_DEG
     ]
     gain, name = max(upright, default=(0.0, ""))
+    still = misfit(left) - misfit(turns)
     bias = float(np.linalg.norm(np.median(left, axis=0))) / (lag * float(np.median(pause)))
     contradicted = float(_spread(left).max()) > noise
     # The gyroscope's sign may be the mistaken one.
     if contradicted and gain > max(LEAST_GAIN, misfit(left) - misfit(difference(readings, -1.0))):
         evidence = f"expected turns as its gyroscope's, so they fit better by {gain:.0f} in log likelihood"
         yield Doubt(sensor.label, name, evidence, True)
-    elif contradicted:
-        evidence = "expected turns as its gyroscope's, got others that no convention explains"
+    # Readings that jitter beside a slow hand still turn as the gyroscope does, better than not at all.
+    elif contradicted and still > LEAST_GAIN:
+        evidence = f"expected turns as its gyroscope's, no turn fits better by {still:.0f} in log likelihood"
         yield Doubt(sensor.label, "gyroscope on other axes, or quaternions of another kind", evidence, False)
     elif bias > MOST_BIAS_DEG_S:
         evidence = f"expected turns as its gyroscope's, got {bias:.1f} degrees/s more"

@@ -3,10 +3,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from faults import spoil
+from scipy.spatial.transform import Rotation
 
 from speckle3d.config import Config
 from speckle3d.core.errors import MismatchError
 from speckle3d.corrections import correct
+from speckle3d.examine.conventions import doubts_of_gyroscope
 from speckle3d.examine.disagreements import differing_lengths, disagreements
 from speckle3d.examine.sensors import cleaned_readings, examined_sensors
 from speckle3d.motion.direction import settle_direction
@@ -131,6 +133,17 @@ def test_a_gyroscope_on_other_axes_does_not_refute_the_readings(sweep, tracked):
     turned_round = replace(sweep.orientation, gyroscope_rad_s=-sweep.orientation.gyroscope_rad_s)
     examined = examined_sensors(replace(sweep, tracker=None, orientation=turned_round), tracked.image)
     assert [(doubt.refuted, "gyroscope" in doubt.suspect) for doubt in examined.doubts] == [(False, True)]
+
+
+def test_readings_that_jitter_about_the_gyroscopes_turns_are_not_doubted(sweep):
+    sensor = sweep.orientation
+    time_s = sensor.readings.time_s
+    turned = np.deg2rad(2.0) * np.sin(np.pi * time_s[:, None] + np.arange(3))
+    jitter = np.random.default_rng(0).normal(0.0, np.deg2rad(0.15), turned.shape)
+    readings = replace(sensor.readings, world_from_sensor=Rotation.from_rotvec(turned + jitter))
+    rate = np.gradient(turned, time_s, axis=0)
+    slow = replace(sensor, readings=readings, gyroscope_rad_s=rate, accelerometer_m_s2=None)
+    assert list(doubts_of_gyroscope(slow)) == []
 
 
 def test_modes_by_the_images_alone_do_not_contradict_each_other():
