@@ -54,7 +54,7 @@ def test_setting_then_tracker_then_nothing_settles_the_direction(sweep, tracked)
 
 def spoilt(sweep, numbers, change):
     """The sweep with some frames changed by a function of the frame."""
-    frames = np.stack([sweep.frames[k] for k in range(len(sweep))])
+    frames = np.stack([sweep.frames[k] for k in range(len(sweep))]).astype(np.float32)
     for number in numbers:
         frames[number] = change(frames[number])
     return replace(sweep, frames=frames)
@@ -82,6 +82,13 @@ def test_the_path_goes_on_past_frames_without_speckle(sweep, curves, lost):
     centre = sweep.grid.centre_mm
     true, seen = (path[0].inv() * path[47] for path in (sweep.truth, found.image))
     assert seen.apply(centre)[2] == pytest.approx(true.apply(centre)[2], rel=0.06)
+
+
+@pytest.mark.parametrize("value", [0.0, np.nan])
+def test_a_sweep_goes_on_from_frames_without_echo_at_its_start(sweep, curves, value):
+    found = track(spoilt(sweep.part(0, 20), [0, 1], lambda frame: np.full_like(frame, value)), curves)
+    assert (found.flags[:2] & FrameFlag.NO_SPECKLE).all()
+    assert not found.flags[3:].any()
 
 
 @pytest.mark.parametrize("flag", [FrameFlag.SATURATED, FrameFlag.NO_SPECKLE])

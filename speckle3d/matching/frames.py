@@ -18,6 +18,10 @@ from speckle3d.matching.schedule import KnownSchedule, PairSchedule
 from speckle3d.matching.table import CorrelationTable
 from speckle3d.matching.texture import FRAMES, Texture, spread_frames
 
+SEARCHED = 3
+"""References against which the in-plane motion of a frame is searched, if it resembles none before: the last
+sound frame may show other tissue, or be the first of the sweep, and without an echo."""
+
 ImageSink = Callable[[int, Float32Array], None]
 """Called with each frame's number and intensity image (vector, sample), in order."""
 
@@ -117,17 +121,18 @@ class FrameByFrame:
         return table
 
     def _pairs(self, number: int, frame: Frame) -> CorrelationTable:
-        """Match a frame with its references, from a start found against the first of them."""
+        """Match a frame with its references, from a start found against the first that it resembles."""
         references, least = self._schedule.references(number), self._schedule.least_correlation
         self._motion[number] = self._motion.get(number - 1, np.zeros(3))
-        if not references:
-            return self._matcher.match({}, number, frame, [])
-        anchor, fixed = references[0], {first: self._frames[first] for first in sorted(references)}
-        motion = compose(self._motion[anchor], self._matcher.search(fixed[anchor], frame))
-        starts = [compose(inverse(self._motion[first]), motion) for first in fixed]
-        table = self._matcher.match(fixed, number, frame, starts)
-        if table.median.max() >= least:
-            row = sorted(references).index(anchor)
-            close = table.median[row] >= least
-            self._motion[number] = compose(self._motion[anchor], table.inplane[row]) if close else motion
+        fixed = {first: self._frames[first] for first in sorted(references)}
+        table = self._matcher.match({}, number, frame, [])
+        for anchor in references[:SEARCHED]:
+            motion = compose(self._motion[anchor], self._matcher.search(fixed[anchor], frame))
+            starts = [compose(inverse(self._motion[first]), motion) for first in fixed]
+            table = self._matcher.match(fixed, number, frame, starts)
+            if table.median.max() >= least:
+                row = sorted(references).index(anchor)
+                close = table.median[row] >= least
+                self._motion[number] = compose(self._motion[anchor], table.inplane[row]) if close else motion
+                break
         return table

@@ -143,6 +143,8 @@ class FrameMatcher:
 
     def leave_out(self, overlay: Overlay) -> None:
         """Leave out the patches on which something stands still, and that from the others' local mean."""
+        if not overlay.count:
+            return
         standing, patches = overlay.standing, self.patches
         still = patches.tiles(standing * overlay.power).sum(axis=(1, 2))
         power = patches.tiles(overlay.power).sum(axis=(1, 2))

@@ -24,12 +24,14 @@ class Overlay:
 
     Attributes
     ----------
+    count : int
+        Of frames that were finite.
     power : ndarray, shape (vector, grid.samples)
         Sum of the frames' intensities.
     """
 
     def __init__(self) -> None:
-        self._count = 0
+        self.count = 0
         self.power: Any = np.float32(0.0)
         self._total: Any = np.complex64(0.0)
         self._extremes: tuple[npt.NDArray[Any], npt.NDArray[Any]] | None = None
@@ -38,7 +40,7 @@ class Overlay:
         """Look at one frame, as read and its echo: where there is no phase, grey levels are compared."""
         if not np.isfinite(echo.intensity.sum()):
             return
-        self._count += 1
+        self.count += 1
         self.power = self.power + echo.intensity
         if echo.analytic is not None:
             self._total = self._total + echo.analytic
@@ -52,4 +54,4 @@ class Overlay:
         if self._extremes is not None:
             darkest, brightest = self._extremes
             return np.asarray((darkest == brightest) & (darkest > 0))
-        return np.asarray(np.abs(self._total) ** 2 > STANDING * self._count * self.power)
+        return np.asarray(np.abs(self._total) ** 2 > STANDING * self.count * self.power)

@@ -78,3 +78,13 @@ def test_images_that_show_no_speckle_leave_the_length_open(shipped):
     for images, least, most in (frames, 0.05, 0.3), (dark, 1.0, np.inf):
         grey = replace(sweep, frames=images)
         assert least < live(grey, data_sheet_curves(SHEET, grey))[0].length_sigma < most
+
+
+def test_a_first_frame_that_is_not_finite_is_flagged_and_the_sweep_goes_on(shipped):
+    sweep, curves = shipped_part(shipped)
+    tracker = LiveTracker(sweep, curves, background=False)
+    frames = np.stack([sweep.frames[k] for k in range(8)]).astype(np.float32)
+    frames[0] = np.nan
+    flags = [tracker.append(frame, float(k)).flags for k, frame in enumerate(frames)]
+    assert flags[0] & FrameFlag.NO_SPECKLE
+    assert not any(flags[2:])
