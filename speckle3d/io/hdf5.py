@@ -133,6 +133,8 @@ def open_hdf5(path: PathLike) -> h5py.File:
         try:
             return h5py.File(path, "r", rdcc_nbytes=_CHUNK_CACHE_BYTES)
         except OSError as error:
+            if "signature not found" in str(error):
+                raise FileError(f"{path}: expected an HDF5 file, got one of another kind") from error
             if not any(words in str(error) for words in _HAS_WRITER):
                 raise
             return _opened_beside_writer(path)
