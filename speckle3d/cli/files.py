@@ -66,7 +66,9 @@ def convert(
         Fields("speckle3d.io.import_settings:ImportSettings", without=("image_to_probe", "arrays")),
     ],
     calibration: Paths = None,
-    compression: Literal["gzip", "lzf", "none"] | None = None,
+    compression: Annotated[
+        Literal["gzip", "lzf", "none"] | None, typer.Option("--compression", "--compress")
+    ] = None,
     mode: MaybeText = None,
     sweep_file: MaybePath = None,
 ) -> None:
