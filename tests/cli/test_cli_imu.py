@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -42,6 +43,19 @@ def log_file(tmp_path):
     path.parent.mkdir()
     write_csv(path, turning()[1])
     return path
+
+
+def test_an_accelerometer_in_g_is_told_wherever_the_log_is_shown_or_written(run, tmp_path):
+    _, log = turning()
+    path = tmp_path / "g.csv"
+    write_csv(path, replace(log, accelerometer_m_s2=log.accelerometer_m_s2 / 9.80665))
+    code, out, _ = run("imu", "info", path)
+    assert code == 0
+    assert "in g" in out
+    for command in (("convert",), ("orient", "--method", "sensor")):
+        code, _, err = run("imu", *command, path, "-o", tmp_path / "out.csv")
+        assert code == 0
+        assert "in g" in err
 
 
 def test_an_orientation_goes_into_a_sweep_on_its_own_clock(run, log_file, sweep_file):

@@ -47,11 +47,25 @@ def read(path: Path, rate_hz: float | None = None, world: str | None = None) -> 
 
 def tell(log: ImuLog) -> None:
     """Report on stderr what a log lacks, and what was assumed in its place."""
-    notes(log.notes)
+    notes([*log.notes, *other_unit(log)])
     if log.gaps:
         longest = max(gap.duration_s for gap in log.gaps)
         lost = f"{log.lost} samples lost in {len(log.gaps)} gaps" if log.lost else f"{len(log.gaps)} pauses"
         note(f"{lost}, the longest of {longest:.3f} s; nothing filled in")
+
+
+def other_unit(log: ImuLog) -> list[str]:
+    """Say that a log's accelerometer is not in m/s^2, if its norm shows that."""
+    from xsens.fusion.readings import require_metres
+    from xsens.logs.samples import finite_rows
+
+    force = log.accelerometer_m_s2
+    try:
+        if force is not None and finite_rows(force).any():
+            require_metres(force[finite_rows(force)], "accelerometer")
+    except InvalidInputError as error:
+        return [str(error)]
+    return []
 
 
 def orientation_of(
@@ -93,9 +107,7 @@ def info(log_file: Path, rate_hz: MaybeNumber = None, world: World = None) -> Re
     import numpy as np
 
     from speckle3d.core.sweep import INERTIAL
-    from xsens.fusion.readings import require_metres
     from xsens.logs.contradictions import contradictions
-    from xsens.logs.samples import finite_rows
 
     log = read(log_file, rate_hz, world)
     rate = (f"{log.rate_hz:.2f}", "samples/s") if math.isfinite(log.rate_hz) else ("unknown", "")
@@ -115,12 +127,7 @@ def info(log_file: Path, rate_hz: MaybeNumber = None, world: World = None) -> Re
         else:
             norm = np.nanmedian(np.linalg.norm(values, axis=1))
             rows.append((f"{spoken}, median norm", f"{norm:.4f}", unit))
-    notes = [*log.notes, *filter(None, contradictions(log).values())]
-    if (force := log.accelerometer_m_s2) is not None:
-        try:
-            require_metres(force[finite_rows(force)], "accelerometer")
-        except InvalidInputError as error:
-            notes.append(str(error))
+    notes = [*log.notes, *filter(None, contradictions(log).values()), *other_unit(log)]
     return rows_of([*rows, *(("note", text, "") for text in notes)])
 
 
