@@ -25,7 +25,7 @@ from speckle3d.core.progress import Progress
 from speckle3d.core.reconstruction import FramePairs, SharedErrors
 from speckle3d.core.relative import RelativePoses
 from speckle3d.core.shown import shown
-from speckle3d.core.sweep import BModeSettings, Sweep
+from speckle3d.core.sweep import BModeSettings, RFSettings, Sweep
 from speckle3d.examine.curves import examine_key, unrefuted
 from speckle3d.examine.disagreements import disagreements
 from speckle3d.examine.images import examine_echoes, examine_images
@@ -263,7 +263,10 @@ def track(
         sensed = sensed_orientation(sensors.trusted, settings.sensors)
         subset, used = (None, motion.pairs.used) if sensed is None else consistent_poses(motion, sensed)
         mismatch = motion.problem.curves.mismatch(settings.curves.same_probe, attenuation.log_length_sigma)
-        short, compression = shortening(matches), _compression_error(sweep, curves, settings, motion)
+        short, compression = (
+            shortening(matches),
+            _compression_error(sweep, matcher.signal, curves, settings, motion),
+        )
         open_sigma = float(np.linalg.norm([mismatch, short, compression]))
         shared, covariance = motion.claims(float(np.hypot(open_sigma, structure)))
 
@@ -317,14 +320,19 @@ def require_kind(value: Any, kind: type, name: str, made_by: str) -> None:
         raise InvalidInputError(f"{name}: expected a {kind.__name__}, as {made_by} gives it, got {got}")
 
 
-def _compression_error(sweep: Sweep, curves: DecorrelationCurves, config: Config, motion: Motion) -> float:
-    """Relative standard deviation of distances by a dynamic range that is estimated.
+def _compression_error(
+    sweep: Sweep,
+    signal: RFSettings | BModeSettings,
+    curves: DecorrelationCurves,
+    config: Config,
+    motion: Motion,
+) -> float:
+    """Relative standard deviation of distances by a dynamic range, that of `signal`, if it is estimated.
 
     One that is wider by its deviation is tried: what it does to fully developed speckle's correlation, a
     tenth of what comes out, can be calculated, what it does to structure and to black and white cannot.
     Curves measured with images compressed alike have its error in them.
     """
-    signal = sweep.signal
     if not isinstance(signal, BModeSettings) or curves.origin != "data sheet":
         return 0.0
     if not signal.dynamic_range_sigma_db:

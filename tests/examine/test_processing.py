@@ -74,3 +74,11 @@ def test_means_of_frames_are_refused(grey, count):
     sweep = averaged(grey, count)
     with pytest.raises(InsufficientDataError):
         track(sweep, data_sheet_curves(SHEET, sweep))
+
+
+def test_a_range_that_curves_state_is_taken_for_an_estimated_one(grey):
+    short = grey.part(0, 24)
+    curves = data_sheet_curves(SHEET, short)
+    estimated = replace(short.signal, dynamic_range_db=70.0, dynamic_range_sigma_db=8.0)
+    expected, found = (track(sweep, curves) for sweep in (short, replace(short, signal=estimated)))
+    np.testing.assert_array_equal(found.covariance, expected.covariance)
