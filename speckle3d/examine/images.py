@@ -252,7 +252,7 @@ def standing(share: FloatArray, pairs: int, cells: float, of_echo: bool = True) 
     Parameters
     ----------
     share : ndarray, shape (p,)
-        Of each patch's power, from `speckle3d.matching.texture.standing_share`.
+        Of each patch's power, from `Texture.standing_share`.
     pairs : int
         Of frames, from which it was measured.
     cells : float

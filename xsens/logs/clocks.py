@@ -102,8 +102,11 @@ def require_rate(rate_hz: float, what: str) -> None:
 
 
 def unwrapped(values: Any, span: int) -> Any:
-    """Numbers of a counter or clock that wraps round at a span, going on beyond it."""
-    steps = (np.diff(values) + span // 2) % span - span // 2
+    """Numbers of a counter or clock that wraps round at a span, going on beyond it; as they are if none falls."""
+    steps = np.diff(values)
+    if (steps >= 0).all():
+        return values
+    steps = (steps + span // 2) % span - span // 2
     return values[0] + _summed(steps)
 
 

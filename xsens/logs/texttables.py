@@ -231,7 +231,8 @@ def _named(rows: Iterator[str], header: Header, names: Names, separator: str | N
             raise InvalidInputError(
                 f"expected the columns of one sensor, got two of {key}: {names[columns[key][0]]}, {name}"
             )
-        if key not in columns or columns[key][1] is None:  # of several times, one with its unit
+        # Of several times, the first with its unit, else the first.
+        if key not in columns or (columns[key][1] is None and scale is not None):
             columns[key] = i, scale
     if not columns:
         raise InvalidInputError(not_understood(names))

@@ -23,6 +23,11 @@ def test_lost_samples_are_found_wherever_the_counter_wraps(first, lost, stride):
         assert gap.duration_s == pytest.approx((gap.lost + 1) * PERIOD_S)
 
 
+def test_a_counter_that_never_falls_has_not_wrapped_round_however_much_is_lost():
+    line = timeline(Stamps(unwrapped(np.array([0, 1, 2, 40002, 40003]), COUNTS), period_s=0.01))
+    assert [gap.lost for gap in line.gaps] == [39999]
+
+
 @pytest.mark.parametrize(
     "at", [[0, 1, 2, 4, 3], [*range(300), *range(301, 1500), 300], [*range(800), *range(600, 700)]]
 )

@@ -145,3 +145,8 @@ def test_dates_and_short_counters_that_wrap_round(s):
     rows = [f"2024-05-01T23:59:59.{i:02d}0Z,{(230 + i) % 256},0,0,9.8" for i in range(60) if i != 30]
     log = parse_text("timestamp,counter,acc_x,acc_y,acc_z\n" + "\n".join(rows))
     assert (log.rate_hz, log.lost, log.duration_s) == pytest.approx((100.0, 1, 0.59))
+
+
+def test_of_two_times_without_units_the_first_counts():
+    log = parse_text("time,timestamp,acc_x,acc_y,acc_z\n0.00,5,0,0,9.8\n0.02,9,0,0,9.8\n0.04,13,0,0,9.8\n")
+    np.testing.assert_allclose(log.time_s, [0.0, 0.02, 0.04])
