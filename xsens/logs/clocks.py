@@ -102,7 +102,7 @@ def require_rate(rate_hz: float, what: str) -> None:
 
 
 def unwrapped(values: Any, span: int) -> Any:
-    """Numbers of a counter or clock that wraps round at a span, going on beyond it; as they are if none falls."""
+    """Unwrap a counter or clock that wraps round at a span; one that never falls stays as it is."""
     steps = np.diff(values)
     if (steps >= 0).all():
         return values
