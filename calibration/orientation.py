@@ -89,4 +89,11 @@ def _upright(solution: Solution, viewed_from: str) -> Solution:
         )
     if (down > 0) == (viewed_from == "above"):
         return solution
-    return replace(solution, chain=solution.chain.mirrored(), residuals=-solution.residuals)
+    # The image's x and y axes are turned by half, and displacements about them with these.
+    signs = np.array([-1.0 if name in ("beta", "gamma") else 1.0 for name in solution.free])
+    return replace(
+        solution,
+        chain=solution.chain.mirrored(),
+        covariance=solution.covariance * np.outer(signs, signs),
+        residuals=-solution.residuals,
+    )

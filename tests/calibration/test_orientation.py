@@ -57,6 +57,16 @@ def test_the_mirror_is_never_wrong(trials):
         assert np.linalg.norm(tilt_yaw_roll_deg(solution, mounting)) < 20.0, trial
 
 
+def test_errors_of_the_mirror_are_about_its_own_axes():
+    directions, readings, _ = line_directions(np.random.default_rng(3), 30, noise_deg=0.1)
+    above, below = (
+        calibrate(directions, readings, viewed_from=side).image_covariance(("gamma", "beta", "alpha"))
+        for side in ("above", "below")
+    )
+    turned = np.diag([-1.0, -1.0, 1.0])
+    np.testing.assert_allclose(below, turned @ above @ turned, rtol=1e-6)
+
+
 def test_beams_that_are_level_on_average_cannot_be_told_from_their_mirror():
     rng = np.random.default_rng(0)
     above = line_directions(rng, 60, noise_deg=0.05, mounting=Rotation.identity())
