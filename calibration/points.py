@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
-from speckle3d.core.errors import InvalidInputError, MismatchError
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
 from speckle3d.core.geometry import require_finite
 from speckle3d.core.grid import ImageGrid
 from speckle3d.core.shown import shown
@@ -153,7 +153,15 @@ class ImagePoints:
         return np.unique(self.frame)
 
     def of_some_frames(self, count: int) -> ImagePoints:
-        """The points of at most `count` frames, spread evenly over the recording."""
+        """The points of at most `count` frames, spread evenly over the recording.
+
+        Raises
+        ------
+        InsufficientDataError
+            If no frame has any.
+        """
+        if not len(self):
+            raise InsufficientDataError("expected the phantom in several frames, got it in none")
         places = np.unique(np.linspace(0, len(self.frames) - 1, count).astype(int))
         return self[np.isin(self.frame, self.frames[places])]
 

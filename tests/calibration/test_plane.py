@@ -121,5 +121,8 @@ def test_what_cannot_be_calibrated_is_refused():
     shuffled = right.world_from_sensor[np.repeat(2 * np.random.default_rng(1).permutation(100), 2)]
     with pytest.raises(InsufficientDataError):
         calibrate_plane(ImagePoints(right.pixels, right.frame, shuffled))
+    for count in (0, 2, 10):  # of points, two in a frame
+        with pytest.raises(InsufficientDataError):
+            calibrate_plane(right[np.arange(len(right)) < count])
     with pytest.raises(InvalidInputError):
         calibrate_plane(right, settings=FIXED)

@@ -8,6 +8,7 @@ from accuracy_set import INDEPENDENT
 
 from speckle3d.config import Config
 from speckle3d.core.errors import InsufficientDataError
+from speckle3d.examine.images import examine_echoes
 from speckle3d.examine.processing import shortening, structure_openness
 from speckle3d.io.load import load_sweep
 from speckle3d.matching.frames import match_sweep
@@ -82,3 +83,10 @@ def test_a_range_that_curves_state_is_taken_for_an_estimated_one(grey):
     estimated = replace(short.signal, dynamic_range_db=70.0, dynamic_range_sigma_db=8.0)
     expected, found = (track(sweep, curves) for sweep in (short, replace(short, signal=estimated)))
     np.testing.assert_array_equal(found.covariance, expected.covariance)
+
+
+def test_grey_levels_cut_off_at_white_are_doubted(grey):
+    short, bright = grey.part(0, 8), np.minimum(grey.frames[:8].astype(int) + 90, 255).astype(np.uint8)
+    assert examine_echoes(matched(short)) == ()
+    (doubt,) = examine_echoes(matched(replace(short, frames=bright)))
+    assert (doubt.suspect, doubt.refuted) == ("gain", False)
