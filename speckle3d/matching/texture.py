@@ -184,10 +184,9 @@ class Texture:
 
     def _rows(self, name: str, usable: BoolArray | None) -> FloatArray:
         """Values of the usable frames, or of all if none is, by rows and columns, shape (n, k, r, c)."""
-        sound = [self._looks[k] for k in self.frames.tolist() if usable is None or usable[k]]
-        return self._patches.rows_of(
-            np.stack([getattr(look, name) for look in sound or self._looks.values()])
-        )
+        frames = self.frames
+        sound = frames if usable is None or not usable[frames].any() else frames[usable[frames]]
+        return self._patches.rows_of(np.stack([getattr(self._looks[k], name) for k in sound.tolist()]))
 
 
 def measured_texture(sweep: Sweep, matcher: FrameMatcher) -> Texture:
