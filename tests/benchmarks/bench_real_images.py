@@ -25,7 +25,6 @@ from speckle3d.sheet_curves import data_sheet_curves
 from speckle3d.simulation.presets import SimulationSettings, simulate
 from speckle3d.simulation.receiver import received
 
-FIRST_SEED = 5001
 STRAIN, SLIDING, PULSE_MM, PULSE_HZ, VESSEL_MM = 0.01, 0.05, 0.1, 1.2, 4.0
 """Strain at the end of the sweep; share of the probe's way that tissue goes along; pulse; depth over which it
 falls to 1/e on either side of a vessel in the middle of the image."""
@@ -115,6 +114,7 @@ def cases(sweep, is_bmode):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--first-seed", type=int, default=5001)
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--length-mm", type=float, default=6.0)
     parser.add_argument("--vectors", type=int, default=36)
@@ -122,7 +122,7 @@ def main():
     options = parsed(parser, seeds=1, length_mm=1.5, vectors=20)
     size = {"length_mm": options.length_mm, "vectors": options.vectors, "samples": 2600}
     rows = {}
-    for seed in range(FIRST_SEED, FIRST_SEED + options.seeds):
+    for seed in range(options.first_seed, options.first_seed + options.seeds):
         sweep = simulate(SimulationSettings(preset="tissue", seed=seed, **size))[0].sweep
         centre = sweep.grid.centre_mm
         for name, case in cases(sweep, options.signal == "bmode").items():

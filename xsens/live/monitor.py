@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from speckle3d.core.arrays import FloatArray
     from xsens.fusion.online import OnlineFilter, OnlineState
 
+_MOST_PENDING = 1 << 14
+"""Messages kept until the state is asked for, as many as eight seconds bring at most."""
 _SEEN = 9
 """States over which the rate is taken: two seconds if they come four times a second, long against the 16 ms
 between two deliveries of an adapter."""
@@ -134,6 +136,8 @@ class Monitor:
             data = [message for message in self._framer.feed(received) if message.mid in _DATA]
             self._set(samples=self._now.samples + len(data))
             self._pending += data
+            if len(self._pending) > _MOST_PENDING:  # nobody has asked for a while
+                self._digest()
 
     def interrupted(self, reason: str) -> None:
         """Note that the connection is lost, or still is."""
