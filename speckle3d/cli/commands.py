@@ -215,7 +215,8 @@ def _checked(flag: str, option: inspect.Parameter, value: Any, flags: Mapping[st
         if rule[1] == "Not with" and others:
             raise InvalidInputError(f"{flag}: expected no {others[0]} beside it, got both")
     for path in value if isinstance(value, list | tuple) else [value]:
-        if isinstance(path, float) and not math.isfinite(path):
+        is_allowed = path == math.inf and re.search(r"\binf\b", info.help or "")
+        if isinstance(path, float) and not math.isfinite(path) and not is_allowed:
             raise InvalidInputError(f"{flag}: expected a finite number, got {path}")
         if isinstance(path, Path) and not path.exists() and not info.writable:
             where = f"{flag}: " if isinstance(info, typer.models.OptionInfo) else ""
