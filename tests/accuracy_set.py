@@ -87,7 +87,7 @@ class Nothing:
 
     attenuation_db_cm_mhz = 0.4
 
-    def seen(self, *_):
+    def scatterers(self, *_):
         return []
 
 
