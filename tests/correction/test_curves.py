@@ -38,7 +38,7 @@ def test_poses_are_equation_1_written_out(curves):
 def test_twists_are_the_derivative_of_every_frame(seed, curves):
     _, chain = chain_of(seed, frames=12, curves=curves)
     rng = np.random.default_rng(seed)
-    coefficients, point = rng.normal(0.0, 0.5, 30), rng.uniform(0.0, 40.0, 3)
+    coefficients, point = rng.normal(0.0, 0.2, 30), rng.uniform(0.0, 40.0, 3)
     poses = chain.poses(coefficients)
     turn, shift = chain.twists(coefficients, poses)
     where = poses[:, :3, :3] @ point + poses[:, :3, 3]
