@@ -68,7 +68,7 @@ def test_what_a_process_was_started_to_ignore_stays_ignored(told):
 
 @pytest.mark.slow
 def test_told_to_end_it_leaves_nothing(bench, tmp_path):
-    process = started(tmp_path, "reconstruct", bench / "sweep.h5", "-o", tmp_path / "above" / "o")
+    process = started(tmp_path, "reconstruct", bench / "sweep.h5", "-o", tmp_path / "o")
     process.terminate()
     _, err = process.communicate(timeout=WAIT_S)
     assert (process.returncode, err.splitlines()[-1]) == (128 + signal.SIGTERM, "speckle3d: stopped"), err
