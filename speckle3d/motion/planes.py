@@ -46,7 +46,7 @@ LEAST_SIGMA_MM = 1e-3
 ROUNDS = 12
 NEAR_MM = 0.15
 """Least distance at which fits start: correlation is flat at zero, and a fit from there takes distance for
-tilt. Nearer frames may turn as if they were this far apart: a hand trembles in place."""
+tilt."""
 
 
 class PlaneSettings(BaseModel):
