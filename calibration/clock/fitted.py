@@ -59,13 +59,13 @@ def estimate_offset(
         If readings cover no frame at all offsets, no offset gives a calibration, the best is at the end of
         the range, or another is as good.
     """
-    there = covered(readings, points.times, around_s, search_s)
-    if not there.any():
+    covered_points = covered(readings, points.times, around_s, search_s)
+    if not covered_points.any():
         raise InsufficientDataError(
             f"expected readings from {search_s:g} s before to {search_s:g} s after some frames, to tell the "
             "clock, got none"
         )
-    points_at = _reader(points[there], readings)
+    points_at = _reader(points[covered_points], readings)
     tried = delays_around(around_s, search_s, STEP_S)
     misfit = np.full(len(tried), np.nan)
     for number, offset in enumerate(tried):
@@ -96,8 +96,8 @@ def with_uncertain_offset(
     solution: Solution, points: ImagePoints, readings: TimedPoses | TimedRotations, seconds: float
 ) -> Solution:
     """Return a solution whose covariance includes that of the clock offset that its points were read with."""
-    there = covered(readings, points.times, seconds, _DERIVATIVE_S)
-    _, joint = _joint_fit(solution, _reader(points[there], readings), seconds)
+    covered_points = covered(readings, points.times, seconds, _DERIVATIVE_S)
+    _, joint = _joint_fit(solution, _reader(points[covered_points], readings), seconds)
     along, variance = joint[:-1, -1], joint[-1, -1]
     return replace(solution, covariance=solution.covariance + np.outer(along, along) / variance)
 

@@ -75,13 +75,13 @@ def delay_from_lines(
         If too few frames have readings at all these delays, the line does not follow the sensor, the best
         delay is at the end of the range, or another is as good, as with a periodic motion.
     """
-    there = covered(readings, frame_time_s, around_s, search_s)
-    if there.sum() < FEWEST_FRAMES:
+    inside = covered(readings, frame_time_s, around_s, search_s)
+    if inside.sum() < FEWEST_FRAMES:
         raise InsufficientDataError(
             f"expected readings from {search_s:g} s before to {search_s:g} s after at least {FEWEST_FRAMES} "
-            f"frames with a line, got them for {there.sum()} of {len(frame_time_s)} such frames"
+            f"frames with a line, got them for {inside.sum()} of {len(frame_time_s)} such frames"
         )
-    times, wanted = frame_time_s[there], signal[there, 0 if isinstance(readings, TimedPoses) else 1]
+    times, wanted = frame_time_s[inside], signal[inside, 0 if isinstance(readings, TimedPoses) else 1]
     wanted = wanted - wanted.mean()
     if float(np.ptp(wanted)) < _STILL:
         raise InsufficientDataError("expected a line that moves, got one that stands still")

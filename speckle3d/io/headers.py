@@ -1,8 +1,7 @@
-"""MetaImage and NRRD files: headers, with the per-frame fields that PLUS writes into them, and pixels.
+"""Reading MetaImage and NRRD files: headers, with the per-frame fields that PLUS writes, and pixels.
 
 pynrrd parses NRRD's headers, and a MetaImage's fields are put into NRRD's words. Pixels are read here: pynrrd
-reads all of a raw sequence into memory and stops at the first member of packed pixels; and written here: it
-refuses letters beyond ASCII (names of segments), and nobody else's frames have fields.
+reads all of a raw sequence into memory and stops at the first member of packed pixels.
 
 References
 ----------
@@ -16,7 +15,7 @@ import bz2
 import math
 import re
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -31,15 +30,15 @@ from speckle3d.core.files import PathLike, open_regular
 from speckle3d.io.hdf5 import reading
 from speckle3d.io.text import numbers
 
-_library: Any = zlib
+DEFLATE: Any = zlib
 try:
     from isal import isal_zlib
 
-    _library = isal_zlib
+    DEFLATE = isal_zlib
 except ImportError:
     pass
 
-_ZLIB, _GZIP, _EITHER = 15, 31, 47
+ZLIB, GZIP, _EITHER = 15, 31, 47
 """Windows of deflate, and by them what is around it; either is told when unpacking."""
 
 _FRAME_FIELD = re.compile(r"Seq_Frame0*(\d{1,7})_(\w+)")
@@ -52,7 +51,7 @@ _S_PER = {"s": 1.0, "sec": 1.0, "second": 1.0, "ms": 1e-3, "msec": 1e-3, "us": 1
 _SPACE, _TIME = ("domain", "space", "", "???", "none", "?"), ("list", "time")
 _PACKINGS = {"ra": "raw", "gz": "deflate", "bz": "bzip2", "tx": "text", "te": "text", "as": "text"}
 """By how NRRD's words for them begin, as bzip2 or bz2."""
-_TYPES = {
+NUMBER_TYPES = {
     "i1": "char int8",
     "u1": "uchar uint8",
     "i2": "short int16",
@@ -161,7 +160,7 @@ class SequenceHeader:
         """
         count = math.prod(self.size) * self.channels
         size_bytes = count * self.dtype.itemsize
-        with reading(self.path, _library.error), open_regular(self.data) as stream:
+        with reading(self.path, DEFLATE.error), open_regular(self.data) as stream:
             length = stream.seek(0, 2)
             stream.seek(max(length - size_bytes, 0) if self.start < 0 else self.start)
             for _ in range(self.skipped_lines):
@@ -183,7 +182,7 @@ def _unpacked(packed: bytes, packing: str) -> bytes:
     """Unpack all; members of gzip that follow one another are one stream."""
     content = bytearray()
     while packed:
-        stream = bz2.BZ2Decompressor() if packing == "bzip2" else _library.decompressobj(_EITHER)
+        stream = bz2.BZ2Decompressor() if packing == "bzip2" else DEFLATE.decompressobj(_EITHER)
         content += stream.decompress(packed)
         packed = stream.unused_data if stream.unused_data[:2] == b"\x1f\x8b" else b""
     return bytes(content)
@@ -378,7 +377,7 @@ def _number_type(word: str, is_big: bool) -> np.dtype[Any]:
     """Type of numbers by a word of either format, as ``MET_UCHAR`` or ``unsigned char``."""
     plain = word.lower().removeprefix("met_").removesuffix("_t").replace("unsigned ", "u")
     plain = plain.replace("signed ", "").removesuffix(" int").replace(" ", "")
-    for kind, words in _TYPES.items():
+    for kind, words in NUMBER_TYPES.items():
         if plain in words.split():
             return np.dtype((">" if is_big else "<") + kind)
     raise InvalidInputError(f"type: expected a type of numbers as uint8 or MET_UCHAR, got {word!r}")
@@ -403,75 +402,3 @@ def _beside(path: Path, name: str) -> Path:
     if words[0] == "LIST" or ("%" in name and len(words) > 1) or not data.is_relative_to(folder):
         raise InvalidInputError(f"expected pixels in one file in the header's own folder, got {name!r}")
     return data
-
-
-def meta_header(
-    shape: Sequence[int],
-    dtype: np.dtype[Any],
-    kinds: str,
-    fields: Mapping[str, object],
-    packed_bytes: int | None,
-) -> str:
-    """Header of a MetaImage of three axes; of packed pixels, with room for their size."""
-    size = "" if packed_bytes is None else f"CompressedDataSize = {packed_bytes:<20}\n"
-    return f"""ObjectType = Image
-NDims = 3
-BinaryData = True
-BinaryDataByteOrderMSB = False
-CompressedData = {bool(size)}
-{size}DimSize = {" ".join(map(str, shape))}
-ElementType = MET_{_TYPES[dtype.str[1:]].split()[0].upper()}
-Kinds = {kinds}
-{_field_lines(fields, " = ")}ElementDataFile = LOCAL
-"""
-
-
-def nrrd_header(
-    version: int, dtype: np.dtype[Any], axes: str, fields: Mapping[str, object], is_packed: bool
-) -> str:
-    """Header of an NRRD file; `axes` are lines that tell of them."""
-    return f"""NRRD000{version}
-type: {_TYPES[dtype.str[1:]].split()[-1]}
-{axes}
-endian: little
-encoding: {"gzip" if is_packed else "raw"}
-{_field_lines(fields, ":=")}
-"""
-
-
-def _field_lines(fields: Mapping[str, object], sign: str) -> str:
-    """A line for each field of a header."""
-    return "".join(f"{name}{sign}{value}\n" for name, value in fields.items())
-
-
-def write_image(
-    path: Path,
-    header: Callable[[int | None], str],
-    planes: Iterable[npt.NDArray[Any]],
-    is_packed: bool,
-    is_nrrd: bool,
-) -> None:
-    """Write a header and pixels behind it, plane by plane, little-endian.
-
-    Parameters
-    ----------
-    header : callable
-        Makes the header, as long whatever the size of the packed pixels; None of raw ones.
-    """
-    # At higher levels speckle hardly shrinks further, and takes several times as long.
-    pack = _library.compressobj(1, zlib.DEFLATED, _GZIP if is_nrrd else _ZLIB) if is_packed else None
-    with path.open("wb") as file:
-        start = file.write(_encoded(header(0 if is_packed else None)))
-        for plane in planes:
-            raw = plane.astype(plane.dtype.newbyteorder("<"), order="C", copy=False).data.cast("B")
-            file.write(raw if pack is None else pack.compress(raw))
-        if pack is not None:
-            file.write(pack.flush())
-            size = file.tell() - start
-            file.seek(0)
-            file.write(_encoded(header(size)))
-
-
-def _encoded(header: str) -> bytes:
-    """A header as bytes that are read back as the same text."""
-    return header.encode("utf-8", "backslashreplace")

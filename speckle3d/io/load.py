@@ -84,23 +84,23 @@ def recording_of(reader: Reader, path: Path, settings: ImportSettings) -> Record
         )
     try:
         with naming(str(path)):
-            made = _read(reader, path, settings)
+            recording = _read(reader, path, settings)
     except Speckle3DError:
         raise
     except (OSError, RuntimeError, MemoryError) as error:  # of damage where nothing else is asked for
         raise FileError(f"{path}: cannot be read: {one_line(error)}") from error
-    return made if isinstance(made, Recording) else Recording(path, settings, ready=made)
+    return recording if isinstance(recording, Recording) else Recording(path, settings, ready=recording)
 
 
 def _read(reader: Reader, path: Path, settings: ImportSettings) -> Sweep | Recording:
     """What a reader makes; where it cannot, the facts that it told before, and why."""
-    made = reader.read(path, settings)
-    if not isinstance(made, Generator):
-        return made
+    facts = reader.read(path, settings)
+    if not isinstance(facts, Generator):
+        return facts
     rows = list[Row]()
     try:
         while True:
-            rows.append(next(made))
+            rows.append(next(facts))
     except StopIteration as end:
         recording: Recording = end.value
         return replace(recording, rows=tuple(rows))

@@ -35,7 +35,7 @@ def test_values_are_those_of_the_pose_and_in_the_units_that_they_name():
     # Noise of 0.2 mm along the beam, as a height.
     assert found.rms == pytest.approx(0.2 * 0.96, rel=0.1)
     # One quantity, one error: roll, yaw and tilt stand once in the table.
-    told = [row for row in found.rows() if row[0].startswith(("roll", "yaw", "tilt", "alpha"))]
+    angles = [row for row in found.rows() if row[0].startswith(("roll", "yaw", "tilt", "alpha"))]
     errors = np.rad2deg(np.sqrt(np.diag(found.covariance)[2::-1]))
-    halves = [float(row[1].split("+- ")[1].removesuffix(" (95 %)")) for row in told]
+    halves = [float(row[1].split("+- ")[1].removesuffix(" (95 %)")) for row in angles]
     assert halves == pytest.approx(1.96 * errors, abs=6e-4)

@@ -84,7 +84,7 @@ def test_images_beside_the_middle_stay_there(tmp_path, name):
     write = write_sweep if name.endswith(".h5") else write_sequence
     write(tmp_path / name, aside)
     got = load_sweep(tmp_path / name)
-    there = [
+    corners_mm = [
         each.tracker.sensor_from_image.apply(np.append(each.grid.mm(0, 0), 0.0)) for each in (aside, got)
     ]
-    np.testing.assert_allclose(there[1], there[0], atol=1e-9)
+    np.testing.assert_allclose(corners_mm[1], corners_mm[0], atol=1e-9)

@@ -188,8 +188,8 @@ def _rising(stamps: Stamps) -> tuple[Any, BoolArray]:
     back = np.flatnonzero(steps < -LATE * usual)
     anew[back + 1] = True
     for i in back[:_OVERTAKINGS].tolist():
-        there = values[i + 1 :] > values[i]
-        anew[i + 1] = not there.any() or steps[i + int(np.argmax(there))] < _LONGER * usual
+        later = values[i + 1 :] > values[i]
+        anew[i + 1] = not later.any() or steps[i + int(np.argmax(later))] < _LONGER * usual
     if stamps.time_s is None and stamps.starts is not None:
         anew |= stamps.starts
     elif stamps.computer_s is not None:

@@ -183,8 +183,8 @@ def _not_understood(table: TextTable, plain: bool) -> Names:
     keys = {name: column[0] for name in table.names if (column := column_of(name))}
     odd = [name for name in table.names if name not in keys and (plain or _SENSOR_LIKE.match(name))]
     for quantity in (*_VECTORS, _QUATERNION):
-        there = [name for name, key in keys.items() if key in quantity]
-        odd += there if len(there) < len(quantity) else []
+        columns = [name for name, key in keys.items() if key in quantity]
+        odd += columns if len(columns) < len(quantity) else []
     return (not_understood(filter(None, odd)),) if any(odd) else ()
 
 

@@ -89,19 +89,19 @@ def tracked_poses(
     InvalidInputError
         If a transform that was asked for is not there.
     """
-    there = names_of(header)
-    name = _usual(there, names) if asked is None else asked.removesuffix("Transform")
+    stored = names_of(header)
+    name = _usual(stored, names) if asked is None else asked.removesuffix("Transform")
     if name is None or name == "none":
         return None
     tool, world = ends(name)
     # A reference counts if both are tracked in the same world.
     fixed = f"ReferenceTo{world}" if reference is None else reference.removesuffix("Transform")
-    if reference is None and (tool == "Reference" or not {fixed, _back(fixed)} & {*there}):
+    if reference is None and (tool == "Reference" or not {fixed, _back(fixed)} & {*stored}):
         fixed = "none"
     for one in {name, fixed} - {"none"}:
-        if one not in there and _back(one) not in there:
+        if one not in stored and _back(one) not in stored:
             raise InvalidInputError(
-                f"{header.path}: expected a transform {one}, got {', '.join(there) or 'none'}"
+                f"{header.path}: expected a transform {one}, got {', '.join(stored) or 'none'}"
             )
     matrices, faults = _column(header, name)
     pixels, chain = None, [name]

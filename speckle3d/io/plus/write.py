@@ -22,7 +22,8 @@ from speckle3d.core.files import PathLike
 from speckle3d.core.progress import Progress
 from speckle3d.core.sweep import OrientationSensor, RFSettings, Sweep, Tracker, stored_dtype
 from speckle3d.io.hdf5 import atomic_path, require_suffix
-from speckle3d.io.headers import NRRD_NAMES, meta_header, nrrd_header, write_image
+from speckle3d.io.headers import NRRD_NAMES
+from speckle3d.io.image_writer import meta_header, nrrd_header, write_image
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.plus.transforms import IMAGE, ORIENTATION, image_matrix
 from speckle3d.io.text import number_text, numbers

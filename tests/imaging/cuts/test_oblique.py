@@ -29,8 +29,8 @@ def test_a_covering_plane_is_as_large_as_what_frames_show():
 
 def test_planes_of_several_modes_begin_with_one_line_and_show_what_became_longer():
     """Two worlds, one of them 6 % too long: the first frame's line has one place in both pictures."""
-    there = np.arange(0, 20, 0.5)
-    moved = np.outer([*there, *there[::-1]], [0.1, 0.05, 1.0])
+    way = np.arange(0, 20, 0.5)
+    moved = np.outer([*way, *way[::-1]], [0.1, 0.05, 1.0])
     rng, line = np.random.default_rng(4), lateral_line(GRID, 2.5)
     worlds = RigidTransform.from_components(rng.normal(0, 50, (2, 3)), Rotation.random(2, rng=rng))
     poses = {
@@ -44,7 +44,7 @@ def test_planes_of_several_modes_begin_with_one_line_and_show_what_became_longer
     for mode, plane in planes.items():
         first = plane.world_from_mm([0, 0], line[:, 1])
         np.testing.assert_allclose(first, poses[mode][0].apply(line), atol=1e-9)
-        far = poses[mode][there.size].apply(line[0])
+        far = poses[mode][way.size].apply(line[0])
         travelled.append(np.linalg.norm(far - plane.world_from_mm(0.0, 1.0)))
     assert travelled[0] / travelled[1] == pytest.approx(1.06)
     # Large enough for the longer one.
