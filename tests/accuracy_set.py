@@ -56,7 +56,7 @@ class Errors:
         return abs(self.length_percent) / self.claim_percent
 
 
-def simulate_set(folder, shipped):
+def simulate_set(folder, data_folder):
     """Write all sweeps that are simulated to `folder`: a minute."""
 
     def made(name, attenuation=None, vectors=48, **settings):
@@ -77,7 +77,7 @@ def simulate_set(folder, shipped):
     noise = replace(simulated.frames, medium=Nothing(), snr_db=20.0)
     write_sweep(folder / "noise.h5", replace(tissue, frames=Added(tissue.frames, noise)))
     depth = np.arange(tissue.grid.samples) * tissue.grid.sample_spacing_mm
-    still = CLUTTER * np.exp(-depth / CLUTTER_MM) * load_sweep(shipped / "phantom.h5").frames[0]
+    still = CLUTTER * np.exp(-depth / CLUTTER_MM) * load_sweep(data_folder / "phantom.h5").frames[0]
     still = np.broadcast_to(np.rint(still).astype(np.int16), tissue.frames.shape)
     write_sweep(folder / "clutter.h5", replace(tissue, frames=Added(tissue.frames, still)))
 
@@ -162,8 +162,8 @@ CASES = {
 class AccuracySet:
     """The sweeps of a folder that `simulate_set` has filled, tracked when they are asked for."""
 
-    def __init__(self, folder, shipped):
-        self.folder, self.shipped, self.config = folder, shipped, Config()
+    def __init__(self, folder, data_folder):
+        self.folder, self.data_folder, self.config = folder, data_folder, Config()
         # Of the instance, so that a test's change to another leaves this one alone.
         self.errors, self.curves = cache(self._errors), cache(self._curves)
 
@@ -173,7 +173,7 @@ class AccuracySet:
         if name.startswith("independent"):
             folder = INDEPENDENT
         elif file == "phantom":
-            folder = self.shipped
+            folder = self.data_folder
         sweep = load_sweep(folder / f"{file}.h5")
         return sweep if change is None else change(sweep)
 
@@ -189,7 +189,7 @@ class AccuracySet:
         if kind == "independent":
             steps = sorted(INDEPENDENT.glob("phantom_steps_*.h5"))
             return calibrate_curves([load_sweep(path) for path in steps], self.config)
-        return read_curves(self.shipped / "curves.h5")
+        return read_curves(self.data_folder / "curves.h5")
 
     def _errors(self, name):
         """Errors by mode."""
@@ -200,10 +200,10 @@ class AccuracySet:
         sweep = self.sweep(name)
         kind = (*CASES[name], None, None)[2]
         curves = self.curves(kind, name if kind and "sheet" in kind else None)
-        tracked = track(sweep, curves, self.config)
+        tracking = track(sweep, curves, self.config)
         modes = ["orientation", "fused", *(["pose"] if sweep.tracker else [])]
-        modes = correct(tracked, sweep, modes, self.config)
-        return _scored({"image": tracked, **modes}, sweep.truth, sweep.grid.centre_mm)
+        modes = correct(tracking, sweep, modes, self.config)
+        return _scored({"image": tracking, **modes}, sweep.truth, sweep.grid.centre_mm)
 
 
 def _scored(modes, truth, centre_mm):

@@ -35,7 +35,7 @@ def project():
 
 
 @pytest.fixture(scope="session")
-def shipped():
+def data_folder():
     """Folder of the sweep and the curves that come with the project."""
     return ROOT / "data"
 
@@ -58,13 +58,13 @@ def back(tmp_path_factory):
 
 
 @pytest.fixture(scope="session")
-def small_sweeps(tmp_path_factory, shipped):
+def small_sweeps(tmp_path_factory, data_folder):
     """Folder of s5.h5 and s6.h5, simulated tissue of 24 frames, and the curves for them."""
     from speckle3d.io.sweep_writer import write_sweep
     from speckle3d.simulation.presets import SimulationSettings, simulate
 
     def make(folder):
-        shutil.copy(shipped / "curves.h5", folder)
+        shutil.copy(data_folder / "curves.h5", folder)
         for seed in (5, 6):
             settings = SimulationSettings(
                 preset="tissue", vectors=26, samples=1000, seed=seed, length_mm=3.0, frames=24
@@ -110,23 +110,23 @@ def python():
 
 
 @pytest.fixture(scope="session")
-def sweep(shipped):
+def sweep(data_folder):
     """The sweep that comes with the project: 96 frames, 12 mm, with both sensors and the truth."""
     from speckle3d.io.load import load_sweep
 
-    return load_sweep(shipped / "phantom.h5")
+    return load_sweep(data_folder / "phantom.h5")
 
 
 @pytest.fixture(scope="session")
-def curves(shipped):
+def curves(data_folder):
     """The curves that come with the project."""
     from speckle3d.io.curves import read_curves
 
-    return read_curves(shipped / "curves.h5")
+    return read_curves(data_folder / "curves.h5")
 
 
 @pytest.fixture(scope="session")
-def tracked(sweep, curves):
+def tracking(sweep, curves):
     """The shipped sweep, tracked as it comes."""
     from speckle3d.pipeline import track
 

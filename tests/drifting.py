@@ -40,7 +40,7 @@ def accumulate(first_from_steps):
     return RigidTransform.from_matrix(np.array(matrices))
 
 
-def drifted(truth, rng):
+def drifting_poses(truth, rng):
     """Image-based poses: elevational steps too long by 15 %, tilt that drifts by 1.5 degrees per 20 mm.
 
     Both drifts vary by a third along the sweep and follow the signed distance travelled.
@@ -58,7 +58,7 @@ def drifted(truth, rng):
     return accumulate(about_centre * RigidTransform.from_translation(-CENTRE_MM))
 
 
-def tracked(truth, rng, noise_mm=0.15, noise_deg=0.1, outliers=0.0):
+def tracker_poses(truth, rng, noise_mm=0.15, noise_deg=0.1, outliers=0.0):
     """Tracker readings: Gaussian noise per axis at the image origin, a share of poses off by 2 mm."""
     n = len(truth)
     offset = rng.normal(0.0, noise_mm, (n, 3))

@@ -35,7 +35,7 @@ def grey(frames=3, rows=4, columns=5):
     return np.random.default_rng(0).integers(0, 256, (frames, rows, columns)).astype(np.uint8)
 
 
-def tracked(n, **more):
+def frame_fields(n, **fields):
     rng = np.random.default_rng(1)
     probe = RigidTransform.from_components(rng.normal(0, 100, (n, 3)), Rotation.random(n, rng=rng))
     reference = RigidTransform.from_components(rng.normal(0, 100, (n, 3)), Rotation.random(n, rng=rng))
@@ -46,7 +46,7 @@ def tracked(n, **more):
             "ProbeToTrackerTransformStatus": "OK",
             "ReferenceToTrackerTransform": text_of(reference[i].as_matrix()),
             "ReferenceToTrackerTransformStatus": "OK",
-            **more,
+            **fields,
         }
         for i in range(n)
     ]

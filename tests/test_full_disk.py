@@ -87,8 +87,8 @@ main()
 """
 
 
-def test_the_command_ends_with_one_line_and_no_crash(shipped, tmp_path):
-    arguments = ("convert", str(shipped / "phantom.h5"), str(tmp_path / "copy.h5"))
+def test_the_command_ends_with_one_line_and_no_crash(data_folder, tmp_path):
+    arguments = ("convert", str(data_folder / "phantom.h5"), str(tmp_path / "copy.h5"))
     done = subprocess.run(
         [sys.executable, "-c", COMMAND, *arguments], capture_output=True, text=True, timeout=60
     )

@@ -15,9 +15,9 @@ from speckle3d.motion.direction import SensorSettings, settle_direction
 from speckle3d.pipeline import track
 
 
-def test_steps_follow_the_truth(sweep, tracked):
+def test_steps_follow_the_truth(sweep, tracking):
     centre = sweep.grid.centre_mm
-    found, true = ((p[:-1].inv() * p[1:]).apply(centre) - centre for p in (tracked.image, sweep.truth))
+    found, true = ((p[:-1].inv() * p[1:]).apply(centre) - centre for p in (tracking.image, sweep.truth))
     # Two vectors' pitch is 0.6 mm, a step 0.13 mm on average: a tenth of a pitch and of a millimetre.
     assert np.sqrt(np.mean((found - true) ** 2, axis=0)) == pytest.approx(0, abs=0.04)
     assert np.corrcoef(found[:, 2], true[:, 2])[0, 1] > 0.9
@@ -41,14 +41,14 @@ def test_progress_images_and_pairs_come_in_order(sweep, curves):
     assert all((table.first < table.second).all() for table in pairs)
 
 
-def test_setting_then_tracker_then_nothing_settles_the_direction(sweep, tracked):
-    assert tracked.direction_from == "tracker"
-    assert not tracked.flags.any()
+def test_setting_then_tracker_then_nothing_settles_the_direction(sweep, tracking):
+    assert tracking.direction_from == "tracker"
+    assert not tracking.flags.any()
     bare = replace(sweep, tracker=None, orientation=None, truth=None)
-    other = mirrored(tracked.image)
-    assert settle_direction(sweep, tracked.image, SensorSettings()) == (1, "tracker")
+    other = mirrored(tracking.image)
+    assert settle_direction(sweep, tracking.image, SensorSettings()) == (1, "tracker")
     assert settle_direction(sweep, other, SensorSettings()) == (-1, "tracker")
-    assert settle_direction(sweep, tracked.image, SensorSettings(direction=-1)) == (-1, "setting")
+    assert settle_direction(sweep, tracking.image, SensorSettings(direction=-1)) == (-1, "setting")
     assert settle_direction(bare, other, SensorSettings()) == (1, "assumed")
 
 
@@ -114,11 +114,11 @@ def test_curves_of_intensity_do_not_serve_echoes(sweep, curves):
         track(sweep, curves, config)
 
 
-def test_curves_beside_a_recording_are_taken_and_said(shipped):
-    sweep = load_sweep(shipped / "phantom.h5").part(0, 12)
+def test_curves_beside_a_recording_are_taken_and_said(data_folder):
+    sweep = load_sweep(data_folder / "phantom.h5").part(0, 12)
     with pytest.warns(UserWarning, match=r"curves\.h5, by phantom; .* % \(95 %\)"):
         found = track(sweep)
-    expected = track(sweep, read_curves(shipped / "curves.h5"))
+    expected = track(sweep, read_curves(data_folder / "curves.h5"))
     np.testing.assert_array_equal(found.image.as_matrix(), expected.image.as_matrix())
     with pytest.raises(InvalidInputError, match="load_curves"):
         track(replace(sweep, path=None))

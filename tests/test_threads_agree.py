@@ -11,13 +11,13 @@ from speckle3d.corrections import correct
 from speckle3d.pipeline import track
 
 
-def poses_of(tracked, sweep):
-    corrected = correct(tracked, sweep, ["orientation", "pose"])
+def poses_of(tracking, sweep):
+    corrected = correct(tracking, sweep, ["orientation", "pose"])
     return {
-        "image": tracked.image.as_matrix(),
-        "covariance": tracked.covariance,
-        "subset": tracked.subset.as_matrix(),
-        "flags": tracked.flags,
+        "image": tracking.image.as_matrix(),
+        "covariance": tracking.covariance,
+        "subset": tracking.subset.as_matrix(),
+        "flags": tracking.flags,
     } | {mode: each.poses.as_matrix() for mode, each in corrected.items()}
 
 

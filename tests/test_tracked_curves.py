@@ -23,15 +23,15 @@ def shaken(sweep, jitter_mm, seed=3):
     return replace(sweep, truth=None, tracker=tracker)
 
 
-def test_the_length_is_the_trackers_and_its_error_grows_with_jitter(sweep, tracked):
+def test_the_length_is_the_trackers_and_its_error_grows_with_jitter(sweep, tracking):
     true = sweep.truth[0].inv() * sweep.truth
-    z, seen = (abs(poses.apply(sweep.grid.centre_mm)[-1, 2]) for poses in (true, tracked.image))
-    scales = [tracker_scale(shaken(sweep, jitter), tracked) for jitter in (0.05, 0.3)]
+    z, seen = (abs(poses.apply(sweep.grid.centre_mm)[-1, 2]) for poses in (true, tracking.image))
+    scales = [tracker_scale(shaken(sweep, jitter), tracking) for jitter in (0.05, 0.3)]
     for length in scales:
         assert abs(length.log_scale - np.log(z / seen)) < 3 * length.sigma
     assert 0.005 < scales[0].sigma < scales[1].sigma < 0.03
     with pytest.raises(InsufficientDataError):
-        tracker_scale(shaken(sweep, 20.0), tracked)
+        tracker_scale(shaken(sweep, 20.0), tracking)
 
 
 def test_curves_of_few_tracked_frames_claim_what_they_leave_open(sweep, curves):

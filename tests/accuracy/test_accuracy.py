@@ -18,11 +18,11 @@ every_claim = pytest.mark.parametrize("row", CLAIMED)
 
 
 @pytest.fixture(scope="session")
-def accuracy_set(tmp_path_factory, shipped):
+def accuracy_set(tmp_path_factory, data_folder):
     if KEPT:
-        return AccuracySet(Path(KEPT), shipped)
-    folder = made_once(tmp_path_factory, "accuracy", lambda folder: simulate_set(folder, shipped))
-    return AccuracySet(folder, shipped)
+        return AccuracySet(Path(KEPT), data_folder)
+    folder = made_once(tmp_path_factory, "accuracy", lambda folder: simulate_set(folder, data_folder))
+    return AccuracySet(folder, data_folder)
 
 
 @pytest.fixture

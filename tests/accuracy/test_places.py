@@ -7,8 +7,8 @@ from speckle3d.io.load import load_sweep
 
 
 @pytest.fixture(scope="module")
-def phantom(shipped):
-    return load_sweep(shipped / "phantom.h5")
+def phantom(data_folder):
+    return load_sweep(data_folder / "phantom.h5")
 
 
 def test_tracker_and_images_have_one_clock(phantom):

@@ -8,12 +8,12 @@ from commands import RF, command, free_port, read_until
 pytestmark = needs_browser
 
 
-def test_picture_length_and_end_are_shown(browser, shipped, tmp_path, monkeypatch):
+def test_picture_length_and_end_are_shown(browser, data_folder, tmp_path, monkeypatch):
     monkeypatch.setenv("BROWSER", "true")  # the one that this test brings looks at it
     port = free_port()
     # Slowly: a page on a busy machine takes seconds to open.
-    play = command("play", shipped / "phantom.h5", "--port", port, "--rate", "0.3")
-    live = command("live", f"localhost:{port}", "-o", tmp_path / "out", "--curves", shipped / "curves.h5",
+    play = command("play", data_folder / "phantom.h5", "--port", port, "--rate", "0.3")
+    live = command("live", f"localhost:{port}", "-o", tmp_path / "out", "--curves", data_folder / "curves.h5",
                    "--view", *RF)  # fmt: skip
     with running(play, stderr=subprocess.PIPE) as playing:
         read_until(playing, "127.0.0.1")

@@ -21,8 +21,8 @@ def log(tmp_path):
     return tmp_path / "log.csv"
 
 
-def test_a_sweep_with_a_sensor_has_both_pages_and_a_log_its_own(shipped, log):
-    assert titles(shipped / "phantom.h5") == ["Sweep", "Sensor"]
+def test_a_sweep_with_a_sensor_has_both_pages_and_a_log_its_own(data_folder, log):
+    assert titles(data_folder / "phantom.h5") == ["Sweep", "Sensor"]
     assert titles(log) == ["Sensor"]
 
 
@@ -33,12 +33,12 @@ def test_a_package_without_frames_still_has_its_sensor(realdata):
     assert "frames are not shown: " in page._source._log.notes[-1]
 
 
-def test_what_has_no_page_is_one_line_and_exit_code_2(shipped, log, tmp_path, capsys, monkeypatch):
+def test_what_has_no_page_is_one_line_and_exit_code_2(data_folder, log, tmp_path, capsys, monkeypatch):
     (tmp_path / "empty").write_bytes(b"")
     cases = [
-        (shipped / "curves.h5",), (shipped,), (tmp_path / "none.h5",), (tmp_path / "empty",),
+        (data_folder / "curves.h5",), (data_folder,), (tmp_path / "none.h5",), (tmp_path / "empty",),
         (log, "--record", tmp_path / "out.mtb"),
-        (shipped / "phantom.h5", "--reconstruction", shipped / "phantom.h5"),
+        (data_folder / "phantom.h5", "--reconstruction", data_folder / "phantom.h5"),
     ]  # fmt: skip
     for arguments in cases:
         monkeypatch.setattr("sys.argv", ["speckle3d", "view", "--no-browser", *map(str, arguments)])

@@ -14,8 +14,8 @@ pytestmark = needs_browser
 
 
 @pytest.fixture(scope="module")
-def address(shipped):
-    with viewing(shipped / "phantom.h5") as address:
+def address(data_folder):
+    with viewing(data_folder / "phantom.h5") as address:
         yield address
 
 
@@ -52,7 +52,7 @@ def test_without_a_signature_it_is_closed(address):
     assert status(f"{bare}autoload.js?bokeh-autoload-element=1") == 403
 
 
-def test_the_address_that_a_browser_is_started_with_opens_once(browser, shipped):
+def test_the_address_that_a_browser_is_started_with_opens_once(browser, data_folder):
     """Other users see the arguments that programs are started with."""
     code = (
         "import sys; from pathlib import Path; from speckle3d.app.opened import pages_of; "
@@ -60,7 +60,7 @@ def test_the_address_that_a_browser_is_started_with_opens_once(browser, shipped)
         "server = AppServer(pages_of(path), path.name, unseen_s=3.0); "
         "print(server.address_for_once(), flush=True); server.run()"
     )
-    command = [sys.executable, "-c", code, shipped / "phantom.h5"]
+    command = [sys.executable, "-c", code, data_folder / "phantom.h5"]
     with running(command, stdout=subprocess.PIPE) as server:
         once = server.stdout.readline().strip()
         page = opened(browser, once)

@@ -50,11 +50,11 @@ def main():
     before, lines, unsaid = read_table() if TABLE.exists() else {}, [], []
     with tempfile.TemporaryDirectory() as scratch:
         folder = options.keep or Path(scratch) / "sweeps"
-        shipped = TABLE.parents[2] / "data"
+        data_folder = TABLE.parents[2] / "data"
         if not (folder.is_dir() or options.quick):
             folder.mkdir(parents=True)
-            simulate_set(folder, shipped)
-        accuracy_set = AccuracySet(folder, shipped)
+            simulate_set(folder, data_folder)
+        accuracy_set = AccuracySet(folder, data_folder)
         for case in (case for case in CASES if options.cases in case):
             if case.startswith("independent") and not INDEPENDENT.is_dir():
                 sys.exit(f"expected sweeps of another physics in {INDEPENDENT}")

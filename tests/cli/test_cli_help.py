@@ -71,7 +71,9 @@ def test_every_setting_is_printed_with_its_default(run):
         (("calibrate", "images", "a", "b", "-o", "c.h5", "--scales"), "--pixel-mm takes them"),
     ],
 )
-def test_what_is_refused_is_refused_before_work(refused, monkeypatch, tmp_path, shipped, arguments, expected):
+def test_what_is_refused_is_refused_before_work(
+    refused, monkeypatch, tmp_path, data_folder, arguments, expected
+):
     from speckle3d import sensor_logs
     from speckle3d.study import job, paper
 
@@ -82,6 +84,6 @@ def test_what_is_refused_is_refused_before_work(refused, monkeypatch, tmp_path, 
     monkeypatch.setattr(paper, "paper_study", work)
     monkeypatch.setattr(sensor_logs, "ridden_along", work)
     monkeypatch.chdir(tmp_path)
-    sweep = shipped / "phantom.h5"
+    sweep = data_folder / "phantom.h5"
     assert expected.format(sweep=sweep) in refused(*(word.format(sweep=sweep) for word in arguments))
     assert not list(tmp_path.iterdir())

@@ -6,9 +6,9 @@ import h5py
 import numpy as np
 
 
-def test_a_sweeps_own_sensor_is_oriented_anew(run, shipped, tmp_path):
+def test_a_sweeps_own_sensor_is_oriented_anew(run, data_folder, tmp_path):
     path = tmp_path / "a.h5"
-    shutil.copy(shipped / "phantom.h5", path)
+    shutil.copy(data_folder / "phantom.h5", path)
     code, out, err = run("imu", "info", path)
     assert code == 0, err
     with h5py.File(path) as file:

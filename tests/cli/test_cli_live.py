@@ -18,10 +18,10 @@ def started(*arguments):
 
 
 @pytest.fixture
-def player(shipped):
+def player(data_folder):
     """A sweep that is played once, and its port."""
     port = free_port()
-    playing = started("play", shipped / "phantom.h5", "--port", port)
+    playing = started("play", data_folder / "phantom.h5", "--port", port)
     read_until(playing, "waiting for a client")
     yield port
     playing.kill()
@@ -43,8 +43,8 @@ def waited_for(path, frames):
 
 
 @pytest.mark.slow
-def test_a_played_sweep_is_recorded_placed_and_reconstructed_as_off_line(player, shipped, tmp_path):
-    out, curves = tmp_path / "out", shipped / "curves.h5"
+def test_a_played_sweep_is_recorded_placed_and_reconstructed_as_off_line(player, data_folder, tmp_path):
+    out, curves = tmp_path / "out", data_folder / "curves.h5"
     running = started(
         "live", f"127.0.0.1:{player}", "-o", out, "--curves", curves, "--transform", "ProbeToReference", *RF
     )
@@ -55,7 +55,7 @@ def test_a_played_sweep_is_recorded_placed_and_reconstructed_as_off_line(player,
     assert running.returncode == 0, told
     placed = re.search(r"96 frames in .*, (\d+) placed as they came", told)
     assert int(placed[1]) > 0
-    whole = s3.load_sweep(shipped / "phantom.h5")
+    whole = s3.load_sweep(data_folder / "phantom.h5")
     kept = s3.load_sweep(out / "sweep.h5")
     np.testing.assert_array_equal(kept.frames[95], whole.frames[95])
     assert len(kept.tracker.readings)

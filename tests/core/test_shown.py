@@ -10,8 +10,8 @@ from xsens.logs.samples import ImuLog
 
 
 @pytest.fixture(scope="module")
-def things(sweep, curves, tracked):
-    corrected = s3.correct(tracked, sweep, ["pose", "orientation", "fused"])
+def things(sweep, curves, tracking):
+    corrected = s3.correct(tracking, sweep, ["pose", "orientation", "fused"])
     volume = Volume(np.zeros((4, 3, 2), np.uint8), (0.5, 0.5, 1.0), RigidTransform.identity())
     log = ImuLog(np.arange(500) / 100, gyroscope_rad_s=np.zeros((500, 3)))
     return [
@@ -20,7 +20,7 @@ def things(sweep, curves, tracked):
         sweep.orientation,
         sweep.tracker.readings,
         curves,
-        tracked,
+        tracking,
         volume,
         log,
         *corrected.values(),
@@ -35,9 +35,9 @@ def test_a_repr_fits_in_ten_lines(things):
         assert max(map(len, lines)) <= 100, type(thing).__name__
 
 
-def test_a_table_has_a_row_for_each_frame(tracked, sweep):
+def test_a_table_has_a_row_for_each_frame(tracking, sweep):
     pytest.importorskip("pandas")
-    table = tracked.to_dataframe()
+    table = tracking.to_dataframe()
     assert len(table) == len(sweep)
     assert table["length_mm"].iloc[-1] == pytest.approx(table["length_mm"].max(), abs=0.1)
     truth = np.abs(np.diff(sweep.truth.apply(sweep.grid.centre_mm), axis=0)).sum()

@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from drifting import CENTRE_MM, drifted, hand_sweep
+from drifting import CENTRE_MM, drifting_poses, hand_sweep
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -15,7 +15,7 @@ from speckle3d.correction.curves import (
 
 def chain_of(seed, frames=40, axes=AXES, curves="time", turns=0):
     rng = np.random.default_rng(seed)
-    poses = drifted(hand_sweep(rng, frames, turns=turns), rng)
+    poses = drifting_poses(hand_sweep(rng, frames, turns=turns), rng)
     basis = curve_basis(axes, elevational_steps(poses, CENTRE_MM), curves)
     return poses, CorrectedChain.of(poses, axes, basis)
 

@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from drifting import CENTRE_MM, CORNERS_MM, drifted, hand_sweep, tracked
+from drifting import CENTRE_MM, CORNERS_MM, drifting_poses, hand_sweep, tracker_poses
 
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.geometry import elevational_steps, relative_poses, roll_yaw_tilt
@@ -12,7 +12,7 @@ TIME, DISTANCE = DriftSettings(), DriftSettings(curves="distance")
 def sweep(seed, frames=160, turns=0, outliers=0.0):
     rng = np.random.default_rng(seed)
     truth = hand_sweep(rng, frames, turns=turns)
-    return truth, drifted(truth, rng), tracked(truth, rng, outliers=outliers)
+    return truth, drifting_poses(truth, rng), tracker_poses(truth, rng, outliers=outliers)
 
 
 def everywhere(poses):

@@ -48,14 +48,14 @@ REFUTED = (
 """Faults that leave nothing of a sensor to rely on."""
 
 
-def doubts_of(sweep, tracked):
-    examined = examined_sensors(sweep, tracked.image)
-    return examined, disagreements(examined.trusted, tracked.image, tracked.covariance)
+def doubts_of(sweep, tracking):
+    examined = examined_sensors(sweep, tracking.image)
+    return examined, disagreements(examined.trusted, tracking.image, tracking.covariance)
 
 
-def test_good_sensors_are_not_doubted(sweep, tracked):
-    assert tracked.doubts == ()
-    examined, found = doubts_of(sweep, tracked)
+def test_good_sensors_are_not_doubted(sweep, tracking):
+    assert tracking.doubts == ()
+    examined, found = doubts_of(sweep, tracking)
     assert examined.doubts == found == ()
     assert examined.turn_confirmed
     assert examined.trusted.tracker is sweep.tracker
@@ -63,8 +63,8 @@ def test_good_sensors_are_not_doubted(sweep, tracked):
 
 
 @pytest.mark.parametrize("name", AGAINST_THEMSELVES)
-def test_a_sensor_that_contradicts_itself_is_named(name, sweep, tracked):
-    examined, _ = doubts_of(spoil(sweep, name), tracked)
+def test_a_sensor_that_contradicts_itself_is_named(name, sweep, tracking):
+    examined, _ = doubts_of(spoil(sweep, name), tracking)
     about = "tracker" if name.startswith("tracker") else "orientation sensor"
     assert {doubt.about for doubt in examined.doubts} == {about}
     assert any(AGAINST_THEMSELVES[name] in doubt.suspect for doubt in examined.doubts)
@@ -73,9 +73,9 @@ def test_a_sensor_that_contradicts_itself_is_named(name, sweep, tracked):
 
 
 @pytest.mark.parametrize("name", BESIDE_THE_IMAGES)
-def test_images_and_a_sensor_that_differ_are_told_side_by_side_and_nobody_is_left_out(name, sweep, tracked):
+def test_images_and_a_sensor_that_differ_are_told_side_by_side_and_nobody_is_left_out(name, sweep, tracking):
     bad = spoil(sweep, name)
-    examined, found = doubts_of(bad, tracked)
+    examined, found = doubts_of(bad, tracking)
     assert examined.trusted.tracker is not None
     assert found
     assert not any(doubt.refuted for doubt in found)
@@ -92,26 +92,26 @@ def test_lengths_of_modes_beyond_three_joint_claims_are_told_with_both_numbers()
 
 
 @pytest.mark.parametrize("name", ["orientation stored xyzw", "orientation inverted", "orientation random"])
-def test_no_sign_is_taken_from_turns_that_nothing_confirms(name, sweep, tracked):
+def test_no_sign_is_taken_from_turns_that_nothing_confirms(name, sweep, tracking):
     bad = spoil(replace(sweep, tracker=None, truth=None), name)
     # Without what it measures beside its orientation, only the images are left to say so.
     bare = replace(bad, orientation=replace(bad.orientation, gyroscope_rad_s=None, accelerometer_m_s2=None))
     for recorded in (bad, bare):
-        examined = examined_sensors(recorded, tracked.image)
-        sign = settle_direction(examined.trusted, tracked.image, Config().sensors, examined.turn_confirmed)
+        examined = examined_sensors(recorded, tracking.image)
+        sign = settle_direction(examined.trusted, tracking.image, Config().sensors, examined.turn_confirmed)
         assert sign == (1, "assumed")
 
 
-def test_a_sensor_that_contradicts_itself_gives_no_mode_unless_told_to(sweep, tracked):
+def test_a_sensor_that_contradicts_itself_gives_no_mode_unless_told_to(sweep, tracking):
     bad = spoil(sweep, "tracker frozen")
-    doubts = examined_sensors(bad, tracked.image).doubts
+    doubts = examined_sensors(bad, tracking.image).doubts
     with pytest.raises(MismatchError, match=r"pose.*tracker.*frozen"):
-        correct(replace(tracked, doubts=doubts), bad, ["pose"])
+        correct(replace(tracking, doubts=doubts), bad, ["pose"])
     config = Config(sensors={"examine": False})
-    assert len(correct(tracked, bad, ["pose"], config)["pose"].poses) == len(sweep)
+    assert len(correct(tracking, bad, ["pose"], config)["pose"].poses) == len(sweep)
 
 
-def test_spikes_are_left_out_and_counted(sweep, tracked):
+def test_spikes_are_left_out_and_counted(sweep, tracking):
     bad = spoil(sweep, "tracker spikes of 30 mm")
     cleaned, (doubt,) = cleaned_readings(bad)
     places = [each.tracker.readings.world_from_sensor.translation for each in (bad, sweep)]
@@ -123,15 +123,15 @@ def test_spikes_are_left_out_and_counted(sweep, tracked):
     at = at[(at >= sweep.frame_time_s[0]) & (at <= sweep.frame_time_s[-1])]
     named = np.concatenate([np.arange(first, last + 1) for first, last in doubt.frames])
     assert np.isin(np.abs(sweep.frame_time_s[:, None] - at).argmin(axis=0), named).all()
-    good, mended = (correct(tracked, each, ["pose"])["pose"].poses for each in (sweep, bad))
+    good, mended = (correct(tracking, each, ["pose"])["pose"].poses for each in (sweep, bad))
     ends = [(p[0].inv() * p[-1]).apply(sweep.grid.centre_mm)[2] for p in (good, mended)]
     # A tenth of the readings less: their jitter of 0.15 mm over some 20 that tell an end.
     assert ends[1] == pytest.approx(ends[0], abs=0.05)
 
 
-def test_a_gyroscope_on_other_axes_does_not_refute_the_readings(sweep, tracked):
+def test_a_gyroscope_on_other_axes_does_not_refute_the_readings(sweep, tracking):
     turned_round = replace(sweep.orientation, gyroscope_rad_s=-sweep.orientation.gyroscope_rad_s)
-    examined = examined_sensors(replace(sweep, tracker=None, orientation=turned_round), tracked.image)
+    examined = examined_sensors(replace(sweep, tracker=None, orientation=turned_round), tracking.image)
     assert [(doubt.refuted, "gyroscope" in doubt.suspect) for doubt in examined.doubts] == [(False, True)]
 
 

@@ -44,7 +44,9 @@ def write_images(folder):
 
     from speckle3d.io.plus.write import write_sequence
 
-    image_examples.write_mha(folder / "a.mha", image_examples.grey(), frames=image_examples.tracked(3)[2])
+    image_examples.write_mha(
+        folder / "a.mha", image_examples.grey(), frames=image_examples.frame_fields(3)[2]
+    )
     write_sequence(folder / "b.nrrd", sweeps()["bmode"][0])
 
 

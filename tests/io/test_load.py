@@ -2,7 +2,7 @@ import json
 
 import numpy as np
 import sweep_examples
-from image_examples import grey, tracked, write_mha
+from image_examples import frame_fields, grey, write_mha
 
 from speckle3d.io.describe import describe
 from speckle3d.io.import_settings import ImportSettings
@@ -18,7 +18,7 @@ def values(path):
 
 def test_the_reader_is_chosen_by_content_not_by_name(tmp_path):
     write_sweep(tmp_path / "sweep.mha", sweep_examples.rf_sweep())
-    write_mha(tmp_path / "images.h5", grey(), frames=tracked(3)[2])
+    write_mha(tmp_path / "images.h5", grey(), frames=frame_fields(3)[2])
     assert len(load_sweep(tmp_path / "sweep.mha")) == 6
     assert len(load_sweep(tmp_path / "images.h5", BMODE)) == 3
 
@@ -26,7 +26,7 @@ def test_the_reader_is_chosen_by_content_not_by_name(tmp_path):
 def test_what_settings_override_is_told_with_what_the_file_says(tmp_path):
     pixels = np.zeros((3, 4, 30), np.int16)
     fields = {"UltrasoundImageType": "RF_REAL"}
-    path = write_mha(tmp_path / "a.mha", pixels, fields, tracked(3)[2], spacing="0.01925 0.2 1")
+    path = write_mha(tmp_path / "a.mha", pixels, fields, frame_fields(3)[2], spacing="0.01925 0.2 1")
     (tmp_path / "import.toml").write_text(
         "sampling_rate_hz = 80e6\ncentre_frequency_hz = 5e6\n"
         "bandwidth_hz = [3e6, 7e6]\nvector_pitch_mm = 0.2005"

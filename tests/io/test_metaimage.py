@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from image_examples import grey, text_of, tracked, write_mha
+from image_examples import frame_fields, grey, text_of, write_mha
 from scipy.spatial.transform import RigidTransform, Rotation
 from sweep_examples import frames_of
 
@@ -129,7 +129,7 @@ def test_a_lost_tool_that_is_written_as_the_identity_is_left_out(tmp_path, lost)
 
 
 def test_transforms_are_chosen_by_name(tmp_path):
-    probe, reference, frames = tracked(3)
+    probe, reference, frames = frame_fields(3)
     path = write_mha(tmp_path / "a.mha", grey(), frames=frames)
     both = read_poses(path).readings.world_from_sensor
     # Six digits were written: 1e-6 of a rotation, 1e-3 of hundreds of mm.

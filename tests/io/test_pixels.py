@@ -4,7 +4,7 @@ import os
 
 import numpy as np
 import pytest
-from image_examples import grey, tracked, write_mha
+from image_examples import frame_fields, grey, write_mha
 
 from speckle3d.io.headers import read_header
 from speckle3d.io.import_settings import ImportSettings
@@ -14,7 +14,7 @@ BMODE = ImportSettings(column_pitch_mm=0.1, row_spacing_mm=0.2, dynamic_range_db
 
 def detached(folder, name, suffix=".mhd"):
     """A header whose pixels are in another file."""
-    whole = write_mha(folder / "whole.mha", grey(), frames=tracked(3)[2]).read_bytes()
+    whole = write_mha(folder / "whole.mha", grey(), frames=frame_fields(3)[2]).read_bytes()
     head, _, pixels = whole.partition(b"LOCAL\n")
     path = folder / f"header{suffix}"
     if suffix == ".nhdr":

@@ -1,7 +1,7 @@
 """One door: what a recording lacks comes from options or from a file beside it, and is asked for at once."""
 
 import pytest
-from image_examples import grey, tracked, write_mha
+from image_examples import frame_fields, grey, write_mha
 from PIL import Image
 
 from speckle3d.core.errors import InvalidInputError
@@ -14,7 +14,7 @@ BMODE = "column_pitch_mm = 0.1\nrow_spacing_mm = 0.2\ndynamic_range_db = 60\n"
 
 @pytest.fixture
 def images(tmp_path):
-    return write_mha(tmp_path / "a.mha", grey(), frames=tracked(3)[2])
+    return write_mha(tmp_path / "a.mha", grey(), frames=frame_fields(3)[2])
 
 
 def test_a_recordings_own_file_comes_before_the_folders_and_options_before_both(images):

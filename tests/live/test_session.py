@@ -58,9 +58,9 @@ def run(batches, done, curves, folder, **settings):
 
 
 @pytest.fixture(scope="module")
-def recorded(shipped):
-    sweep = s3.load_sweep(shipped / "phantom.h5")
-    return [sweep.frames[k] for k in range(14)], s3.load_curves(shipped / "curves.h5")
+def recorded(data_folder):
+    sweep = s3.load_sweep(data_folder / "phantom.h5")
+    return [sweep.frames[k] for k in range(14)], s3.load_curves(data_folder / "curves.h5")
 
 
 def test_what_is_received_is_recorded_placed_and_sent_on(recorded, tmp_path):

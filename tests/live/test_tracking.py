@@ -39,8 +39,8 @@ def live(sweep, curves):
 
 
 @pytest.fixture(scope="module")
-def followed(shipped):
-    sweep, curves = shipped_part(shipped)
+def followed(data_folder):
+    sweep, curves = shipped_part(data_folder)
     return sweep, curves, *live(sweep, curves)
 
 
@@ -59,8 +59,8 @@ def test_at_the_end_poses_are_those_of_the_recording(followed):
     assert apart_mm(sweep, tracker.poses, track(sweep, curves).image).max() < 0.006
 
 
-def test_a_frame_of_noise_is_flagged_and_the_sweep_goes_on(shipped):
-    sweep, curves = shipped_part(shipped)
+def test_a_frame_of_noise_is_flagged_and_the_sweep_goes_on(data_folder):
+    sweep, curves = shipped_part(data_folder)
     tracker = LiveTracker(sweep, curves, background=False)
     noise = np.random.default_rng(3).integers(-60, 60, sweep.frames.shape[1:]).astype(np.int16)
     told = [tracker.append(noise if k == 12 else sweep.frames[k], float(k)) for k in range(20)]
@@ -71,8 +71,8 @@ def test_a_frame_of_noise_is_flagged_and_the_sweep_goes_on(shipped):
     assert apart_mm(sweep, tracker.poses, whole)[[11, 14, 19]].max() < 0.1
 
 
-def test_images_that_show_no_speckle_leave_the_length_open(shipped):
-    sweep = received(shipped_part(shipped, 6)[0], dynamic_range_db=60.0)
+def test_images_that_show_no_speckle_leave_the_length_open(data_folder):
+    sweep = received(shipped_part(data_folder, 6)[0], dynamic_range_db=60.0)
     frames = np.stack([sweep.frames[k] for k in range(len(sweep))])
     dark = np.maximum(frames - np.quantile(frames, 0.6), 0.0).astype(np.uint8)
     for images, least, most in (frames, 0.05, 0.3), (dark, 1.0, np.inf):
@@ -80,8 +80,8 @@ def test_images_that_show_no_speckle_leave_the_length_open(shipped):
         assert least < live(grey, data_sheet_curves(SHEET, grey))[0].length_sigma < most
 
 
-def test_a_first_frame_that_is_not_finite_is_flagged_and_the_sweep_goes_on(shipped):
-    sweep, curves = shipped_part(shipped)
+def test_a_first_frame_that_is_not_finite_is_flagged_and_the_sweep_goes_on(data_folder):
+    sweep, curves = shipped_part(data_folder)
     tracker = LiveTracker(sweep, curves, background=False)
     frames = np.stack([sweep.frames[k] for k in range(8)]).astype(np.float32)
     frames[0] = np.nan

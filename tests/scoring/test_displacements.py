@@ -3,7 +3,7 @@
 import challenge_examples as examples
 import numpy as np
 import pytest
-from drifting import CENTRE_MM, drifted
+from drifting import CENTRE_MM, drifting_poses
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
@@ -47,7 +47,7 @@ def test_errors_and_score_are_those_the_challenge_publishes(tmp_path):
     path, _, true_tool, published = examples.write_data_set(tmp_path)
     sweep, marks = load_sweep(path), load_landmarks(path)
     true = find_reference(sweep, None).world_from_image
-    poses = drifted(true, np.random.default_rng(4))
+    poses = drifting_poses(true, np.random.default_rng(4))
     counted_from_ours = RigidTransform.from_translation([*examples.SCALE_MM, 0.0]).as_matrix()
     tool = poses.as_matrix() @ np.linalg.inv(counted_from_ours) @ np.linalg.inv(examples.TOOL_FROM_IMAGE)
     expected = examples.published_errors(true_tool, tool, published)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from drifting import CENTRE_MM, accumulate, drifted, hand_sweep, tracked
+from drifting import CENTRE_MM, accumulate, drifting_poses, hand_sweep, tracker_poses
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.geometry import rotation_from_fixed_angles
@@ -31,7 +31,7 @@ def test_parts_of_a_jittery_tracker_are_those_of_the_hand():
         rng, turns = np.random.default_rng(seed), 2 * (seed % 2)
         truth = hand_sweep(rng, 300, turns=turns)
         exact = monotone_parts(accumulated(truth, CENTRE_MM).length_mm)
-        rough = monotone_parts(accumulated(tracked(truth, rng, outliers=0.05), CENTRE_MM).length_mm)
+        rough = monotone_parts(accumulated(tracker_poses(truth, rng, outliers=0.05), CENTRE_MM).length_mm)
         assert [p.name for p in exact] == [p.name for p in rough] == ["f", "r", "f2"][: turns + 1]
         # Noise of 0.15 / sqrt(9) mm against steps of 0.2 mm per frame, and the width of the mean.
         np.testing.assert_allclose([p.last for p in rough], [p.last for p in exact], atol=5)
@@ -54,7 +54,7 @@ def test_a_jittery_tracker_scores_as_the_truth_does_and_says_how_sure_it_is():
     for seed in range(40):
         rng = np.random.default_rng(seed)
         truth = hand_sweep(rng, 200)
-        modes, tracker = {"image": drifted(truth, rng)}, tracked(truth, rng, outliers=0.02)
+        modes, tracker = {"image": drifting_poses(truth, rng)}, tracker_poses(truth, rng, outliers=0.02)
         (exact,) = compare_modes(modes, truth, CENTRE_MM, end_frames=1)
         (rough,) = compare_modes(modes, tracker, CENTRE_MM)
         (ends,) = compare_modes(modes, tracker, CENTRE_MM, end_frames=1)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import sweep_examples
-from drifting import drifted, hand_sweep
+from drifting import drifting_poses, hand_sweep
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.errors import InvalidInputError
@@ -24,7 +24,7 @@ from speckle3d.scoring.trajectories import (
 def pair():
     rng = np.random.default_rng(7)
     truth = hand_sweep(rng, 40)
-    return drifted(truth, rng), truth
+    return drifting_poses(truth, rng), truth
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +56,7 @@ def test_a_reconstruction_is_scored_against_a_sweep(tmp_path):
     sweep = sweep_examples.rf_sweep()
     write_sweep(tmp_path / "s.h5", sweep)
     rng = np.random.default_rng(2)
-    poses = {"image": drifted(sweep.truth, rng), "pose": sweep.truth}
+    poses = {"image": drifting_poses(sweep.truth, rng), "pose": sweep.truth}
     made = Provenance("s.h5", "ab", "0.1.0")
     write_reconstruction(tmp_path / "r.h5", Reconstruction(sweep.frame_time_s, sweep.grid, poses, made))
     reference = load_reference(tmp_path / "s.h5")

@@ -28,9 +28,9 @@ def tiny(monkeypatch):
 
 
 @pytest.mark.slow
-def test_the_study_simulates_once_and_compares_with_the_tracker_and_the_truth(tiny, shipped, tmp_path):
+def test_the_study_simulates_once_and_compares_with_the_tracker_and_the_truth(tiny, data_folder, tmp_path):
     told = []
-    _, table = paper.paper_study(tmp_path, shipped / "curves.h5", simulated=lambda *at: told.append(at))
+    _, table = paper.paper_study(tmp_path, data_folder / "curves.h5", simulated=lambda *at: told.append(at))
     assert told == [(0, 1), (1, 1)]
     assert "beef-1 f" in table
     held = json.loads((tmp_path / "paper.json").read_text())
@@ -42,7 +42,9 @@ def test_the_study_simulates_once_and_compares_with_the_tracker_and_the_truth(ti
     tracked = sweep.tracker.world_from_image(sweep.frame_time_s).rotation
     assert np.rad2deg((turned * tracked).magnitude().max()) < 1e-4
     told.clear()
-    study, again = paper.paper_study(tmp_path, shipped / "curves.h5", simulated=lambda *at: told.append(at))
+    study, again = paper.paper_study(
+        tmp_path, data_folder / "curves.h5", simulated=lambda *at: told.append(at)
+    )
     assert told == [(1, 1)]
     assert all(each.skipped for each in study.outcomes)
     assert again == table

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import sweep_examples
-from image_examples import grey, text_of, tracked, write_mha
+from image_examples import frame_fields, grey, text_of, write_mha
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.calibration import Calibration, FramesUsed
@@ -22,7 +22,7 @@ LEANING[0, 1] = 0.01
 
 
 def sequence(folder, matrix=PIXELS, invalid=(), frames=4):
-    fields = tracked(frames)[2]
+    fields = frame_fields(frames)[2]
     for i, frame in enumerate(fields):
         frame |= {"ImageToProbeTransform": text_of(matrix), "ImageToProbeTransformStatus": "OK"}
         if i in invalid:

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from igsio_twin import Clip
-from image_examples import grey, tracked, write_mha
+from image_examples import frame_fields, grey, write_mha
 from scipy.spatial.transform import Rotation
 
 from speckle3d.core.grid import ImageGrid
@@ -42,7 +42,7 @@ def given(config, **more):
 
 @pytest.fixture
 def sequence(tmp_path):
-    return write_mha(tmp_path / "a.mha", grey(), frames=tracked(3)[2])
+    return write_mha(tmp_path / "a.mha", grey(), frames=frame_fields(3)[2])
 
 
 HALF = np.diag([1.0, 1.0, 1.0, 1.0])
@@ -73,15 +73,15 @@ def test_the_image_on_the_probe_whichever_way_it_is_written(tmp_path, sequence, 
 def test_the_machine_orientation_counts_where_the_header_has_none(tmp_path):
     config = written(tmp_path / "set.xml", ("Image", "Probe", matrix()),
                      more='<DataSource PortUsImageOrientation="UN"/>')  # fmt: skip
-    path = write_mha(tmp_path / "a.mha", grey(), frames=tracked(3)[2])
+    path = write_mha(tmp_path / "a.mha", grey(), frames=frame_fields(3)[2])
     np.testing.assert_array_equal(load_sweep(path, given(config)).frames[0], grey()[0, ::-1, ::-1].T)
-    path = write_mha(tmp_path / "a.mha", grey(), {"UltrasoundImageOrientation": "MF"}, tracked(3)[2])
+    path = write_mha(tmp_path / "a.mha", grey(), {"UltrasoundImageOrientation": "MF"}, frame_fields(3)[2])
     np.testing.assert_array_equal(load_sweep(path, given(config)).frames[0], grey()[0].T)
 
 
 def test_the_pitch_of_rf_lines_but_not_the_image_of_them(tmp_path):
     scan = '<ScanConversion TransducerGeometry="{}" TransducerWidthMm="38.4" ImagingDepthMm="40"/>'
-    rf = write_mha(tmp_path / "rf.mha", np.ones((2, 12, 30), np.int16), frames=tracked(2)[2])
+    rf = write_mha(tmp_path / "rf.mha", np.ones((2, 12, 30), np.int16), frames=frame_fields(2)[2])
     config = written(tmp_path / "set.xml", ("Image", "Probe", matrix()), scan=scan.format("LINEAR"))
     more = {"centre_frequency_hz": 5e6, "bandwidth_hz": (3e6, 7e6)}
     sweep = load_sweep(rf, given(config, sampling_rate_hz=40e6, **more))
@@ -97,7 +97,7 @@ def test_lines_of_a_curved_transducer(tmp_path):
     places = 'RadiusStartMm="50" RadiusStopMm="65" ThetaStartDeg="-10" ThetaStopDeg="5"'
     scan = f'<ScanConversion TransducerGeometry="CURVILINEAR" {places}/>'
     config = written(tmp_path / "set.xml", scan=scan)
-    rf = write_mha(tmp_path / "rf.mha", np.ones((2, 12, 301), np.int16), frames=tracked(2)[2])
+    rf = write_mha(tmp_path / "rf.mha", np.ones((2, 12, 301), np.int16), frames=frame_fields(2)[2])
     sweep = load_sweep(rf, given(config, centre_frequency_hz=3e6, bandwidth_hz=(2e6, 3.8e6)))
     assert sweep.grid.sample_spacing_mm == pytest.approx(15.0 / 300)
     assert sweep.grid.fan.radius_mm == 50.0

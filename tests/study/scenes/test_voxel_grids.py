@@ -12,8 +12,8 @@ COARSE = CompoundingSettings(voxel_mm=1.0)
 
 
 @pytest.fixture(scope="module")
-def posed(shipped):
-    return open_posed(shipped / "phantom.h5")
+def posed(data_folder):
+    return open_posed(data_folder / "phantom.h5")
 
 
 def written(posed, path, **request):
