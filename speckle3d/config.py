@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import tomlkit
-from pydantic import BaseModel, ConfigDict
 from pydantic.fields import FieldInfo
 
 from speckle3d.core.errors import InvalidInputError
@@ -17,10 +16,7 @@ from speckle3d.correction.drift import DriftSettings
 from speckle3d.correction.settings import FusedSettings
 from speckle3d.imaging.voxels.settings import CompoundingSettings
 from speckle3d.io.toml import parsed, read_toml, validated
-from speckle3d.matching.intensity import IntensitySettings
-from speckle3d.matching.matcher import InPlaneSettings, MatchingSettings
-from speckle3d.matching.patches import PatchSettings
-from speckle3d.matching.quality import QualitySettings
+from speckle3d.matching.matcher import ImageSettings
 from speckle3d.matching.schedule import TrajectorySettings
 from speckle3d.motion.direction import SensorSettings
 from speckle3d.motion.phantom import CurveSettings
@@ -58,7 +54,7 @@ REMOVED_SETTINGS = {
 """Settings, or whole stages, of older files, and what is there instead."""
 
 
-class Config(BaseModel):
+class Config(ImageSettings):
     """Every setting of a reconstruction, a group for each stage.
 
     Examples
@@ -68,15 +64,8 @@ class Config(BaseModel):
     ('intensity', True)
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    intensity: IntensitySettings = IntensitySettings()
-    patches: PatchSettings = PatchSettings()
-    inplane: InPlaneSettings = InPlaneSettings()
-    matching: MatchingSettings = MatchingSettings()
     curves: CurveSettings = CurveSettings()
     planes: PlaneSettings = PlaneSettings()
-    quality: QualitySettings = QualitySettings()
     trajectory: TrajectorySettings = TrajectorySettings()
     sensors: SensorSettings = SensorSettings()
     drift: DriftSettings = DriftSettings()

@@ -12,7 +12,8 @@ from speckle3d.correction.drift import DriftCorrection
 from speckle3d.correction.modes import PUBLISHED, correct_mode, require_modes, sensor_of
 from speckle3d.correction.scale import FusedPoses, ScaledPoses
 from speckle3d.examine.sensors import believed, cleaned_readings, require_believed
-from speckle3d.pipeline import Tracked, require_kind
+from speckle3d.tracked import Tracked
+from speckle3d.tracking import require_kind
 
 Correction = DriftCorrection | ScaledPoses | FusedPoses
 

@@ -17,8 +17,9 @@ from speckle3d.correction.crossing.sweep import CrossingSweep
 from speckle3d.examine.sensors import believed
 from speckle3d.matching.intensity import IntensityExtractor
 from speckle3d.motion.direction import sensed_orientation
-from speckle3d.pipeline import Tracked, track
+from speckle3d.tracked import Tracked
 from speckle3d.tracked_curves import Length, corrected_curves
+from speckle3d.tracking import track
 
 
 def cross_sweeps(

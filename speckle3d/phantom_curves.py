@@ -60,24 +60,12 @@ def calibrate_curves(
     keys, samples, sizes, spectra, before = [], [], [], [], 0
     total = sum(len(sweep) for sweep in sweeps)
     for sweep in sweeps:
-        matcher = FrameMatcher(
-            sweep,
-            settings.intensity,
-            settings.patches,
-            settings.inplane,
-            settings.matching,
-            settings.quality,
-        )
+        matcher = FrameMatcher(sweep, settings)
         keys.append(matcher.key)
         keys[0].require_same(matcher.key, "the phantom sweeps do not match each other")
         poses = known_positions(sweep)
         pairs = phantom_pairs(sweep, poses, settings.curves)
-        matches = match_sweep(
-            sweep,
-            matcher,
-            KnownSchedule(pairs),
-            after(progress, before, total),
-        )
+        matches = match_sweep(sweep, matcher, KnownSchedule(pairs), after(progress, before, total))
         samples.append(phantom_samples(poses, matcher.patches, matches.table, pairs))
         sizes.append((matcher.patches.row_depth_mm, matches.texture.speckle_size()))
         spectra.append(matches.texture.spectra())

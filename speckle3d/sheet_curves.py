@@ -128,9 +128,7 @@ def data_sheet_curves(
         if rows.size < 2:
             raise InvalidInputError(f"depth_mm: expected room for two patches, got {sheet.depth_mm:g} mm")
     else:
-        matcher = FrameMatcher(
-            like, settings.intensity, settings.patches, settings.inplane, settings.matching
-        )
+        matcher = FrameMatcher(like, settings)
         key, rows, texture = matcher.key, matcher.patches.row_depth_mm, measured_texture(like, matcher)
         size, seen = texture.speckle_size(), texture.spectra()
         area = 2.0 * np.pi * _filled(rows, size.lateral_mm) * _filled(rows, size.axial_mm)

@@ -63,6 +63,9 @@ over fifty patches scatters by."""
 MOST_OUT_OF_TURN = 0.6
 """Share of such frames. A wobble of 3 Hz at 25 frames a second has a quarter of them, at its turns."""
 
+SHORT_REFUSED = 0.03
+"""Of the length, from which averaging refuses it: the share is known to a factor of two."""
+
 ALIKE = (0.2, 0.9)
 """Median correlations between which distances are compared: more hides in noise, less in what stays."""
 WINDOW = 8
@@ -129,6 +132,37 @@ def doubt_gain(features: Sequence[FrameFeatures]) -> Doubt | None:
     return Doubt(IMAGES, "gain", evidence, False)
 
 
+def examine_processing(structure: float, short: float) -> tuple[Doubt, ...]:
+    """Tell images that are not speckle alone, or not of one moment each.
+
+    Parameters
+    ----------
+    structure : float
+        Logarithm of the factor by which curves were stretched for it.
+    short : float
+        Share of the length that averaging of frames takes.
+
+    Raises
+    ------
+    InsufficientDataError
+        If averaging takes too much.
+    """
+    doubts = []
+    if short > 0.0:
+        evidence = (
+            "expected grey levels that vary as much at speed as at rest, got frames that are means of "
+            f"several (persistence, frame averaging): lengths come out some {short:.0%} short"
+        )
+        doubts.append(Doubt("images", "averaged frames", evidence, short > SHORT_REFUSED))
+    if structure > 0.0:
+        evidence = (
+            "expected grey levels of speckle, got those of structure, which stays alike for longer: lengths "
+            f"are open by a factor of {np.exp(2 * structure):.1f}; curves of a tracked sweep know it"
+        )
+        doubts.append(Doubt("images", "filtered images", evidence, False))
+    return unrefuted(doubts, InsufficientDataError)
+
+
 def examine_images(
     matches: MatchedSweep,
     motion: Motion,
@@ -158,9 +192,9 @@ def examine_images(
     inside, frames = problem.patches.inside, texture.frames
     far = far_apart(z_mm, frames[usable[frames]], curves)
     share = texture.standing_share(far) if len(far) else np.full(inside.size, np.nan)
-    share[~inside | (matches.left_out > 0.5)] = np.nan
+    share[~inside | (matches.echoless > 0.5)] = np.nan
     images = (
-        shadowed(matches.left_out[inside]),
+        shadowed(matches.echoless[inside]),
         interleaved(matches.table, problem.frames, problem.trajectory.least_correlation),
         standing(share, len(far), float(np.median(curves.cells)), problem.at_patches.of_echo),
     )
@@ -176,15 +210,15 @@ def examine_images(
     )
 
 
-def shadowed(left_out: FloatArray) -> Doubt | None:
+def shadowed(echoless: FloatArray) -> Doubt | None:
     """Tell that patches without an echo were left out.
 
     Parameters
     ----------
-    left_out : ndarray, shape (p,)
+    echoless : ndarray, shape (p,)
         Share of the frames in which each patch of the region was.
     """
-    share = float(left_out.mean())
+    share = float(echoless.mean())
     if share < SHADOW_TOLD:
         return None
     evidence = (

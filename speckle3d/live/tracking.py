@@ -28,7 +28,6 @@ from speckle3d.core.geometry import mirrored
 from speckle3d.core.relative import RelativePoses
 from speckle3d.core.sweep import BModeSettings, Sweep
 from speckle3d.core.threads import on_one_thread
-from speckle3d.examine.processing import structure_openness
 from speckle3d.matching.frames import FrameByFrame, ImageSink
 from speckle3d.matching.matcher import FrameMatcher
 from speckle3d.matching.overlay import Overlay
@@ -39,6 +38,7 @@ from speckle3d.matching.texture import FRAMES, Texture
 from speckle3d.motion.estimate import Motion, alike_pairs, elevation_of, estimate_motion, strangers
 from speckle3d.motion.planes import MotionProblem, pair_planes
 from speckle3d.motion.signs import likeliest_path, on_path
+from speckle3d.motion.tissue import structure_openness
 from speckle3d.motion.trajectory import edges_of, solve_trajectory
 
 ANEW = 4
@@ -123,7 +123,7 @@ class LiveTracker:
     ) -> None:
         self.images = images
         self._config = c = config or Config()
-        matcher = FrameMatcher(example, c.intensity, c.patches, c.inplane, c.matching, c.quality, curves)
+        matcher = FrameMatcher(example, c, curves)
         self.image_grid = matcher.grid
         self._example, self._matcher = example, matcher
         self._overlay = Overlay()

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from speckle3d.core.arrays import Float32Array, FloatArray, IntArray
+from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from speckle3d.core.sweep import Sweep, read_frame
 from speckle3d.core.threads import ahead
 from speckle3d.kernels.inplane import Frame
 from speckle3d.matching.matcher import FrameMatcher, ReadyFrame, compose, inverse
 from speckle3d.matching.overlay import Overlay
-from speckle3d.matching.quality import FrameFeatures, FrameFlag, QualitySettings, flag_frames
+from speckle3d.matching.quality import FrameFeatures, FrameFlag, flag_frames
 from speckle3d.matching.schedule import KnownSchedule, PairSchedule
 from speckle3d.matching.table import CorrelationTable
 from speckle3d.matching.texture import FRAMES, Texture, spread_frames
@@ -38,7 +38,9 @@ class MatchedSweep:
         Of every frame.
     texture : Texture
         Of some frames.
-    left_out : ndarray, shape (p,)
+    flags : ndarray of int, shape (n,)
+        `FrameFlag` of every frame, by what is in it and what it shares with others.
+    echoless : ndarray, shape (p,)
         Share of the frames in which each patch in the region holds no echo that could be matched: shadow,
         noise, no contact, or something drawn on the image.
     """
@@ -46,13 +48,14 @@ class MatchedSweep:
     table: CorrelationTable
     features: Sequence[FrameFeatures]
     texture: Texture
-    left_out: FloatArray
+    flags: IntArray
+    echoless: FloatArray
 
-    def flags(self, quality: QualitySettings, least_correlation: float) -> IntArray:
-        """Flags of all frames by what is in them and what they share with others."""
-        flags = flag_frames(self.features, quality)
-        flags[self.table.unmatched(len(self.features), least_correlation)] |= FrameFlag.UNMATCHED
-        return flags
+    @property
+    def sound(self) -> BoolArray:
+        """Pairs both of whose frames hold speckle, shape (e,)."""
+        bad = (self.flags & ~FrameFlag.UNMATCHED) != 0
+        return np.asarray(~bad[self.table.first] & ~bad[self.table.second])
 
 
 def match_sweep(
@@ -71,17 +74,17 @@ def match_sweep(
     images : callable, optional
         Called with every intensity image.
     """
-    matched = FrameByFrame(matcher, schedule)
-    texture, chosen = Texture(matcher), spread_frames(len(sweep), FRAMES)
+    pairing = FrameByFrame(matcher, schedule)
+    texture, texture_frames = Texture(matcher), spread_frames(len(sweep), FRAMES)
     overlay = Overlay()
-    for samples in (read_frame(sweep.frames, number) for number in chosen):
+    for samples in (read_frame(sweep.frames, number) for number in texture_frames):
         overlay.keep(samples, matcher.echo(samples))
     matcher.leave_out(overlay)
 
     def make(number: int) -> ReadyFrame:
         samples = read_frame(sweep.frames, number)
         ready = matcher.ready(samples)
-        if number in chosen:
+        if number in texture_frames:
             texture.keep(number, samples, ready)
         return ready
 
@@ -90,11 +93,13 @@ def match_sweep(
         if images:
             images(number, ready.echo.intensity)
         features.append(ready.features)
-        tables.append(matched.advance(number, ready.frame))
+        tables.append(pairing.advance(number, ready.frame))
         if progress:
             progress(number + 1, len(sweep))
-    left_out = matcher.patches.inside - np.mean([frame.usable for frame in features], axis=0)
-    return MatchedSweep(CorrelationTable.joined(tables), features, texture, left_out)
+    table, flags = CorrelationTable.joined(tables), flag_frames(features, matcher.quality)
+    flags[table.unmatched(len(sweep), schedule.least_correlation)] |= FrameFlag.UNMATCHED
+    echoless = matcher.patches.inside - np.mean([frame.usable for frame in features], axis=0)
+    return MatchedSweep(table, features, texture, flags, echoless)
 
 
 class FrameByFrame:

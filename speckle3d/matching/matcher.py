@@ -17,7 +17,6 @@ from scipy import fft
 
 from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray
 from speckle3d.core.curves import CurveKey, DecorrelationCurves
-from speckle3d.core.region import Region
 from speckle3d.core.sweep import BModeSettings, RFSettings, Sweep
 from speckle3d.core.threads import in_parallel
 from speckle3d.kernels.box_means import amplify
@@ -62,6 +61,18 @@ class InPlaneSettings(BaseModel):
     )
 
 
+class ImageSettings(BaseModel):
+    """Settings of all that looks at images."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    intensity: IntensitySettings = IntensitySettings()
+    patches: PatchSettings = PatchSettings()
+    inplane: InPlaneSettings = InPlaneSettings()
+    matching: MatchingSettings = MatchingSettings()
+    quality: QualitySettings = QualitySettings()
+
+
 class ReadyFrame(NamedTuple):
     """What is made of a frame on the way to matching it."""
 
@@ -75,12 +86,16 @@ class FrameMatcher:
 
     Parameters
     ----------
+    sweep : Sweep
+        Whose frames are not read.
+    settings : ImageSettings, optional
     curves : DecorrelationCurves, optional
         To whose depths the patches are kept, and whose dynamic range is taken where the sweep's is estimated.
 
     Attributes
     ----------
     signal : RFSettings or BModeSettings
+    quality : QualitySettings
     laid, patches : PatchGrid
         All that fit on the image, and those that are matched.
     overlaid : ndarray of bool, shape (p,)
@@ -95,42 +110,40 @@ class FrameMatcher:
     def __init__(
         self,
         sweep: Sweep,
-        intensity: IntensitySettings,
-        patches: PatchSettings,
-        inplane: InPlaneSettings,
-        matching: MatchingSettings | None = None,
-        quality: QualitySettings | None = None,
+        settings: ImageSettings | None = None,
         curves: DecorrelationCurves | None = None,
     ) -> None:
-        signal, known = sweep.signal, None if curves is None else curves.key.signal
-        if isinstance(signal, BModeSettings) and isinstance(known, BModeSettings):
-            signal = replace(known, full_scale=signal.full_scale) if signal.dynamic_range_sigma_db else signal
-        self.signal = signal
-        self.extractor = IntensityExtractor(signal, sweep.grid, intensity)
+        s, signal = settings or ImageSettings(), sweep.signal
+        reference = None if curves is None else curves.key.signal
+        if isinstance(signal, BModeSettings) and isinstance(reference, BModeSettings):
+            is_estimated = signal.dynamic_range_sigma_db > 0
+            signal = replace(reference, full_scale=signal.full_scale) if is_estimated else signal
+        self.signal, self.quality = signal, s.quality
+        self.extractor = IntensityExtractor(signal, sweep.grid, s.intensity)
         self.grid = self.extractor.grid
         self.centre_mm = sweep.grid.centre_mm
-        self.laid = lay_patches(self.grid, patches)
-        self.patches = self.laid
-        self._quality, self._least_overlap = quality, inplane.least_overlap
-        self._region = Region(patches.region).mask(self.grid) if patches.region else None
-        self._mask = self._region
+        self.patches = self.laid = lay_patches(self.grid, s.patches)
+        self._least_overlap = s.inplane.least_overlap
+        self._mask = self.laid.region
         self._standing: BoolArray | None = None
         spacing, sides = self.laid.spacing_mm, np.array([self.grid.vectors, self.grid.samples])
         self._pool = np.array([1, 2 if spacing[1] < _POOLED_BELOW_MM else 1])
-        self._reach = np.minimum(np.ceil(inplane.search_mm / (spacing * self._pool)), sides // self._pool - 1)
+        self._reach = np.minimum(
+            np.ceil(s.inplane.search_mm / (spacing * self._pool)), sides // self._pool - 1
+        )
         self._reach = self._reach.astype(np.int64)
         self._lengths = [fft.next_fast_len(int(n), True) for n in sides // self._pool + self._reach]
         rf = signal if isinstance(signal, RFSettings) else None
-        self.of_echo = rf is not None and (matching or MatchingSettings()).correlate == "echo"
+        self.of_echo = rf is not None and s.matching.correlate == "echo"
         self._wavenumber, fan = two_way_wavenumber(rf) if rf is not None else 0.0, sweep.grid.fan
         self.key = CurveKey(
             signal,
             self.grid.vector_pitch_mm,
-            patches.width_mm,
-            patches.height_mm,
-            intensity.equalise_mm,
+            s.patches.width_mm,
+            s.patches.height_mm,
+            s.intensity.equalise_mm,
             "echo" if self.of_echo else "intensity",
-            intensity.edge_fraction,
+            s.intensity.edge_fraction,
             sweep.probe,
             "parallel" if fan is None else "fan",
             0.0 if fan is None else fan.radius_mm,
@@ -155,14 +168,14 @@ class FrameMatcher:
             over[vector : vector + wide, sample : sample + high] = True
         over &= standing
         self._standing = over if over.any() else None
-        self._mask = self._region
+        self._mask = self.laid.region
         if self._standing is not None:
-            self._mask = ~over if self._region is None else self._region & ~over
+            self._mask = ~over if self._mask is None else self._mask & ~over
 
     def ready(self, samples: npt.NDArray[Any]) -> ReadyFrame:
         """Make a frame, as read, ready to be matched; on any thread."""
         echo, is_bmode = self.echo(samples), isinstance(self.signal, BModeSettings)
-        features = inspect_frame(samples, echo.intensity, self.patches, is_bmode, self._quality)
+        features = inspect_frame(samples, echo.intensity, self.patches, is_bmode, self.quality)
         features = replace(features, usable=features.usable & ~self.overlaid)
         return ReadyFrame(echo, features, self.prepare(echo, features.usable))
 

@@ -55,6 +55,8 @@ class PatchGrid:
         Patches in the region that counts.
     step_rad : float
         Angle between neighbouring vectors.
+    region : ndarray of bool, shape (vector, sample), optional
+        Samples of the image that count, where not all do.
     """
 
     first: IntArray
@@ -66,6 +68,7 @@ class PatchGrid:
     spacing_mm: FloatArray
     inside: BoolArray
     step_rad: float = 0.0
+    region: BoolArray | None = None
 
     def __len__(self) -> int:
         return int(self.first.shape[0])
@@ -143,8 +146,8 @@ def lay_patches(grid: ImageGrid, settings: PatchSettings | None = None) -> Patch
     if s.region:
         # Most of a patch must lie in the region.
         mask = Region(s.region).mask(grid)
-        patches = replace(patches, inside=patches.tiles(mask).mean(axis=(1, 2)) >= 0.5)
-    kept = np.asarray(patches.rows_of(patches.inside).any(axis=1))
-    if kept.sum() < 2:
-        raise InvalidInputError(f"region: expected two rows of patches in it, got {kept.sum()}: {s.region}")
-    return patches.with_rows(kept)
+        patches = replace(patches, region=mask, inside=patches.tiles(mask).mean(axis=(1, 2)) >= 0.5)
+    rows_inside = np.asarray(patches.rows_of(patches.inside).any(axis=1))
+    if (count := rows_inside.sum()) < 2:
+        raise InvalidInputError(f"region: expected two rows of patches in it, got {count}: {s.region}")
+    return patches.with_rows(rows_inside)

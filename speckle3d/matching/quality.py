@@ -204,6 +204,19 @@ def flag_frames(features: Sequence[FrameFeatures], settings: QualitySettings | N
     return flags
 
 
+def placed_flags(flags: IntArray, unplaced: BoolArray) -> IntArray:
+    """Flags of all frames, with those that no pair joins to earlier ones.
+
+    Raises
+    ------
+    InsufficientDataError
+        If too many frames have a flag.
+    """
+    flags = np.where(unplaced & (flags == 0), int(FrameFlag.UNMATCHED), flags)
+    require_placed(flags)
+    return flags
+
+
 def require_placed(flags: IntArray) -> None:
     """Raise `InsufficientDataError` if too many frames have a flag."""
     lost = int((flags != 0).sum())

@@ -2,16 +2,38 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import BoolArray, FloatArray
+from speckle3d.core.sweep import Sweep
+from speckle3d.motion.direction import SensorSettings, sensed_orientation
 from speckle3d.motion.estimate import Motion, solve_planes
 from speckle3d.motion.planes import pair_planes, patch_distances, raised
 
 
-def consistent_poses(motion: Motion, sensed: Rotation) -> tuple[RigidTransform, BoolArray]:
-    """Poses from the orientation-consistent patches, and each pair's patches used.
+class ConsistentPoses(NamedTuple):
+    """Poses from the orientation-consistent patches.
+
+    Attributes
+    ----------
+    poses : RigidTransform, length n, or None
+        None without a sensed orientation of every frame.
+    used : ndarray of bool, shape (e, p)
+        Patches of each pair that they come from.
+    rejected_share : float
+        Share of the measured patches that they do not come from; NaN without poses.
+    """
+
+    poses: RigidTransform | None
+    used: BoolArray
+    rejected_share: float
+
+
+def consistent_poses(motion: Motion, sweep: Sweep, settings: SensorSettings) -> ConsistentPoses:
+    """Poses from the orientation-consistent patches.
 
     Planes have the sensed orientation and go through the patches that agree with it; pairs of which too few
     do keep their own.
@@ -20,9 +42,12 @@ def consistent_poses(motion: Motion, sensed: Rotation) -> tuple[RigidTransform, 
     ----------
     motion : Motion
         Of the true sign.
-    sensed : Rotation, length n
-        Orientation of every frame.
+    sweep : Sweep
+        With the sensors that are to be used.
     """
+    sensed = sensed_orientation(sweep, settings)
+    if sensed is None:
+        return ConsistentPoses(None, motion.pairs.used, float("nan"))
     problem, table, pairs, scale = motion.problem, motion.table, motion.pairs, motion.coherence.scale
     models, correlation = motion.coherence.models(pairs.first), table.correlation[pairs.row]
     sign = np.where(pairs.offset_mm < 0, -1.0, 1.0)
@@ -39,7 +64,8 @@ def consistent_poses(motion: Motion, sensed: Rotation) -> tuple[RigidTransform, 
     planes.covariance[:] *= scale**2
     for name in ("coefficients", "covariance", "used"):
         getattr(planes, name)[~determined] = getattr(pairs, name)[~determined]
-    return solve_planes(problem, table, planes)[1].poses, planes.used
+    rejected_share = 1.0 - float(planes.used[pairs.used].mean())
+    return ConsistentPoses(solve_planes(problem, table, planes)[1].poses, planes.used, rejected_share)
 
 
 def consistent_subset(

@@ -14,8 +14,8 @@ from speckle3d.correction.drift import DriftCorrection
 from speckle3d.correction.modes import sensor_of
 from speckle3d.corrections import Correction
 from speckle3d.matching.quality import describe
-from speckle3d.pipeline import Tracked
 from speckle3d.scoring.lengths import TRACKER
+from speckle3d.tracked import Tracked
 
 
 def recorded_doubts(path: Path, provenance: Provenance) -> tuple[Doubt, ...] | None:

@@ -28,9 +28,9 @@ from speckle3d.io.curves import read_curves
 from speckle3d.io.load import load_sweep
 from speckle3d.motion.direction import settle_direction
 from speckle3d.phantom_curves import calibrate_curves
-from speckle3d.pipeline import track
 from speckle3d.scoring.lengths import accumulated, compare_modes
 from speckle3d.simulation.presets import SimulationSettings
+from speckle3d.tracking import track
 
 FIRST_SEED = 1001
 SHIPPED = Path(__file__).resolve().parents[2] / "data" / "curves.h5"

@@ -22,7 +22,7 @@ import speckle3d.motion
 from speckle3d.core.errors import Speckle3DError
 from speckle3d.io.curves import read_curves
 from speckle3d.io.load import load_sweep
-from speckle3d.pipeline import track
+from speckle3d.tracking import track
 
 SHIPPED = Path(__file__).resolve().parents[2] / "data"
 NOT_OF_THE_PATH = ("diffraction", "lens", "phantom")

@@ -11,7 +11,7 @@ from speckle3d.core.errors import MismatchError
 from speckle3d.core.streams import TimedPoses
 from speckle3d.correction.fused import fuse
 from speckle3d.correction.scale import ScaleEvidence
-from speckle3d.pipeline import track
+from speckle3d.tracking import track
 
 
 def fused(tracking, sweep, scale_sigma=0.03, **evidence):

@@ -4,9 +4,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 
 from speckle3d.core.grid import ImageGrid
 from speckle3d.core.sweep import BModeSettings, Sweep
-from speckle3d.matching.intensity import IntensitySettings
-from speckle3d.matching.matcher import FrameMatcher, InPlaneSettings
-from speckle3d.matching.patches import PatchSettings
+from speckle3d.matching.matcher import FrameMatcher
 
 PIXEL_MM = 0.05
 CURVED = ImageGrid.of_fan(193, 401, 0.08, 60.0, tuple(np.deg2rad((-25.0, 25.0))))
@@ -39,7 +37,7 @@ def test_motion_in_the_plane_of_a_fan(grid, motion):
     field, margin = speckle(grid)
     frames = np.stack([frame(grid, field, margin, each) for each in (np.zeros(3), motion)])
     sweep = Sweep(frames, grid, BModeSettings(60.0), np.arange(2.0))
-    matcher = FrameMatcher(sweep, IntensitySettings(), PatchSettings(), InPlaneSettings())
+    matcher = FrameMatcher(sweep)
     first, second = (matcher.prepare(matcher.echo(each)) for each in frames)
     match = matcher.match({0: first}, 1, second, [matcher.search(first, second)])
     # The same field is seen again: within a fifth of a sample, and no elevational motion to read.

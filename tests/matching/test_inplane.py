@@ -9,8 +9,8 @@ import pytest
 import speckle
 
 from speckle3d.core.sweep import BModeSettings, Sweep
-from speckle3d.matching.intensity import Echo, IntensitySettings, two_way_wavenumber
-from speckle3d.matching.matcher import FrameMatcher, InPlaneSettings, MatchingSettings
+from speckle3d.matching.intensity import Echo, two_way_wavenumber
+from speckle3d.matching.matcher import FrameMatcher, ImageSettings
 from speckle3d.matching.patches import PatchSettings
 
 GRID = speckle.GRID
@@ -21,8 +21,13 @@ BMODE = BModeSettings(60.0)
 
 def matcher_of(grid=GRID, signal=BMODE, patches=None, equalise_mm=0.0, correlate="echo", **inplane):
     sweep = Sweep(np.zeros((1, grid.vectors, grid.samples), np.uint8), grid, signal, np.zeros(1))
-    settings = IntensitySettings(equalise_mm=equalise_mm), patches or PatchSettings()
-    return FrameMatcher(sweep, *settings, InPlaneSettings(**inplane), MatchingSettings(correlate=correlate))
+    settings = ImageSettings(
+        intensity={"equalise_mm": equalise_mm},
+        patches=patches or PatchSettings(),
+        inplane=inplane,
+        matching={"correlate": correlate},
+    )
+    return FrameMatcher(sweep, settings)
 
 
 MATCHER = matcher_of()

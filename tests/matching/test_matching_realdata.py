@@ -7,9 +7,7 @@ import pytest
 
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.load import load_sweep
-from speckle3d.matching.intensity import IntensitySettings
-from speckle3d.matching.matcher import FrameMatcher, InPlaneSettings
-from speckle3d.matching.patches import PatchSettings
+from speckle3d.matching.matcher import FrameMatcher
 
 pytestmark = pytest.mark.realdata
 
@@ -32,7 +30,7 @@ RECORDINGS = {
 def recording(request, realdata):
     path, settings = RECORDINGS[request.param]
     sweep = load_sweep(realdata / path, settings)
-    return sweep, FrameMatcher(sweep, IntensitySettings(), PatchSettings(), InPlaneSettings())
+    return sweep, FrameMatcher(sweep)
 
 
 def ready(matcher, frame):

@@ -9,9 +9,7 @@ import speckle
 from speckle3d.core.sweep import BModeSettings, RFSettings, Sweep, read_frame
 from speckle3d.examine.curves import doubt_sign
 from speckle3d.examine.images import doubt_band, doubt_gain
-from speckle3d.matching.intensity import IntensitySettings
-from speckle3d.matching.matcher import FrameMatcher, InPlaneSettings
-from speckle3d.matching.patches import PatchSettings
+from speckle3d.matching.matcher import FrameMatcher
 from speckle3d.matching.texture import measured_texture
 
 GREY = BModeSettings(dynamic_range_db=100.0, full_scale=65535.0)
@@ -26,7 +24,7 @@ def grey_sweep(frames, grid=speckle.GRID):
 
 
 def matcher_of(sweep):
-    return FrameMatcher(sweep, IntensitySettings(), PatchSettings(), InPlaneSettings())
+    return FrameMatcher(sweep)
 
 
 def texture_of(sweep):

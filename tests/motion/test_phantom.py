@@ -12,9 +12,7 @@ from speckle3d.core.grid import ImageGrid
 from speckle3d.core.streams import TimedPoses
 from speckle3d.core.sweep import BModeSettings, Sweep, Tracker
 from speckle3d.matching.frames import match_sweep
-from speckle3d.matching.intensity import IntensitySettings
-from speckle3d.matching.matcher import FrameMatcher, InPlaneSettings
-from speckle3d.matching.patches import PatchSettings
+from speckle3d.matching.matcher import FrameMatcher
 from speckle3d.matching.schedule import KnownSchedule
 from speckle3d.motion.phantom import CurveSettings, fit_curves
 from speckle3d.phantom_curves import known_positions, phantom_pairs, phantom_samples
@@ -43,7 +41,7 @@ def phantom():
 
 
 def matcher_of(sweep):
-    return FrameMatcher(sweep, IntensitySettings(), PatchSettings(), InPlaneSettings())
+    return FrameMatcher(sweep)
 
 
 def samples_of(sweep, settings, progress=None):

@@ -136,8 +136,7 @@ class SweepPairs:
 
     @cached_property
     def _matcher(self) -> FrameMatcher:
-        c = self._config
-        matcher = FrameMatcher(self._sweep, c.intensity, c.patches, c.inplane, c.matching)
+        matcher = FrameMatcher(self._sweep, self._config)
         if self._pairs is not None:
             grid, (_, sample) = matcher.grid, matcher.grid.sample_at(self._pairs.patch_centre_mm).T
             depth_mm = np.unique(grid.first_sample_depth_mm + sample * grid.sample_spacing_mm)

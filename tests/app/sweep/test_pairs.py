@@ -18,7 +18,7 @@ def part(sweep):
 @pytest.fixture(scope="module")
 def matched(part):
     c = Config()
-    matcher = FrameMatcher(part, c.intensity, c.patches, c.inplane, c.matching)
+    matcher = FrameMatcher(part, c)
     return matcher, match_sweep(part, matcher, PairSchedule(c.trajectory)).table
 
 

@@ -9,14 +9,14 @@ from accuracy_set import INDEPENDENT
 from speckle3d.config import Config
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.examine.images import examine_echoes
-from speckle3d.examine.processing import shortening, structure_openness
 from speckle3d.io.load import load_sweep
 from speckle3d.matching.frames import match_sweep
 from speckle3d.matching.matcher import FrameMatcher
 from speckle3d.matching.schedule import PairSchedule
-from speckle3d.pipeline import track
+from speckle3d.motion.tissue import averaging_loss, structure_openness
 from speckle3d.sheet_curves import ProbeSheet, data_sheet_curves
 from speckle3d.simulation.receiver import received
+from speckle3d.tracking import track
 
 SHEET = ProbeSheet(elevation_aperture_mm=5.0, elevation_focus_mm=20.0, band_mhz=(5.0, 10.0))
 
@@ -50,19 +50,19 @@ def averaged(sweep, count):
 
 def matched(sweep):
     c, curves = Config(), data_sheet_curves(SHEET, sweep)
-    matcher = FrameMatcher(sweep, c.intensity, c.patches, c.inplane, c.matching, c.quality, curves)
-    return match_sweep(sweep, matcher, PairSchedule(c.trajectory))
+    return match_sweep(sweep, FrameMatcher(sweep, c, curves), PairSchedule(c.trajectory))
 
 
 def test_frames_of_one_moment_each_are_not_doubted(grey):
     matches = matched(grey)
-    assert shortening(matches) == 0.0
+    assert averaging_loss(matches.table, matches.features) == 0.0
     assert structure_openness(matches.texture) == 0.0
 
 
 @pytest.mark.skipif(not INDEPENDENT.is_dir(), reason="no sweeps of another physics at hand")
 def test_an_even_hand_over_tissue_is_not_doubted():
-    assert shortening(matched(b_mode(load_sweep(INDEPENDENT / "tissue_reverse.h5")))) == 0.0
+    matches = matched(b_mode(load_sweep(INDEPENDENT / "tissue_reverse.h5")))
+    assert averaging_loss(matches.table, matches.features) == 0.0
 
 
 def test_images_black_for_the_most_part_leave_lengths_open(grey):

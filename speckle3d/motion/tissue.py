@@ -1,4 +1,4 @@
-"""What a scanner makes of its echoes before they are images, and what that leaves open of a length.
+"""How a sweep's tissue, and what a scanner makes of its echoes, change the curves, and what that leaves open.
 
 Averaging of frames (persistence) widens the beam by what the probe goes meanwhile, so that lengths come out
 short. Where speckle has changed from one frame to the next, their mean varies less in grey: frames taken at
@@ -11,14 +11,20 @@ they are even about their median; where bright ones have the long tail, it is st
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 from scipy.stats import theilslopes
 
-from speckle3d.core.arrays import FloatArray
-from speckle3d.core.doubts import Doubt
-from speckle3d.matching.frames import MatchedSweep
+from speckle3d.core.arrays import BoolArray, FloatArray
+from speckle3d.core.curves import DecorrelationCurves
+from speckle3d.matching.quality import FrameFeatures
+from speckle3d.matching.table import CorrelationTable
 from speckle3d.matching.texture import Texture
+from speckle3d.motion.attenuation import Attenuation, estimate_attenuation
+from speckle3d.motion.lens import stretched
 
 SMOOTHED = 21
 """Frames over which tissue goes by: what changes more slowly is no effect of speed."""
@@ -34,8 +40,6 @@ to -1.4, half of the last frame kept -1.1 to -1.8; bone at 0.5 mm a frame -0.16.
 CONFIDENCE = 0.9
 SHORT_BY_SPREAD = 3.0
 """Length lost over what is lost of the spread: 2 to first order, simulated sweeps have 2 to 4."""
-SHORT_REFUSED = 0.03
-"""Of the length, from which averaging refuses it: the share is known to a factor of two."""
 STRUCTURE_BALANCE = 0.8
 """Ratio of the distances of the 10th and the 90th percentile of decibels from their median, below which
 structure is seen in place of speckle. Simulated speckle has 1.4 to 1.6, smoothed by 5 x 5 samples 0.85 to 1;
@@ -43,6 +47,39 @@ a sweep of muscle and bone has 0.43, and keeps half its correlation over 2.5 tim
 LEAST_BALANCE = 0.1
 """Taken where it is less: zero where a tenth of the samples and the median have one grey level, as in images
 that are black for the most part, or of four levels. Lengths are then open by a factor of 64."""
+
+
+@dataclass(frozen=True)
+class TissueCurves:
+    """Curves as a sweep's tissue reads them.
+
+    Attributes
+    ----------
+    curves : DecorrelationCurves
+    attenuation : Attenuation
+        Of the tissue over the curves' phantom.
+    structure : float
+        Logarithm of the factor by which they were stretched for structure in the place of speckle.
+    """
+
+    curves: DecorrelationCurves
+    attenuation: Attenuation
+    structure: float
+
+
+def tissue_curves(curves: DecorrelationCurves, texture: Texture, usable: BoolArray) -> TissueCurves:
+    """Stretch curves of a phantom for a sweep's attenuation and structure.
+
+    Parameters
+    ----------
+    usable : ndarray of bool, shape (n,)
+        Frames whose spectra count.
+    """
+    attenuation = estimate_attenuation(curves, texture.spectra(usable))
+    structure = 0.0 if curves.of_tissue else structure_openness(texture)
+    if structure:
+        curves = replace(stretched(curves, np.array(structure)), of_tissue=True)
+    return TissueCurves(attenuation.applied(curves), attenuation, structure)
 
 
 def structure_openness(texture: Texture) -> float:
@@ -53,29 +90,10 @@ def structure_openness(texture: Texture) -> float:
     return float(np.log(max(1.0, STRUCTURE_BALANCE / max(texture.balance(), LEAST_BALANCE))))
 
 
-def processing_doubts(structure: float, short: float) -> tuple[Doubt, ...]:
-    """What tells that images are not speckle alone, or not of one moment each."""
-    doubts = []
-    if short > 0.0:
-        evidence = (
-            "expected grey levels that vary as much at speed as at rest, got frames that are means of "
-            f"several (persistence, frame averaging): lengths come out some {short:.0%} short"
-        )
-        doubts.append(Doubt("images", "averaged frames", evidence, short > SHORT_REFUSED))
-    if structure > 0.0:
-        evidence = (
-            "expected grey levels of speckle, got those of structure, which stays alike for longer: lengths "
-            f"are open by a factor of {np.exp(2 * structure):.1f}; curves of a tracked sweep know it"
-        )
-        doubts.append(Doubt("images", "filtered images", evidence, False))
-    return tuple(doubts)
-
-
-def shortening(matches: MatchedSweep) -> float:
+def averaging_loss(table: CorrelationTable, features: Sequence[FrameFeatures]) -> float:
     """Share of the length that is lost to averaging of frames; 0 if there is none to be seen."""
-    spread = np.array([frame.grey_spread for frame in matches.features])
-    usable = np.mean([frame.usable for frame in matches.features], axis=0) >= USABLE_SHARE
-    table = matches.table
+    spread = np.array([frame.grey_spread for frame in features])
+    usable = np.mean([frame.usable for frame in features], axis=0) >= USABLE_SHARE
     last = table.second - table.first == 1
     frames = table.second[last]
     if not usable.any() or frames.size < LEAST_FRAMES or not np.isfinite(spread[:, usable]).all():
