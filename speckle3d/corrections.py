@@ -11,7 +11,7 @@ from speckle3d.correction.crossing.pair import CrossedPair
 from speckle3d.correction.drift import DriftCorrection
 from speckle3d.correction.modes import PUBLISHED, correct_mode, require_modes, sensor_of
 from speckle3d.correction.scale import FusedPoses, ScaledPoses
-from speckle3d.examine.sensors import believed, cleaned_readings, require_believed
+from speckle3d.examine.sensors import credible_sensors, repair_readings, require_credible
 from speckle3d.tracked import Tracked
 from speckle3d.tracking import require_kind
 
@@ -74,9 +74,9 @@ def correct(
     require_modes(sweep, modes, crossed is not None)
     for mode in modes:
         if mode != "fused":
-            require_believed(tracked.doubts, sensor_of(sweep, mode), f"{sweep.name}: drift mode {mode}")
+            require_credible(tracked.doubts, sensor_of(sweep, mode), f"{sweep.name}: drift mode {mode}")
     if settings.sensors.examine:
-        sweep, _ = cleaned_readings(sweep)
+        sweep, _ = repair_readings(sweep)
     found: dict[str, Correction] = {}
     for mode in modes:
         if mode in PUBLISHED:
@@ -94,7 +94,7 @@ def _fused(tracked: Tracked, sweep: Sweep, config: Config, crossed: CrossedPair 
     """Fuse with the sensors that do not contradict themselves."""
     from speckle3d.correction.fused import fuse
 
-    sweep = believed(sweep, tracked.doubts)
+    sweep = credible_sensors(sweep, tracked.doubts)
     evidence = () if crossed is None else crossed.of(sweep.frame_time_s, sweep.name).evidence
     with naming(f"{sweep.name}: drift mode fused"):
         return fuse(

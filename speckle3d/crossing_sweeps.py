@@ -14,7 +14,7 @@ from speckle3d.core.sweep import Sweep
 from speckle3d.correction.crossing.pair import CrossedPair, crossed
 from speckle3d.correction.crossing.stack import ImageStack
 from speckle3d.correction.crossing.sweep import CrossingSweep
-from speckle3d.examine.sensors import believed
+from speckle3d.examine.sensors import credible_sensors
 from speckle3d.matching.intensity import IntensityExtractor
 from speckle3d.motion.direction import sensed_orientation
 from speckle3d.tracked import Tracked
@@ -104,7 +104,7 @@ def crossing_side(sweep: Sweep, tracked: Tracked, stack: ImageStack, config: Con
         sweep.grid.centre_mm,
         tracked.scale_sigma,
         float(tracked.shared.turn_sigma_per_mm.max()),
-        sensed_orientation(believed(sweep, tracked.doubts), config.sensors),
+        sensed_orientation(credible_sensors(sweep, tracked.doubts), config.sensors),
         tracked.flags,
         sweep.frame_time_s,
     )

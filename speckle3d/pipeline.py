@@ -20,7 +20,7 @@ from speckle3d.core.sweep import BModeSettings, RFSettings, Sweep
 from speckle3d.examine.curves import examine_key
 from speckle3d.examine.disagreements import disagreements
 from speckle3d.examine.images import examine_echoes, examine_images, examine_processing
-from speckle3d.examine.sensors import examined_sensors
+from speckle3d.examine.sensors import examine_sensors
 from speckle3d.matching.frames import ImageSink, match_sweep
 from speckle3d.matching.matcher import FrameMatcher
 from speckle3d.matching.quality import placed_flags, require_placed
@@ -60,12 +60,12 @@ def track(
     motion = estimate_motion(problem, matches.table, matches.sound)
     flags = placed_flags(matches.flags, motion.unplaced)
 
-    sensors = examined_sensors(sweep, motion.poses, settings.sensors.examine)
+    sensors = examine_sensors(sweep, motion.poses, settings.sensors.examine)
     direction, source = settle_direction(
-        sensors.trusted, motion.poses, settings.sensors, sensors.turn_confirmed
+        sensors.credible, motion.poses, settings.sensors, sensors.tells_direction
     )
     motion = motion.mirrored() if direction < 0 else motion
-    subset = consistent_poses(motion, sensors.trusted, settings.sensors)
+    subset = consistent_poses(motion, sensors.credible, settings.sensors)
 
     mismatch = motion.problem.curves.mismatch(settings.curves.same_probe, tissue.attenuation.log_length_sigma)
     averaging = averaging_loss(matches.table, matches.features)
@@ -76,7 +76,7 @@ def track(
     doubts += tissue.attenuation.doubts + examine_processing(tissue.structure, averaging)
     # What structure leaves open is told by itself.
     doubts += examine_images(matches, motion, motion.claims(error)[1], curves, flags == 0)
-    doubts += sensors.doubts + disagreements(sensors.trusted, motion.poses, covariance)
+    doubts += sensors.doubts + disagreements(sensors.credible, motion.poses, covariance)
     if sink:
         sink(frame_pairs(motion, subset.used, shared.length_sigma))
     return Tracked(

@@ -101,8 +101,8 @@ class Tracked:
 
     def to_dataframe(self) -> Any:
         """Poses in mode `image` as a `pandas.DataFrame`, a row for each frame; see `pose_table`."""
-        others = {"time_s": self.frame_time_s, "flags": self.flags}
-        return pose_table(self.image, self._centre_mm, self.covariance, **others)
+        columns = {"time_s": self.frame_time_s, "flags": self.flags}
+        return pose_table(self.image, self._centre_mm, self.covariance, **columns)
 
     @property
     def _centre_mm(self) -> FloatArray:
@@ -111,19 +111,17 @@ class Tracked:
     def facts(self) -> list[tuple[str, object]]:
         """What the tracked sweep shows of itself."""
         z = self.image.translation[:, 2]
-        flagged = int(np.count_nonzero(self.flags))
+        flag_count = int(np.count_nonzero(self.flags))
+        doubts = "; ".join(f"{doubt.about}: {doubt.suspect or doubt.evidence}" for doubt in self.doubts)
         subset = "none" if self.subset is None else f"{1 - self.rejected_share:.0%} of patches agree"
         return [
-            ("frames", f"{len(self.image)}, {flagged} of them flagged"),
+            ("frames", f"{len(self.image)}, {flag_count} of them flagged"),
             ("travel", f"{np.abs(np.diff(z)).sum():.2f} mm along the image's normal, in mode image"),
             ("length error", f"{100 * self.scale_sigma:.1f} % claimed (standard deviation)"),
             ("direction", f"{self.direction:+d}, from {self.direction_from}"),
             ("subset", subset),
             ("pairs", f"{self.pairs} of frames"),
-            (
-                "doubts",
-                "; ".join(f"{each.about}: {each.suspect or each.evidence}" for each in self.doubts) or "none",
-            ),
+            ("doubts", doubts or "none"),
         ]
 
     @property

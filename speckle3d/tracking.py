@@ -100,5 +100,5 @@ def require_kind(value: Any, kind: type, name: str, made_by: str) -> None:
         If it is something else.
     """
     if not isinstance(value, kind):
-        got = type(value).__name__
-        raise InvalidInputError(f"{name}: expected a {kind.__name__}, as {made_by} gives it, got {got}")
+        kind_name = type(value).__name__
+        raise InvalidInputError(f"{name}: expected a {kind.__name__}, as {made_by} gives it, got {kind_name}")

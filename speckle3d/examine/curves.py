@@ -24,11 +24,11 @@ from speckle3d.matching.texture import Texture
 from speckle3d.motion.coherence import NOISY_GAIN, ROW_SIGMA, RowScales
 from speckle3d.motion.estimate import Motion
 
-BENT, REFUTED_BEND = 0.12, 0.25
+BEND_DOUBT, BEND_LIMIT = 0.12, 0.25
 """Standard deviation over depth of the logarithm of distances. Simulated: right curves up to 0.06 in phantom,
 tissue and noise; of a lens whose focus is 10 % off 0.11; shipped ones 10 mm too high 0.20, reversed 0.53."""
-RESIZED = {"lateral_mm": 0.13, "axial_mm": 0.3}
-REFUTED_SIZE = {"lateral_mm": 0.3, "axial_mm": 0.6}
+SIZE_DOUBT = {"lateral_mm": 0.13, "axial_mm": 0.3}
+SIZE_LIMIT = {"lateral_mm": 0.3, "axial_mm": 0.6}
 """Median over depth of the logarithm of speckle sizes over the phantom's, either sign. Simulated: lateral up
 to 0.03 in phantom, 0.10 in tissue, 0.19 to 0.31 at depths wrong by 10 mm; axial 0.08, with attenuation wrong
 by 0.3 dB/cm/MHz 0.17, with a sampling rate wrong by a factor of two 0.69."""
@@ -44,7 +44,7 @@ TILT_FACTOR = 1.4
 """Of tilt's spread over that of the curves' width, from which it is calculated when curves are measured."""
 
 
-def examine_key(curves: DecorrelationCurves, laid: PatchGrid, used: PatchGrid) -> tuple[Doubt, ...]:
+def examine_key(curves: DecorrelationCurves, all_patches: PatchGrid, patches: PatchGrid) -> tuple[Doubt, ...]:
     """Hold curves against what beams can do, and against the patches that were laid and those used.
 
     Raises
@@ -52,17 +52,17 @@ def examine_key(curves: DecorrelationCurves, laid: PatchGrid, used: PatchGrid) -
     MismatchError
         If the curves are no beam's.
     """
-    return unrefuted((doubt_depths(curves, laid, used), *doubt_widths(curves)), MismatchError)
+    return require_usable((doubt_depths(curves, all_patches, patches), *doubt_widths(curves)), MismatchError)
 
 
-def doubt_depths(curves: DecorrelationCurves, laid: PatchGrid, used: PatchGrid) -> Doubt | None:
+def doubt_depths(curves: DecorrelationCurves, all_patches: PatchGrid, patches: PatchGrid) -> Doubt | None:
     """Tell that patches were left out because the curves did not measure their depths."""
-    rows, kept = laid.row_depth_mm, used.row_depth_mm
-    if rows.size == kept.size:
+    rows, common = all_patches.row_depth_mm, patches.row_depth_mm
+    if rows.size == common.size:
         return None
     evidence = (
         f"expected patches at the curves' depths of {curves.depth_mm[0]:.1f} to {curves.depth_mm[-1]:.1f} "
-        f"mm, got {rows[0]:.1f} to {rows[-1]:.1f} mm: {rows.size - kept.size} of {rows.size} rows left out"
+        f"mm, got {rows[0]:.1f} to {rows[-1]:.1f} mm: {rows.size - common.size} of {rows.size} rows left out"
     )
     return Doubt("curves", "depths", evidence, False)
 
@@ -80,13 +80,13 @@ def doubt_widths(curves: DecorrelationCurves) -> Iterator[Doubt]:
         yield Doubt("curves", "units", evidence, True)
 
 
-def unrefuted(doubts: Iterable[Doubt | None], error: type[Speckle3DError]) -> tuple[Doubt, ...]:
+def require_usable(doubts: Iterable[Doubt | None], error: type[Speckle3DError]) -> tuple[Doubt, ...]:
     """Return doubts that leave what is doubted usable; raise `error` with the first that does not."""
-    some = tuple(doubt for doubt in doubts if doubt is not None)
-    for doubt in some:
+    actual = tuple(doubt for doubt in doubts if doubt is not None)
+    for doubt in actual:
         if doubt.refuted:
             raise error(str(doubt))
-    return some
+    return actual
 
 
 def examine_curves(texture: Texture, motion: Motion, usable: BoolArray) -> tuple[Doubt | None, ...]:
@@ -108,8 +108,8 @@ def rows_without_tilt(motion: Motion) -> RowScales | None:
     steps = np.diff(motion.path, axis=0)
     tilt_per_mm = float(steps[:, 2] @ steps[:, 0]) / max(float(steps[:, 0] @ steps[:, 0]), 1e-12)
     lever = np.median(problem.patches.rows_of(problem.levers.lever_mm), axis=-1)
-    explained = np.log(np.maximum(np.abs(1.0 + tilt_per_mm * lever), 1e-3))
-    return replace(rows, logarithm=rows.logarithm + explained - np.median(explained))
+    by_tilt = np.log(np.maximum(np.abs(1.0 + tilt_per_mm * lever), 1e-3))
+    return replace(rows, logarithm=rows.logarithm + by_tilt - np.median(by_tilt))
 
 
 def doubt_bend(rows: RowScales | None) -> Doubt | None:
@@ -129,48 +129,48 @@ def doubt_bend(rows: RowScales | None) -> Doubt | None:
 
     fit = least_squares(misfit, np.zeros(3), loss="soft_l1", f_scale=ROW_SIGMA)
     size = float(np.std(design @ fit.x))
-    if size < BENT:
+    if size < BEND_DOUBT:
         return None
     ratio = np.exp(np.nanmax(rows.logarithm) - np.nanmin(rows.logarithm))
     evidence = (
         f"expected all depths to tell the same distance, got distances at {rows.depth_mm[0]:.0f} to "
         f"{rows.depth_mm[-1]:.0f} mm that differ by a factor of {ratio:.2f} ({100 * size:.0f} % rms, at most "
-        f"{100 * BENT:.0f} expected)"
+        f"{100 * BEND_DOUBT:.0f} expected)"
     )
-    return Doubt("curves", "curves of another probe, lens or depth", evidence, size > REFUTED_BEND)
+    return Doubt("curves", "curves of another probe, lens or depth", evidence, size > BEND_LIMIT)
 
 
 def doubt_size(
-    seen: SpeckleSize, curves: DecorrelationCurves, patches: PatchGrid, left: FloatArray
+    speckle: SpeckleSize, curves: DecorrelationCurves, patches: PatchGrid, gain: FloatArray
 ) -> tuple[Doubt, ...]:
     """Doubt a sweep whose speckle is not as large as the curves' phantom's at the same depths.
 
     Parameters
     ----------
-    seen : SpeckleSize
+    speckle : SpeckleSize
         Of the rows of patches; NaN where they hold no speckle.
-    left : ndarray, shape (r,)
+    gain : ndarray, shape (r,)
         Part of the correlation of each row of patches that noise leaves.
     """
-    known = curves.at(patches.row_depth_mm).speckle
-    if known is None:
+    reference = curves.at(patches.row_depth_mm).speckle
+    if reference is None:
         return ()
     doubts = []
     for name in ("lateral_mm", "axial_mm"):
         # Noise differs from sample to sample, so that speckle under it looks finer.
-        fair = np.isfinite(getattr(seen, name)) & (left >= NOISY_GAIN)
+        fair = np.isfinite(getattr(speckle, name)) & (gain >= NOISY_GAIN)
         if fair.sum() < LEAST_ROWS:
             continue
-        own, phantom = (getattr(size, name)[fair] for size in (seen, known))
-        off = float(np.median(np.abs(np.log(own / phantom))))
-        if off > RESIZED[name]:
+        size, phantom = (getattr(source, name)[fair] for source in (speckle, reference))
+        off = float(np.median(np.abs(np.log(size / phantom))))
+        if off > SIZE_DOUBT[name]:
             evidence = (
                 f"expected {name.removesuffix('_mm')} speckle of {np.median(phantom):.3f} mm, as in the "
-                f"curves' phantom, got {np.median(own):.3f} mm ({100 * off:.0f} % off at "
+                f"curves' phantom, got {np.median(size):.3f} mm ({100 * off:.0f} % off at "
                 "the median depth)"
             )
-            refuted = bool(off > REFUTED_SIZE[name])
-            doubts.append(Doubt("curves", "another probe, depth or sampling rate", evidence, refuted))
+            is_refuted = bool(off > SIZE_LIMIT[name])
+            doubts.append(Doubt("curves", "another probe, depth or sampling rate", evidence, is_refuted))
     return tuple(doubts)
 
 

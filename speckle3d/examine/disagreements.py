@@ -43,25 +43,25 @@ def disagreements(sweep: Sweep, image: RigidTransform, covariance: FloatArray) -
     covariance : ndarray, shape (n, 6, 6)
         Claimed for them.
     """
-    found: list[Doubt] = []
+    doubts: list[Doubt] = []
     for sensor in (sweep.tracker, sweep.orientation):
         if sensor is None or sensor.sensor_from_image is None:
             continue
-        covered = np.flatnonzero(sensor.covers(sweep.frame_time_s))
-        if covered.size >= SMOOTH_FRAMES:
-            found += _compared(sensor, sweep, image[covered], covariance[covered], covered)
-    return tuple(found)
+        frames = np.flatnonzero(sensor.covers(sweep.frame_time_s))
+        if frames.size >= SMOOTH_FRAMES:
+            doubts += _doubt_sensor(sensor, sweep, image[frames], covariance[frames], frames)
+    return tuple(doubts)
 
 
-def _compared(
+def _doubt_sensor(
     sensor: OrientationSensor | Tracker,
     sweep: Sweep,
     image: RigidTransform,
     covariance: FloatArray,
-    covered: IntArray,
+    frames: IntArray,
 ) -> Iterator[Doubt]:
     centre, about = sweep.grid.centre_mm, f"images and {sensor.label}"
-    poses = rigid(sensor.world_from_image(sweep.frame_time_s[covered]))
+    poses = rigid(sensor.world_from_image(sweep.frame_time_s[frames]))
     by_images, by_sensor = _motion(image, centre), _motion(poses, centre)
     travel = np.abs(by_images[:, 2])
     unit = unit_of_length(image, sensor, poses) if isinstance(sensor, Tracker) else ""
@@ -69,18 +69,19 @@ def _compared(
     for axis, name in (2, "length"), (0, "x"), (1, "y"), (5, "roll"):
         if axis < 3 and not isinstance(sensor, Tracker):
             continue
-        own = np.hypot(np.sqrt(covariance[:, axis, axis]), SIDEWAYS * travel if axis < 2 else 0.0)
+        image_sigma = np.hypot(np.sqrt(covariance[:, axis, axis]), SIDEWAYS * travel if axis < 2 else 0.0)
         least = LEAST_SIGMA_MM if axis < 3 else LEAST_SIGMA_RAD
-        its = np.full_like(own, np.hypot(noise[int(axis > 2)] / np.sqrt(SMOOTH_FRAMES), least))
-        size = np.abs(by_images[:, axis] - by_sensor[:, axis]) / np.hypot(own, its)
+        jitter_left = noise[int(axis > 2)] / np.sqrt(SMOOTH_FRAMES)
+        sensor_sigma = np.full_like(image_sigma, np.hypot(jitter_left, least))
+        size = np.abs(by_images[:, axis] - by_sensor[:, axis]) / np.hypot(image_sigma, sensor_sigma)
         worst = int(np.argmax(travel if axis == 2 else size))
         if size[worst] > JOINT_CLAIMS or (unit and axis == 2):
             factor, mm = (1.0, "mm") if axis < 3 else (float(np.degrees(1.0)), "degrees")
-            images, other = (
+            image_words, sensor_words = (
                 f"{factor * float(path[worst, axis]):.3g} +- {1.96 * factor * float(sigma[worst]):.2g} {mm}"
-                for path, sigma in ((by_images, own), (by_sensor, its))
+                for path, sigma in ((by_images, image_sigma), (by_sensor, sensor_sigma))
             )
-            words = f"{name} {images} by the images, {other} by the {sensor.label} (95 %)"
+            words = f"{name} {image_words} by the images, {sensor_words} by the {sensor.label} (95 %)"
             yield Doubt(about, unit and f"units: {unit} for millimetres", words, False)
             return
 
@@ -91,8 +92,8 @@ def _motion(poses: RigidTransform, centre_mm: FloatArray) -> FloatArray:
     So no slow error of tilt or yaw, which images see badly, passes for one of place. Smoothed.
     """
     steps = relative_poses(poses)
-    moved = np.hstack([steps.apply(centre_mm) - centre_mm, steps.rotation.as_rotvec()])
-    path = np.concatenate([np.zeros((1, 6)), np.cumsum(moved, axis=0)])
+    motion = np.hstack([steps.apply(centre_mm) - centre_mm, steps.rotation.as_rotvec()])
+    path = np.concatenate([np.zeros((1, 6)), np.cumsum(motion, axis=0)])
     path = median_filter(path, (SMOOTH_FRAMES, 1), mode="mirror")
     return np.asarray(path - path[0])
 
@@ -106,11 +107,11 @@ def unit_of_length(image: RigidTransform, tracker: Tracker, poses: RigidTransfor
         ``world_from_image`` by the images and by the tracker.
     """
     assert tracker.sensor_from_image is not None
-    images, measured = (
+    images, by_tracker = (
         np.linalg.norm(path.translation - path.translation[0], axis=1)
         for path in (image * tracker.sensor_from_image.inv(), poses * tracker.sensor_from_image.inv())
     )
-    ratio = float((images * measured).sum() / max((images**2).sum(), LEAST_SIGMA_MM**2))
+    ratio = float((images * by_tracker).sum() / max((images**2).sum(), LEAST_SIGMA_MM**2))
     for factor, name in UNITS.items():
         for multiple, unit in (1.0 / factor, name), (factor, f"1/{factor:g} of a millimetre"):
             if 1.0 / UNIT_FACTOR < ratio / multiple < UNIT_FACTOR:
@@ -128,12 +129,13 @@ def differing_lengths(lengths: Mapping[str, tuple[float, float]]) -> tuple[Doubt
     lengths : dict of str to (float, float)
         Length of each mode and its standard deviation, mm.
     """
-    found = []
-    for (one, (first, own)), (other, (second, its)) in combinations(lengths.items(), 2):
-        if not {one, other} <= BY_IMAGES and abs(first - second) > JOINT_CLAIMS * float(np.hypot(own, its)):
+    doubts = []
+    for modes in combinations(lengths, 2):
+        (a, a_sigma), (b, b_sigma) = (lengths[mode] for mode in modes)
+        if not {*modes} <= BY_IMAGES and abs(a - b) > JOINT_CLAIMS * float(np.hypot(a_sigma, b_sigma)):
             words = (
-                f"length {first:.2f} +- {1.96 * own:.2f} mm in mode {one}, {second:.2f} +- "
-                f"{1.96 * its:.2f} mm in {other} (95 %)"
+                f"length {a:.2f} +- {1.96 * a_sigma:.2f} mm in mode {modes[0]}, {b:.2f} +- "
+                f"{1.96 * b_sigma:.2f} mm in {modes[1]} (95 %)"
             )
-            found.append(Doubt(f"modes {one} and {other}", "", words, False))
-    return tuple(found)
+            doubts.append(Doubt(f"modes {modes[0]} and {modes[1]}", "", words, False))
+    return tuple(doubts)

@@ -19,7 +19,7 @@ from speckle3d.core.doubts import Doubt
 from speckle3d.core.errors import InsufficientDataError, MismatchError
 from speckle3d.core.relative import HELD
 from speckle3d.core.sweep import RFSettings
-from speckle3d.examine.curves import examine_curves, unrefuted
+from speckle3d.examine.curves import examine_curves, require_usable
 from speckle3d.examine.sensors import runs_of
 from speckle3d.matching.frames import MatchedSweep
 from speckle3d.matching.quality import FrameFeatures
@@ -31,13 +31,13 @@ from speckle3d.motion.planes import LEAST_CORRELATION
 IMAGES = "images"
 """What all doubts of this module are about."""
 
-SHADOW_TOLD = 0.02
+SHADOW_SHARE = 0.02
 """Share of patches without an echo that is told."""
 OPEN_SHARE = 0.5
 """Standard error over length from which a length is refused; from half of it, it is flagged. Good sweeps
 claim up to 0.06, those with noise of half the signal's power 0.15."""
 
-MOST_CLIPPED = 0.2
+CLIPPING_SHARE = 0.2
 """Of the share at which a frame is saturated, in the median frame: with 0.6 a simulated B-mode sweep read
 5 % longer than with none."""
 NOISE_QUANTILE, LEAST_ECHO = 0.2, 0.05
@@ -54,7 +54,7 @@ INTENSITY_LIMITS = (0.1, 1 / 3), (0.25, 2 / 3)
 power."""
 STANDING_SIGMA = 5.0
 """Standard errors that a share must be above zero."""
-PATCH_LOST = 0.2
+CLUTTER_SHARE = 0.2
 """Share from which a patch is lost to what stands still; without, patches scatter by 0.02."""
 
 OUT_OF_TURN = 0.1
@@ -63,7 +63,7 @@ over fifty patches scatters by."""
 MOST_OUT_OF_TURN = 0.6
 """Share of such frames. A wobble of 3 Hz at 25 frames a second has a quarter of them, at its turns."""
 
-SHORT_REFUSED = 0.03
+LARGEST_AVERAGING = 0.03
 """Of the length, from which averaging refuses it: the share is known to a factor of two."""
 
 ALIKE = (0.2, 0.9)
@@ -71,11 +71,11 @@ ALIKE = (0.2, 0.9)
 WINDOW = 8
 """Frames over which distances are compared with what pairs as alike have elsewhere: a fold of the path takes
 no more. A quarter of a window on comes the next."""
-LEAST_COMPARED = 6
+LEAST_PAIRS = 6
 """Pairs that a window needs."""
 FOLD_PATCHES = 8
 """Patches from which a fold is told: a median over fewer scatters too much."""
-FOLD_FLAGGED, FOLD_REFUSED = 0.25, 0.40
+FOLD_DOUBT, FOLD_LIMIT = 0.25, 0.40
 """Mean departure over mean distance in the worst window. Of 64 small sweeps of 6 to 21 patches, those right
 to three standard errors have up to 0.18, two at three of them 0.23 and 0.24, and three that are a quarter to
 a half too short 0.41 and more; whole images have up to 0.05, with noise of a tenth of the power 0.14."""
@@ -89,7 +89,7 @@ def examine_echoes(matches: MatchedSweep) -> tuple[Doubt, ...]:
     MismatchError
         If the echoes are not of that band.
     """
-    return unrefuted((doubt_band(matches.texture), doubt_gain(matches.features)), MismatchError)
+    return require_usable((doubt_band(matches.texture), doubt_gain(matches.features)), MismatchError)
 
 
 def doubt_band(texture: Texture) -> Doubt | None:
@@ -124,7 +124,7 @@ def doubt_gain(features: Sequence[FrameFeatures]) -> Doubt | None:
     What is cut off decorrelates otherwise than in the phantom's images.
     """
     share = float(np.median([frame.clipped for frame in features]))
-    if share <= MOST_CLIPPED:
+    if share <= CLIPPING_SHARE:
         return None
     evidence = (
         f"expected hardly a sample cut off at full scale, got {share:.0%} of what makes frames saturated"
@@ -153,14 +153,14 @@ def examine_processing(structure: float, short: float) -> tuple[Doubt, ...]:
             "expected grey levels that vary as much at speed as at rest, got frames that are means of "
             f"several (persistence, frame averaging): lengths come out some {short:.0%} short"
         )
-        doubts.append(Doubt("images", "averaged frames", evidence, short > SHORT_REFUSED))
+        doubts.append(Doubt("images", "averaged frames", evidence, short > LARGEST_AVERAGING))
     if structure > 0.0:
         evidence = (
             "expected grey levels of speckle, got those of structure, which stays alike for longer: lengths "
             f"are open by a factor of {np.exp(2 * structure):.1f}; curves of a tracked sweep know it"
         )
         doubts.append(Doubt("images", "filtered images", evidence, False))
-    return unrefuted(doubts, InsufficientDataError)
+    return require_usable(doubts, InsufficientDataError)
 
 
 def examine_images(
@@ -194,23 +194,23 @@ def examine_images(
     share = texture.standing_share(far) if len(far) else np.full(inside.size, np.nan)
     share[~inside | (matches.echoless > 0.5)] = np.nan
     images = (
-        shadowed(matches.echoless[inside]),
-        interleaved(matches.table, problem.frames, problem.trajectory.least_correlation),
-        standing(share, len(far), float(np.median(curves.cells)), problem.at_patches.of_echo),
+        doubt_shadow(matches.echoless[inside]),
+        doubt_order(matches.table, problem.frames, problem.trajectory.least_correlation),
+        doubt_clutter(share, len(far), float(np.median(curves.cells)), problem.at_patches.of_echo),
     )
     path = (
-        undetermined(z_mm, np.sqrt(covariance[:, 2, 2]), float(curves.distance_mm[-1])),
-        severed(pairs.first, pairs.second, usable),
-        folded(matches.table, motion.poses, problem.patches.centre_mm, usable),
+        doubt_length(z_mm, np.sqrt(covariance[:, 2, 2]), float(curves.distance_mm[-1])),
+        doubt_connection(pairs.first, pairs.second, usable),
+        doubt_path(matches.table, motion.poses, problem.patches.centre_mm, usable),
     )
     return (
-        *unrefuted(images, InsufficientDataError),
-        *unrefuted(examine_curves(texture, motion, usable), MismatchError),
-        *unrefuted(path, InsufficientDataError),
+        *require_usable(images, InsufficientDataError),
+        *require_usable(examine_curves(texture, motion, usable), MismatchError),
+        *require_usable(path, InsufficientDataError),
     )
 
 
-def shadowed(echoless: FloatArray) -> Doubt | None:
+def doubt_shadow(echoless: FloatArray) -> Doubt | None:
     """Tell that patches without an echo were left out.
 
     Parameters
@@ -219,7 +219,7 @@ def shadowed(echoless: FloatArray) -> Doubt | None:
         Share of the frames in which each patch of the region was.
     """
     share = float(echoless.mean())
-    if share < SHADOW_TOLD:
+    if share < SHADOW_SHARE:
         return None
     evidence = (
         f"expected echoes all over the image, got none in {share:.0%} of it (shadow, noise, lost contact, or "
@@ -228,7 +228,7 @@ def shadowed(echoless: FloatArray) -> Doubt | None:
     return Doubt(IMAGES, "", evidence, False)
 
 
-def undetermined(position_mm: FloatArray, sigma_mm: FloatArray, reach_mm: float) -> Doubt | None:
+def doubt_length(position_mm: FloatArray, sigma_mm: FloatArray, reach_mm: float) -> Doubt | None:
     """Doubt a length whose standard error is a large part of itself and of what the curves measure.
 
     Parameters
@@ -239,28 +239,28 @@ def undetermined(position_mm: FloatArray, sigma_mm: FloatArray, reach_mm: float)
         Largest distance in the curves: a probe at rest is known to much less.
     """
     length, sigma = float(np.ptp(position_mm)), float(np.max(sigma_mm))
-    allowed = max(OPEN_SHARE * length, reach_mm)
-    if sigma <= allowed / 2:
+    limit = max(OPEN_SHARE * length, reach_mm)
+    if sigma <= limit / 2:
         return None
     evidence = (
-        f"expected a length known to {allowed / 2:.3g} mm, got {length:.3g} mm with a standard error of "
+        f"expected a length known to {limit / 2:.3g} mm, got {length:.3g} mm with a standard error of "
         f"{sigma:.3g} mm: the correlations do not determine it"
     )
-    return Doubt(IMAGES, "too little speckle in common", evidence, sigma > allowed)
+    return Doubt(IMAGES, "too little speckle in common", evidence, sigma > limit)
 
 
-def interleaved(table: CorrelationTable, frames: int, least_correlation: float) -> Doubt | None:
+def doubt_order(table: CorrelationTable, frames: int, least_correlation: float) -> Doubt | None:
     """Doubt a sweep whose frames resemble earlier ones more than the last: not recorded in this order."""
     last, before = np.full((2, frames), -1.0)
     lag = table.second - table.first
     for best, rows in ((last, lag == 1), (before, lag > 1)):
         np.maximum.at(best, table.second[rows], table.median[rows])
-    known = (np.minimum(last, before) >= 0.0) & ~table.unmatched(frames, least_correlation)
-    swapped = float(np.mean(before[known] > last[known] + OUT_OF_TURN)) if known.sum() > 3 else 0.0
-    if swapped <= MOST_OUT_OF_TURN:
+    whole = (np.minimum(last, before) >= 0.0) & ~table.unmatched(frames, least_correlation)
+    share = float(np.mean(before[whole] > last[whole] + OUT_OF_TURN)) if whole.sum() > 3 else 0.0
+    if share <= MOST_OUT_OF_TURN:
         return None
     evidence = (
-        f"expected frames most like the one just before, got {swapped:.0%} of them ({int(known.sum())}) more "
+        f"expected frames most like the one just before, got {share:.0%} of them ({int(whole.sum())}) more "
         "like earlier ones"
     )
     return Doubt(IMAGES, "sweeps interleaved, or frames out of order", evidence, True)
@@ -280,7 +280,7 @@ def far_apart(position_mm: FloatArray, frames: IntArray, curves: DecorrelationCu
     return np.asarray(pairs[np.abs(np.diff(position_mm[pairs], axis=1))[:, 0] >= apart_mm])
 
 
-def standing(share: FloatArray, pairs: int, cells: float, of_echo: bool = True) -> Doubt | None:
+def doubt_clutter(share: FloatArray, pairs: int, cells: float, of_echo: bool = True) -> Doubt | None:
     """Doubt images that hold the same echoes in the same place however far apart they are.
 
     Parameters
@@ -294,32 +294,32 @@ def standing(share: FloatArray, pairs: int, cells: float, of_echo: bool = True) 
     of_echo : bool
         Whether the images have phase.
     """
-    known = share[np.isfinite(share)]
-    if not known.size:
+    shares = share[np.isfinite(share)]
+    if not shares.size:
         return None
     # Each pair's coherence scatters by one over the root of twice its cells; pairs that share a frame are
     # nearly independent, and a median scatters by a quarter more than a mean.
     chance = STANDING_SIGMA * 1.25 / np.sqrt(2.0 * cells * pairs)
-    least = max(PATCH_LOST, chance)
-    median, lost = float(np.median(known)), float(np.mean(known > least))
+    least = max(CLUTTER_SHARE, chance)
+    median, clutter = float(np.median(shares)), float(np.mean(shares > least))
     # Without phase layers along the sweep stand still in some patches.
-    typical = (float(np.mean(known)) if of_echo else median), median
-    chance *= 1.25 / np.sqrt(known.size)
-    flagged, refused = (
-        size > max(limit, chance) or lost > most
+    typical = (float(np.mean(shares)) if of_echo else median), median
+    chance *= 1.25 / np.sqrt(shares.size)
+    is_doubt, is_refusal = (
+        size > max(limit, chance) or clutter > most
         for size, (limit, most) in zip(typical, ECHO_LIMITS if of_echo else INTENSITY_LIMITS, strict=True)
     )
-    if not flagged:
+    if not is_doubt:
         return None
     evidence = (
         f"expected nothing in common between frames beyond speckle's reach, got {typical[0]:.1%} of the "
         f"echo's power the same at the same place, and over {least:.0%} in "
-        f"{lost:.0%} of the patches"
+        f"{clutter:.0%} of the patches"
     )
-    return Doubt(IMAGES, "static clutter, or noise on a probe at rest", evidence, refused)
+    return Doubt(IMAGES, "static clutter, or noise on a probe at rest", evidence, is_refusal)
 
 
-def folded(
+def doubt_path(
     table: CorrelationTable, poses: RigidTransform, patch_centre_mm: FloatArray, usable: BoolArray
 ) -> Doubt | None:
     """Doubt a path on which pairs that are equally alike are not equally far apart.
@@ -339,7 +339,7 @@ def folded(
     rows = np.flatnonzero((table.median > low) & (table.median < high))
     rows = rows[usable[table.first[rows]] & usable[table.second[rows]]]
     rows = rows[np.argsort(-table.median[rows], kind="stable")]
-    if rows.size < LEAST_COMPARED or len(patch_centre_mm) < FOLD_PATCHES:
+    if rows.size < LEAST_PAIRS or len(patch_centre_mm) < FOLD_PATCHES:
         return None
     second = table.second[rows]
     # Median elevational distance of the patches between the frames of each pair.
@@ -350,22 +350,22 @@ def folded(
     worst, at = 0.0, 0
     for start in range(0, len(poses), WINDOW // 4):
         inside = (second >= start) & (second < start + WINDOW)
-        if inside.sum() >= LEAST_COMPARED:
+        if inside.sum() >= LEAST_PAIRS:
             # Where the probe rests there is no distance to compare with.
             typical = max(float(expected[inside].mean()), float(expected.mean()) / 4, 1e-9)
             departure = float(np.abs(apart - expected)[inside].mean()) / typical
             worst, at = max((worst, at), (departure, start))
-    if worst <= FOLD_FLAGGED:
+    if worst <= FOLD_DOUBT:
         return None
     evidence = (
         f"expected frames equally alike to be equally far apart, got distances {worst:.0%} off what the "
         f"sweep's other pairs have, about frame {at + WINDOW // 2}"
     )
     where = (at, min(at + WINDOW, len(poses)) - 1)
-    return Doubt(IMAGES, "direction lost, noise or clutter", evidence, worst > FOLD_REFUSED, (where,))
+    return Doubt(IMAGES, "direction lost, noise or clutter", evidence, worst > FOLD_LIMIT, (where,))
 
 
-def severed(first: IntArray, second: IntArray, usable: BoolArray) -> Doubt | None:
+def doubt_connection(first: IntArray, second: IntArray, usable: BoolArray) -> Doubt | None:
     """Doubt a sweep in pieces: frames that no pair joins to any before them, though both sides are sound.
 
     Parameters
@@ -374,12 +374,12 @@ def severed(first: IntArray, second: IntArray, usable: BoolArray) -> Doubt | Non
         Frames of the pairs that the trajectory was solved from.
     usable : ndarray of bool, shape (n,)
     """
-    joined, sound = np.zeros(usable.size, dtype=bool), np.flatnonzero(usable)
+    connection, sound = np.zeros(usable.size, dtype=bool), np.flatnonzero(usable)
     for begin, end in zip(first.tolist(), second.tolist(), strict=True):
-        joined[begin + 1 : end + 1] = True
-    joined[: sound[0] + 1] = joined[sound[-1] + 1 :] = True
+        connection[begin + 1 : end + 1] = True
+    connection[: sound[0] + 1] = connection[sound[-1] + 1 :] = True
     # Lost frames are open on both sides; one cut at each run of them.
-    cuts = [begin for begin, _ in runs_of(np.flatnonzero(~joined))]
+    cuts = [begin for begin, _ in runs_of(np.flatnonzero(~connection))]
     if not cuts:
         return None
     evidence = (

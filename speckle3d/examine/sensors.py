@@ -26,9 +26,9 @@ LONGEST_STILL_S = 0.5
 """Beyond which unchanged readings are told: loggers repeat one until the next."""
 MOST_STILL = 0.2
 """Share of the sweep over which readings that do not change at all refute a sensor."""
-MOVED_MM = 0.5
+LEAST_TRAVEL_MM = 0.5
 """By which images must have moved meanwhile: a probe may rest, and a simulated sensor have no noise."""
-SHAKING, SCRAMBLED = 1.5, 10.0
+DOUBTFUL_JITTER, ABSURD_JITTER = 1.5, 10.0
 """Jitter of a step, mm and degrees, that is told, and that refutes; of sensors in use below 0.5 and 0.3."""
 MOST_SPIKES = 0.3
 """Share of readings; with more, there is no stream that spikes stand out of."""
@@ -44,25 +44,25 @@ _STILL = 1e-9
 """Readings closer than this are the same: noise moves the last digits of any sensor that is read."""
 
 
-class ExaminedSensors(NamedTuple):
+class SensorVerdict(NamedTuple):
     """What may be used of a sweep's sensors.
 
     Attributes
     ----------
-    trusted : Sweep
+    credible : Sweep
         Without the sensors that contradict themselves.
-    turn_confirmed : bool
+    tells_direction : bool
         Whether a gyroscope or the images' roll confirm how the orientation sensor turns, without which it
         tells no sign of the motion.
     doubts : tuple of Doubt
     """
 
-    trusted: Sweep
-    turn_confirmed: bool
+    credible: Sweep
+    tells_direction: bool
     doubts: tuple[Doubt, ...]
 
 
-def examined_sensors(sweep: Sweep, image: RigidTransform, examine: bool = True) -> ExaminedSensors:
+def examine_sensors(sweep: Sweep, image: RigidTransform, examine: bool = True) -> SensorVerdict:
     """Examine the sensors of a sweep, or trust them all.
 
     Parameters
@@ -71,45 +71,45 @@ def examined_sensors(sweep: Sweep, image: RigidTransform, examine: bool = True) 
         Image-based poses, of either sign of the elevational motion: they tell whether the probe moved.
     """
     if not examine:
-        return ExaminedSensors(sweep, True, ())
-    cleaned, doubts = cleaned_readings(sweep)
-    left = believed(cleaned, doubts)
+        return SensorVerdict(sweep, True, ())
+    repaired, doubts = repair_readings(sweep)
+    left = credible_sensors(repaired, doubts)
     for sensor in (left.tracker, left.orientation):
         if sensor is not None:
-            odd = (*_frozen(sensor, sweep, image), *_shaking(sensor))
+            odd = (*_doubt_still(sensor, sweep, image), *_doubt_jitter(sensor))
             if not odd and isinstance(sensor, OrientationSensor):
                 odd = (*doubts_of_gyroscope(sensor), *doubts_of_gravity(sensor))
             doubts += odd
-    trusted = believed(left, doubts)
-    sensor, doubted = trusted.orientation, {doubt.about for doubt in doubts}
-    confirmed = sensor is not None and (
-        (sensor.gyroscope_rad_s is not None and sensor.label not in doubted)
+    credible = credible_sensors(left, doubts)
+    sensor, suspects = credible.orientation, {doubt.about for doubt in doubts}
+    tells_direction = sensor is not None and (
+        (sensor.gyroscope_rad_s is not None and sensor.label not in suspects)
         or _roll_agrees(sensor, sweep, image)
     )
-    return ExaminedSensors(trusted, confirmed, doubts)
+    return SensorVerdict(credible, tells_direction, doubts)
 
 
-def cleaned_readings(sweep: Sweep) -> tuple[Sweep, tuple[Doubt, ...]]:
+def repair_readings(sweep: Sweep) -> tuple[Sweep, tuple[Doubt, ...]]:
     """Leave out single wild readings, and count them and jumps."""
     doubts: list[Doubt] = []
     for name in ("tracker", "orientation"):
         sensor = getattr(sweep, name)
         wild = np.zeros(0, dtype=bool) if sensor is None else spikes(sensor)
         share = f"{int(wild.sum())} of {wild.size} readings jump away from those around them and back"
-        scrambled = wild.sum() > MOST_SPIKES * wild.size
-        if scrambled:
+        is_noise = wild.sum() > MOST_SPIKES * wild.size
+        if is_noise:
             doubts.append(Doubt(sensor.label, "scrambled values", f"expected a path, but {share}", True))
         elif wild.any():
             where = frames_at(sensor, np.flatnonzero(wild), sweep.frame_time_s)
             doubts.append(Doubt(sensor.label, "spikes", f"{share}, and are left out", False, where))
             sensor = without(sensor, wild)
             sweep = replace(sweep, **{name: sensor})
-        if sensor is not None and not scrambled:
-            doubts += _slips(sensor, sweep.frame_time_s)
+        if sensor is not None and not is_noise:
+            doubts += _doubt_jumps(sensor, sweep.frame_time_s)
     return sweep, tuple(doubts)
 
 
-def believed(sweep: Sweep, doubts: Iterable[Doubt]) -> Sweep:
+def credible_sensors(sweep: Sweep, doubts: Iterable[Doubt]) -> Sweep:
     """The sweep without the sensors that are refuted."""
     refuted = {doubt.about for doubt in doubts if doubt.refuted}
     return replace(
@@ -119,23 +119,23 @@ def believed(sweep: Sweep, doubts: Iterable[Doubt]) -> Sweep:
     )
 
 
-def require_believed(doubts: Iterable[Doubt], sensor: OrientationSensor | Tracker | None, where: str) -> None:
+def require_credible(doubts: Iterable[Doubt], sensor: OrientationSensor | Tracker | None, where: str) -> None:
     """Raise `MismatchError` for what rests on a sensor that is refuted."""
     for doubt in doubts:
         if sensor is not None and doubt.refuted and doubt.about == sensor.label:
             raise MismatchError(f"{where}: {doubt}; sensors.examine = false uses it as it is")
 
 
-def _shaking(sensor: OrientationSensor | Tracker) -> Iterator[Doubt]:
+def _doubt_jitter(sensor: OrientationSensor | Tracker) -> Iterator[Doubt]:
     place, turn = jitter(rigid(sensor.readings.world_from_sensor), np.zeros(3))
     # A step varies twice as much as a reading.
     size = np.sqrt(2.0) * place, np.sqrt(2.0) * np.rad2deg(turn)
-    if max(size) > SHAKING:
+    if max(size) > DOUBTFUL_JITTER:
         evidence = f"expected a steady path, got a jitter of {size[0]:.2g} mm and {size[1]:.2g} degrees"
-        yield Doubt(sensor.label, "noise or scrambled values", evidence, max(size) > SCRAMBLED)
+        yield Doubt(sensor.label, "noise or scrambled values", evidence, max(size) > ABSURD_JITTER)
 
 
-def _slips(sensor: OrientationSensor | Tracker, frame_time_s: FloatArray) -> Iterator[Doubt]:
+def _doubt_jumps(sensor: OrientationSensor | Tracker, frame_time_s: FloatArray) -> Iterator[Doubt]:
     """Readings that go on elsewhere, faster than any hand: it slipped, or a tracker found itself anew."""
     poses = rigid(sensor.readings.world_from_sensor)
     if len(poses) < 2:
@@ -149,7 +149,7 @@ def _slips(sensor: OrientationSensor | Tracker, frame_time_s: FloatArray) -> Ite
         yield Doubt(sensor.label, "slip, or readings lost and found elsewhere", evidence, False, where)
 
 
-def _frozen(sensor: OrientationSensor | Tracker, sweep: Sweep, image: RigidTransform) -> Iterator[Doubt]:
+def _doubt_still(sensor: OrientationSensor | Tracker, sweep: Sweep, image: RigidTransform) -> Iterator[Doubt]:
     """Readings that are all the same while the images move."""
     poses, read_s = rigid(sensor.readings.world_from_sensor), sensor.readings.time_s
     still = (_steps(poses[:-1], poses[1:]) < _STILL).all(axis=0)
@@ -161,25 +161,25 @@ def _frozen(sensor: OrientationSensor | Tracker, sweep: Sweep, image: RigidTrans
         return
     same_s, whole_s = float(np.ptp(time_s[during])), float(np.ptp(time_s))
     path_mm = image[during].apply(sweep.grid.centre_mm)
-    moved = float(np.linalg.norm(path_mm - path_mm[0], axis=1).max())
-    if moved > MOVED_MM and same_s > LONGEST_STILL_S:
+    travel_mm = float(np.linalg.norm(path_mm - path_mm[0], axis=1).max())
+    if travel_mm > LEAST_TRAVEL_MM and same_s > LONGEST_STILL_S:
         evidence = f"expected readings that change, got the same one for {same_s:.2f} of {whole_s:.2f} s"
         where = runs_of(np.flatnonzero(during))
         yield Doubt(sensor.label, "frozen", evidence, same_s > MOST_STILL * whole_s, where)
 
 
-ROLL_EXPLAINED = 0.6
+ROLL_SHARE = 0.6
 """Share of the variance of the images' roll that a sensor must have in common with it to confirm it."""
 
 
 def _roll_agrees(sensor: OrientationSensor, sweep: Sweep, image: RigidTransform) -> bool:
     """Whether roll, which images know well, is the sensor's."""
-    covered = np.flatnonzero(sensor.covers(sweep.frame_time_s))
-    if sensor.sensor_from_image is None or covered.size < LEAST_FRAMES:
+    frames = np.flatnonzero(sensor.covers(sweep.frame_time_s))
+    if sensor.sensor_from_image is None or frames.size < LEAST_FRAMES:
         return False
-    turned = sensor.world_from_image(sweep.frame_time_s[covered]), image[covered].rotation
-    sensed, seen = ((turns[0].inv() * turns).as_rotvec()[:, 2] for turns in turned)
-    return bool(np.var(sensed - seen) < (1.0 - ROLL_EXPLAINED) * np.var(seen))
+    rotations = sensor.world_from_image(sweep.frame_time_s[frames]), image[frames].rotation
+    sensor_roll, image_roll = ((turns[0].inv() * turns).as_rotvec()[:, 2] for turns in rotations)
+    return bool(np.var(sensor_roll - image_roll) < (1.0 - ROLL_SHARE) * np.var(image_roll))
 
 
 def rigid(samples: RigidTransform | Rotation) -> RigidTransform:
@@ -187,10 +187,10 @@ def rigid(samples: RigidTransform | Rotation) -> RigidTransform:
     return samples if isinstance(samples, RigidTransform) else RigidTransform.from_rotation(samples)
 
 
-def _steps(poses: RigidTransform, others: RigidTransform) -> FloatArray:
+def _steps(poses: RigidTransform, targets: RigidTransform) -> FloatArray:
     """Turn, rad, and distance, mm, from poses to others, shape (2, n)."""
-    moved = np.linalg.norm(others.translation - poses.translation, axis=1)
-    return np.stack([(poses.rotation.inv() * others.rotation).magnitude(), moved])
+    distance = np.linalg.norm(targets.translation - poses.translation, axis=1)
+    return np.stack([(poses.rotation.inv() * targets.rotation).magnitude(), distance])
 
 
 def spikes(sensor: OrientationSensor | Tracker) -> BoolArray:
@@ -229,7 +229,7 @@ def jitter(poses: RigidTransform, at_mm: FloatArray) -> tuple[float, float]:
     turns = (poses.rotation.mean().inv() * poses.rotation).as_rotvec()
     # A second difference of white noise varies six times as much.
     second = (np.diff(values, 2, axis=0) / np.sqrt(6.0) for values in (poses.apply(at_mm), turns))
-    place, turn = (max(robust_sigma(column) for column in each.T) for each in second)
+    place, turn = (max(robust_sigma(column) for column in component.T) for component in second)
     return place, turn
 
 
@@ -246,6 +246,6 @@ def runs_of(frames: IntArray) -> tuple[tuple[int, int], ...]:
     >>> runs_of(np.array([7, 3, 4, 4]))
     ((3, 4), (7, 7))
     """
-    ordered = np.unique(frames)
-    runs = np.split(ordered, np.flatnonzero(np.diff(ordered) > 1) + 1)
+    numbers = np.unique(frames)
+    runs = np.split(numbers, np.flatnonzero(np.diff(numbers) > 1) + 1)
     return tuple((int(run[0]), int(run[-1])) for run in runs if run.size)

@@ -26,37 +26,37 @@ class PathRules(NamedTuple):
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
 def _agree(
-    place: FloatArray, other: FloatArray, moved: FloatArray, weight: FloatArray
+    place: FloatArray, reference: FloatArray, move: FloatArray, weight: FloatArray
 ) -> tuple[float, float]:
     """Squared deviation of a frame's place against another from an unsigned plane, and the likelier sign."""
-    z, slope = place[0] - other[0], place[1] - other[1]
-    u, v = z - moved[0], slope - moved[1]
+    z, slope = place[0] - reference[0], place[1] - reference[1]
+    u, v = z - move[0], slope - move[1]
     plus = weight[0] * u * u + 2.0 * weight[1] * u * v + weight[2] * v * v
-    u, v = z + moved[0], slope + moved[1]
+    u, v = z + move[0], slope + move[1]
     minus = weight[0] * u * u + 2.0 * weight[1] * u * v + weight[2] * v * v
     return (plus, 1.0) if plus <= minus else (minus, -1.0)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
-def _invert(covariance: FloatArray, moved: FloatArray, rules: PathRules, weight: FloatArray) -> None:
+def _invert(covariance: FloatArray, move: FloatArray, rules: PathRules, weight: FloatArray) -> None:
     """Fill the three numbers of a pair's inverse covariance."""
-    a = rules.placed * covariance[0, 0] + (rules.relative_error * moved[0]) ** 2
+    a = rules.placed * covariance[0, 0] + (rules.relative_error * move[0]) ** 2
     b = rules.placed * covariance[0, 1]
-    c = rules.placed * covariance[1, 1] + (rules.relative_error * moved[1]) ** 2
+    c = rules.placed * covariance[1, 1] + (rules.relative_error * move[1]) ** 2
     determinant = a * c - b * b
     weight[0], weight[1], weight[2] = c / determinant, -b / determinant, a / determinant
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
 def _refine(
-    place: FloatArray, earlier: FloatArray, moved: FloatArray, weight: FloatArray, cap: float
+    place: FloatArray, earlier: FloatArray, moves: FloatArray, weight: FloatArray, cap: float
 ) -> None:
     """Move a place to the weighted mean of where the pairs that agree with it put the frame."""
     w00 = w01 = w11 = u0 = u1 = 0.0
-    for e in range(len(moved)):
-        misfit, sign = _agree(place, earlier[e], moved[e], weight[e])
+    for e in range(len(moves)):
+        misfit, sign = _agree(place, earlier[e], moves[e], weight[e])
         if misfit < cap:
-            z, slope = earlier[e, 0] + sign * moved[e, 0], earlier[e, 1] + sign * moved[e, 1]
+            z, slope = earlier[e, 0] + sign * moves[e, 0], earlier[e, 1] + sign * moves[e, 1]
             w00 += weight[e, 0]
             w01 += weight[e, 1]
             w11 += weight[e, 2]
@@ -69,7 +69,7 @@ def _refine(
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
-def _followed(trend: float, step: float, trend_mm: float) -> float:
+def _next_trend(trend: float, step: float, trend_mm: float) -> float:
     """Direction of a path after a step: averaged over travel and not time, so that a pause keeps it."""
     return float(trend + (1.0 - np.exp(-abs(step) / trend_mm)) * (np.sign(step) - trend))
 
@@ -78,13 +78,13 @@ def _followed(trend: float, step: float, trend_mm: float) -> float:
 def follow_paths(
     start: IntArray,
     first: IntArray,
-    moved: FloatArray,
+    moves: FloatArray,
     covariance: FloatArray,
     unlike_start: IntArray,
     unlike: IntArray,
     rules: PathRules,
     best: FloatArray,
-    known: int = 1,
+    placed_frames: int = 1,
 ) -> None:
     """Place frame after frame by its pairs with earlier ones, on the likeliest paths.
 
@@ -94,7 +94,7 @@ def follow_paths(
         Pairs of frame f are ``start[f]`` to ``start[f + 1]``.
     first : int64, shape (e,)
         Earlier frame of each pair.
-    moved : float64, shape (e, 2)
+    moves : float64, shape (e, 2)
         Unsigned offset and slope, whose signs belong together.
     covariance : float64, shape (e, 2, 2)
     unlike_start, unlike : int64, shape (n + 1,) and (u,)
@@ -103,43 +103,43 @@ def follow_paths(
     best : float64, shape (n, 2)
         Receives position and slope of every frame on the path of least cost. Frames that no pair places stay
         where the one before them is.
-    known : int
+    placed_frames : int
         So many frames at the beginning are in `best` already, and stay.
     """
     count, frames = rules.hypotheses, start.size - 1
     paths, cost, trend = np.zeros((count, frames, 2)), np.zeros(count), np.ones(count)
     parent, new_cost, new_trend = np.zeros(count, np.int64), np.zeros(count), np.zeros(count)
     places = np.zeros((count, 2))
-    paths[0, :known] = best[:known]
-    for f in range(1, known):
-        trend[0] = _followed(trend[0], best[f, 0] - best[f - 1, 0], rules.trend_mm)
-    kept, moving = 1, False
-    for f in range(known, frames):
+    paths[0, :placed_frames] = best[:placed_frames]
+    for f in range(1, placed_frames):
+        trend[0] = _next_trend(trend[0], best[f, 0] - best[f - 1, 0], rules.trend_mm)
+    survivors, moving = 1, False
+    for f in range(placed_frames, frames):
         pairs = start[f + 1] - start[f]
         if pairs == 0:
-            paths[:kept, f] = paths[:kept, f - 1]
+            paths[:survivors, f] = paths[:survivors, f - 1]
             continue
-        earlier, moves = first[start[f] : start[f + 1]], moved[start[f] : start[f + 1]]
+        earlier, steps = first[start[f] : start[f + 1]], moves[start[f] : start[f + 1]]
         weight, latest = np.empty((pairs, 3)), np.argmax(earlier)
         for e in range(pairs):
-            _invert(covariance[start[f] + e], moves[e], rules, weight[e])
-        moving = moving or bool(np.any(paths[:kept, f - 1] != 0.0))
-        candidates, total = np.empty((2 * pairs * kept, 2)), np.empty(2 * pairs * kept)
+            _invert(covariance[start[f] + e], steps[e], rules, weight[e])
+        moving = moving or bool(np.any(paths[:survivors, f - 1] != 0.0))
+        candidates, total = np.empty((2 * pairs * survivors, 2)), np.empty(2 * pairs * survivors)
         for n in range(total.size):
             h, e, side = n // (2 * pairs), n % pairs, 1.0 if n // pairs % 2 == 0 else -1.0
             for k in range(2):
-                candidates[n, k] = paths[h, earlier[e], k] + side * moves[e, k]
+                candidates[n, k] = paths[h, earlier[e], k] + side * steps[e, k]
             total[n] = cost[h]
             for i in range(pairs):
                 total[n] += min(
-                    _agree(candidates[n], paths[h, earlier[i]], moves[i], weight[i])[0], rules.cap
+                    _agree(candidates[n], paths[h, earlier[i]], steps[i], weight[i])[0], rules.cap
                 )
             if (candidates[n, 0] - paths[h, earlier[latest], 0]) * trend[h] < 0.0:
                 total[n] += rules.turning_cost
-            for other in unlike[unlike_start[f] : unlike_start[f + 1]]:
-                off = abs(candidates[n, 0] - paths[h, other, 0])
-                turned = abs(candidates[n, 1] - paths[h, other, 1])
-                if off < rules.apart_mm and turned < rules.apart_slope:
+            for stranger in unlike[unlike_start[f] : unlike_start[f + 1]]:
+                off = abs(candidates[n, 0] - paths[h, stranger, 0])
+                tilt = abs(candidates[n, 1] - paths[h, stranger, 1])
+                if off < rules.apart_mm and tilt < rules.apart_slope:
                     total[n] += rules.cap
             if not moving and candidates[n, 0] < 0.0:
                 # The overall sign is open: of two mirror images one is enough.
@@ -150,22 +150,22 @@ def follow_paths(
             if size == count or not np.isfinite(total[n]):
                 break
             h, place = n // (2 * pairs), candidates[n]
-            _refine(place, paths[h][earlier], moves, weight, rules.cap)
-            same = False
+            _refine(place, paths[h][earlier], steps, weight, rules.cap)
+            is_duplicate = False
             for g in range(size):
                 off = abs(places[g, 0] - place[0])
                 for e in range(pairs):
                     off = max(off, abs(paths[parent[g], earlier[e], 0] - paths[h, earlier[e], 0]))
-                same = same or off < rules.same_mm
-            if not same:
+                is_duplicate = is_duplicate or off < rules.same_mm
+            if not is_duplicate:
                 places[size], parent[size], new_cost[size] = place, h, total[n]
                 step = place[0] - paths[h, earlier[latest], 0]
-                new_trend[size] = _followed(trend[h], step, rules.trend_mm)
+                new_trend[size] = _next_trend(trend[h], step, rules.trend_mm)
                 size += 1
             total[n] = np.inf
         if size:
             paths[:size, :f] = paths[parent[:size], :f]
             paths[:size, f] = places[:size]
             trend[:size], cost[:size] = new_trend[:size], new_cost[:size] - new_cost[:size].min()
-            kept = size
-    best[:] = paths[np.argmin(cost[:kept])]
+            survivors = size
+    best[:] = paths[np.argmin(cost[:survivors])]

@@ -18,7 +18,7 @@ from speckle3d.matching.schedule import KnownSchedule, PairSchedule
 from speckle3d.matching.table import CorrelationTable
 from speckle3d.matching.texture import FRAMES, Texture, spread_frames
 
-SEARCHED = 3
+SEARCHES = 3
 """References against which the in-plane motion of a frame is searched, if it resembles none before: the last
 sound frame may show other tissue, or be the first of the sweep, and without an echo."""
 
@@ -131,7 +131,7 @@ class FrameByFrame:
         self._motion[number] = self._motion.get(number - 1, np.zeros(3))
         fixed = {first: self._frames[first] for first in sorted(references)}
         table = self._matcher.match({}, number, frame, [])
-        for anchor in references[:SEARCHED]:
+        for anchor in references[:SEARCHES]:
             motion = compose(self._motion[anchor], self._matcher.search(fixed[anchor], frame))
             starts = [compose(inverse(self._motion[first]), motion) for first in fixed]
             table = self._matcher.match(fixed, number, frame, starts)

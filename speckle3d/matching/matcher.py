@@ -204,14 +204,14 @@ class FrameMatcher:
             Patches that may be matched; by default all in the region.
         """
         image, parts = self.equalised(echo)
-        kept = self.patches.inside if usable is None else self.patches.inside & usable
+        matched_patches = self.patches.inside if usable is None else self.patches.inside & usable
         # Only what lies in the region and moves is searched for.
-        searched = image if self._mask is None else np.where(self._mask, image, image[self._mask].mean())
+        moving = image if self._mask is None else np.where(self._mask, image, image[self._mask].mean())
         if self._pool[1] == 2:
-            even = searched.shape[1] // 2 * 2
-            searched = searched[:, 0:even:2] + searched[:, 1:even:2]
-        spectrum = fft.rfft2(searched - searched.mean(), self._lengths)
-        return Frame(kept, image, parts, spectrum)
+            even = moving.shape[1] // 2 * 2
+            moving = moving[:, 0:even:2] + moving[:, 1:even:2]
+        spectrum = fft.rfft2(moving - moving.mean(), self._lengths)
+        return Frame(matched_patches, image, parts, spectrum)
 
     def search(self, fixed: Frame, moving: Frame) -> FloatArray:
         """In-plane motion (x, y, roll) to the nearest sample, by the correlation of whole frames."""
@@ -263,10 +263,10 @@ class FrameMatcher:
         return CorrelationTable(first, np.full(count, number), correlation, *matches[1:])
 
 
-def compose(first: FloatArray, then: FloatArray) -> FloatArray:
+def compose(first: FloatArray, second: FloatArray) -> FloatArray:
     """In-plane motion (x, y, roll) over two steps, as a start for matching across both."""
-    place = complex(*first[:2]) + np.exp(1j * first[2]) * complex(*then[:2])
-    return np.array([place.real, place.imag, first[2] + then[2]])
+    place = complex(*first[:2]) + np.exp(1j * first[2]) * complex(*second[:2])
+    return np.array([place.real, place.imag, first[2] + second[2]])
 
 
 def inverse(motion: FloatArray) -> FloatArray:

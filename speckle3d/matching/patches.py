@@ -98,20 +98,20 @@ class PatchGrid:
         """
         rows, half = self.row_depth_mm, float(self.size[1] * self.spacing_mm[1]) / 2
         low, high = float(depth_mm[0]), float(depth_mm[-1])
-        kept = (rows >= low - half) & (rows <= high + half)
-        if kept.sum() < max(2, rows.size / 2):
+        inside = (rows >= low - half) & (rows <= high + half)
+        if inside.sum() < max(2, rows.size / 2):
             raise MismatchError(
                 f"the curves do not match the sweep: expected patches at the curves' depths of {low:.1f} to "
-                f"{high:.1f} mm, got {rows[0]:.1f} to {rows[-1]:.1f} mm, {kept.sum()} of {rows.size} rows "
+                f"{high:.1f} mm, got {rows[0]:.1f} to {rows[-1]:.1f} mm, {inside.sum()} of {rows.size} rows "
                 "between them"
             )
-        return self.with_rows(kept)
+        return self.with_rows(inside)
 
-    def with_rows(self, kept: BoolArray) -> PatchGrid:
+    def with_rows(self, rows: BoolArray) -> PatchGrid:
         """Keep some of the rows, shape (r,)."""
-        chosen = np.isin(self.depth_mm, self.row_depth_mm[kept])
+        patches = np.isin(self.depth_mm, self.row_depth_mm[rows])
         names = ("first", "centre_mm", "depth_mm", "angle_rad", "pitch_mm", "inside")
-        return replace(self, **{name: getattr(self, name)[chosen] for name in names})
+        return replace(self, **{name: getattr(self, name)[patches] for name in names})
 
 
 def lay_patches(grid: ImageGrid, settings: PatchSettings | None = None) -> PatchGrid:

@@ -35,10 +35,10 @@ _CONSTANT = 1e-4
 _SAMPLES = 40
 """Samples in depth of which a patch's statistics are taken at least, where it has more: speckle has four."""
 
-MOST_LOST = 0.3
+LARGEST_LOSS = 0.3
 """Share of frames that may not be placed; with more, lengths are mostly guesses."""
 
-_LISTED = 8
+_LONGEST_LIST = 8
 """Frames named in a line of `describe`."""
 
 
@@ -140,7 +140,7 @@ def inspect_frame(
         On the grid of the intensity images.
     """
     s = settings or QualitySettings()
-    inside, statistics, clipped = patches.inside, np.empty((len(patches), 5)), _clipped(frame, is_bmode, s)
+    inside, statistics, clipping = patches.inside, np.empty((len(patches), 5)), _clipping(frame, is_bmode, s)
     step = max(1, int(patches.size[1]) // _SAMPLES)
     patch_statistics(intensity, patches.first, patches.size, step, statistics)
     mean, contrast, alike, across, along = statistics.T
@@ -150,10 +150,10 @@ def inspect_frame(
     fine = (across < s.halves_correlation) & (along < s.halves_correlation)
     varies = patches.rows_of(contrast > _CONSTANT)
     live = varies.any(axis=0) | ~varies.any()
-    counted = inside & np.repeat(live, len(varies))
+    countable = inside & np.repeat(live, len(varies))
 
-    def share(chosen: BoolArray) -> float:
-        return float((echo & chosen & counted).sum() / max(int(counted.sum()), 1))
+    def share(mask: BoolArray) -> float:
+        return float((echo & mask & countable).sum() / max(int(countable.sum()), 1))
 
     usable, spread = echo & together & inside, np.full(len(patches), np.nan)
     if is_bmode:
@@ -161,10 +161,10 @@ def inspect_frame(
         patch_statistics(np.asarray(frame, dtype=np.float32), patches.first, patches.size, 4 * step, grey)
         with np.errstate(divide="ignore", invalid="ignore"):  # Black patches have none.
             spread = np.log(grey[:, 0] * grey[:, 1])
-    return FrameFeatures(mean, clipped, share(together & fine), share(~together), spread, usable)
+    return FrameFeatures(mean, clipping, share(together & fine), share(~together), spread, usable)
 
 
-def _clipped(frame: npt.NDArray[Any], is_bmode: bool, settings: QualitySettings) -> float:
+def _clipping(frame: npt.NDArray[Any], is_bmode: bool, settings: QualitySettings) -> float:
     """Share of samples at a frame's extremes over its limit; a constant frame has none."""
     samples = np.ascontiguousarray(frame)
     if np.iscomplexobj(samples):
@@ -172,10 +172,10 @@ def _clipped(frame: npt.NDArray[Any], is_bmode: bool, settings: QualitySettings)
     low, high = samples.min(), samples.max()
     if low == high:
         return 0.0
-    clipped = np.count_nonzero(samples == high)
+    count = np.count_nonzero(samples == high)
     if is_bmode:  # Black is no echo: it is neither clipped nor counted.
-        return clipped / np.count_nonzero(samples) / settings.clipped_bmode
-    return (clipped + np.count_nonzero(samples == low)) / samples.size / settings.clipped_rf
+        return count / np.count_nonzero(samples) / settings.clipped_bmode
+    return (count + np.count_nonzero(samples == low)) / samples.size / settings.clipped_rf
 
 
 def flag_frames(features: Sequence[FrameFeatures], settings: QualitySettings | None = None) -> IntArray:
@@ -193,8 +193,8 @@ def flag_frames(features: Sequence[FrameFeatures], settings: QualitySettings | N
     """
     s = settings or QualitySettings()
     flags = np.zeros(len(features), dtype=np.int64)
-    repeated = [np.array_equal(frame.mean, before.mean, True) for before, frame in pairwise(features)]
-    flags[1:][repeated] |= FrameFlag.FROZEN
+    repeats = [np.array_equal(frame.mean, before.mean, True) for before, frame in pairwise(features)]
+    flags[1:][repeats] |= FrameFlag.FROZEN
     for k, frame in enumerate(features):
         if frame.clipped >= 1:
             flags[k] |= FrameFlag.SATURATED
@@ -204,7 +204,7 @@ def flag_frames(features: Sequence[FrameFeatures], settings: QualitySettings | N
     return flags
 
 
-def placed_flags(flags: IntArray, unplaced: BoolArray) -> IntArray:
+def placed_flags(flags: IntArray, loose: BoolArray) -> IntArray:
     """Flags of all frames, with those that no pair joins to earlier ones.
 
     Raises
@@ -212,17 +212,17 @@ def placed_flags(flags: IntArray, unplaced: BoolArray) -> IntArray:
     InsufficientDataError
         If too many frames have a flag.
     """
-    flags = np.where(unplaced & (flags == 0), int(FrameFlag.UNMATCHED), flags)
+    flags = np.where(loose & (flags == 0), int(FrameFlag.UNMATCHED), flags)
     require_placed(flags)
     return flags
 
 
 def require_placed(flags: IntArray) -> None:
     """Raise `InsufficientDataError` if too many frames have a flag."""
-    lost = int((flags != 0).sum())
-    if lost > MOST_LOST * len(flags):
+    count = int((flags != 0).sum())
+    if count > LARGEST_LOSS * len(flags):
         raise InsufficientDataError(
-            f"expected frames with speckle in common, got {lost} of {len(flags)} that cannot be placed: "
+            f"expected frames with speckle in common, got {count} of {len(flags)} that cannot be placed: "
             f"{'; '.join(describe(flags))}"
         )
 
@@ -234,7 +234,7 @@ def describe(flags: npt.ArrayLike) -> list[str]:
     for flag, words in _WORDS.items():
         frames = np.flatnonzero(values & int(flag)).tolist()
         if frames:
-            more = f" and {len(frames) - _LISTED} more" if len(frames) > _LISTED else ""
-            named = ", ".join(map(str, frames[:_LISTED]))
-            lines.append(f"{len(frames)} frame{'s' * (len(frames) > 1)} {words}: {named}{more}")
+            rest_words = f" and {len(frames) - _LONGEST_LIST} more" if len(frames) > _LONGEST_LIST else ""
+            numbers = ", ".join(map(str, frames[:_LONGEST_LIST]))
+            lines.append(f"{len(frames)} frame{'s' * (len(frames) > 1)} {words}: {numbers}{rest_words}")
     return lines

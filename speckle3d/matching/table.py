@@ -52,9 +52,9 @@ class CorrelationTable:
         """The same pairs without the correlations of some patches."""
         return replace(self, correlation=np.where(usable, self.correlation, np.float32(np.nan)))
 
-    def where(self, kept: BoolArray, shift: int = 0) -> CorrelationTable:
+    def where(self, rows: BoolArray, shift: int = 0) -> CorrelationTable:
         """Some of the pairs, their frames numbered `shift` higher."""
-        table = CorrelationTable(*(column[kept] for column in self._columns))
+        table = CorrelationTable(*(column[rows] for column in self._columns))
         return replace(table, first=table.first + shift, second=table.second + shift)
 
     @classmethod

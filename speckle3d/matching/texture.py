@@ -74,23 +74,23 @@ class Texture:
         """Measure the usable patches of one frame, on any thread."""
         echo, usable, patches = ready.echo, ready.features.usable, self._patches
         images = echo.intensity, ready.frame.echo if ready.frame.echo.size else ready.frame.image
-        intensity, equalised = map(patches.tiles, images)
+        intensity, local_tiles = map(patches.tiles, images)
         tiles = None if echo.analytic is None else patches.tiles(echo.analytic)
-        power, level, sampled = np.zeros((0, len(patches))), np.zeros((3, 0)), np.zeros(0)
+        power, level, sample_power = np.zeros((0, len(patches))), np.zeros((3, 0)), np.zeros(0)
         if isinstance(self.signal, RFSettings):
             # A vector of each column of patches; frames that are not finite are flagged.
-            some = np.nan_to_num(samples[np.unique(patches.first[:, 0])], posinf=0.0, neginf=0.0)
+            vectors = np.nan_to_num(samples[np.unique(patches.first[:, 0])], posinf=0.0, neginf=0.0)
             segment = min(SEGMENT, samples.shape[1])
-            spectra = welch(some, nperseg=segment, return_onesided=False, detrend=False)[1]
-            sampled = spectra.mean(axis=0)
+            spectra = welch(vectors, nperseg=segment, return_onesided=False, detrend=False)[1]
+            sample_power = spectra.mean(axis=0)
         if tiles is not None:
             power = _powers(tiles)
         elif usable.any():
-            some = intensity[usable, :, ::4].reshape(int(usable.sum()), -1)
-            level = np.log(np.percentile(some, [10, 50, 90], axis=1))
+            thinned = intensity[usable, :, ::4].reshape(int(usable.sum()), -1)
+            level = np.log(np.percentile(thinned, [10, 50, 90], axis=1))
         size = _sizes(intensity, patches.spacing_mm)
         size, power = (np.where(usable, values, np.nan) for values in (size, power))
-        self._looks[number] = _Look(size, power, level, sampled, _unit_echoes(equalised))
+        self._looks[number] = _Look(size, power, level, sample_power, _unit_echoes(local_tiles))
 
     @property
     def frames(self) -> IntArray:
@@ -111,9 +111,9 @@ class Texture:
             Of shape (r,); NaN where too few patches hold fully developed speckle.
         """
         rows = np.moveaxis(self._rows("size", usable), 0, -1)
-        known = np.isfinite(rows).sum(axis=(2, 3)) >= LEAST_PATCHES
-        size = np.full(known.shape, np.nan)
-        size[known] = np.nanmedian(rows[known], axis=(1, 2))
+        measured_rows = np.isfinite(rows).sum(axis=(2, 3)) >= LEAST_PATCHES
+        size = np.full(measured_rows.shape, np.nan)
+        size[measured_rows] = np.nanmedian(rows[measured_rows], axis=(1, 2))
         return SpeckleSize(*size)
 
     def balance(self) -> float:
@@ -133,18 +133,18 @@ class Texture:
         if not (self._of_echo and isinstance(self.signal, RFSettings)):
             return None
         rows = self._rows("power", usable)
-        seen = np.isfinite(rows).any(axis=(0, 1, 3))
-        if not seen.any():
+        rows_seen = np.isfinite(rows).any(axis=(0, 1, 3))
+        if not rows_seen.any():
             return None
-        power = np.nanmean(rows[:, :, seen], axis=(0, 3)).T
+        power = np.nanmean(rows[:, :, rows_seen], axis=(0, 3)).T
         rate_hz = 1e3 * self.signal.speed_of_sound_m_s / (2.0 * self._patches.spacing_mm[1])
         low, high = self.signal.bandwidth_hz
         # The band's centre was shifted to zero.
         frequency = fft.fftfreq(power.shape[1], 1.0 / rate_hz) + (low + high) / 2.0
         edge = self._edge_fraction * (high - low)
         rising = np.argsort(frequency)
-        kept = rising[(frequency[rising] > low - edge) & (frequency[rising] < high + edge)]
-        return EchoSpectra(self._patches.row_depth_mm[seen], frequency[kept], power[:, kept])
+        band = rising[(frequency[rising] > low - edge) & (frequency[rising] < high + edge)]
+        return EchoSpectra(self._patches.row_depth_mm[rows_seen], frequency[band], power[:, band])
 
     def sample_spectrum(self) -> tuple[FloatArray, FloatArray] | None:
         """Frequencies, Hz, increasing, and the power of the samples as read; None of grey levels."""
@@ -179,8 +179,8 @@ class Texture:
         """
         frames, at = np.unique(pairs, return_inverse=True)
         echoes = np.stack([self._looks[k].echo for k in frames.tolist()], axis=1)
-        shared = echoes @ echoes.transpose(0, 2, 1)
-        return np.asarray(np.median(shared[:, *at.reshape(-1, 2).T], axis=1), dtype=float)
+        common = echoes @ echoes.transpose(0, 2, 1)
+        return np.asarray(np.median(common[:, *at.reshape(-1, 2).T], axis=1), dtype=float)
 
     def _rows(self, name: str, usable: BoolArray | None) -> FloatArray:
         """Values of the usable frames, or of all if none is, by rows and columns, shape (n, k, r, c)."""
@@ -203,7 +203,7 @@ def mean_spectra(spectra: Sequence[EchoSpectra]) -> EchoSpectra | None:
     if not spectra:
         return None
     first = spectra[0]
-    power = np.mean([each.at(first.depth_mm, first.frequency_hz) for each in spectra], axis=0)
+    power = np.mean([spectrum.at(first.depth_mm, first.frequency_hz) for spectrum in spectra], axis=0)
     return EchoSpectra(first.depth_mm, first.frequency_hz, power)
 
 
@@ -235,10 +235,10 @@ def _sizes(intensity: Float32Array, spacing_mm: FloatArray) -> FloatArray:
     return np.where(fair, size, np.nan)
 
 
-def _unit_echoes(equalised: Float32Array) -> Float32Array:
+def _unit_echoes(tiles: Float32Array) -> Float32Array:
     """Echo of each patch, shape (p, 2, v, s), or intensity less the mean, of unit power, shape (p, k)."""
-    echoes = equalised.reshape(len(equalised), -1)
-    if equalised.ndim == 3:
+    echoes = tiles.reshape(len(tiles), -1)
+    if tiles.ndim == 3:
         echoes = echoes - echoes.mean(axis=1, keepdims=True)
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.asarray(echoes / np.linalg.norm(echoes, axis=1, keepdims=True))

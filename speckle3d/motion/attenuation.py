@@ -90,12 +90,12 @@ class Attenuation:
 
     def applied(self, curves: DecorrelationCurves) -> DecorrelationCurves:
         """Curves of the phantom, stretched for the tissue, and its spectrum with the tissue's attenuation."""
-        known = curves.spectrum
-        if known is None or not self.log_stretch.any():
+        old = curves.spectrum
+        if old is None or not self.log_stretch.any():
             return curves
-        power = _attenuated(known.power, known.depth_mm, 1e-6 * known.frequency_hz, self.difference_db_cm_mhz)
+        power = _attenuate(old.power, old.depth_mm, 1e-6 * old.frequency_hz, self.difference_db_cm_mhz)
         wider = stretched(curves, np.interp(curves.depth_mm, self.depth_mm, self.log_stretch))
-        return replace(wider, spectrum=replace(known, power=power))
+        return replace(wider, spectrum=replace(old, power=power))
 
 
 def estimate_attenuation(curves: DecorrelationCurves, spectra: EchoSpectra | None) -> Attenuation:
@@ -125,8 +125,8 @@ def estimate_attenuation(curves: DecorrelationCurves, spectra: EchoSpectra | Non
     beta, error, shift, gain = _difference(exponent, sigma, per_unit)
     if gain > OTHER_BAND:
         return replace(unknown, doubts=(_other_band(shift, middle),))
-    attenuated = _attenuated(phantom, spectra.depth_mm, frequency_mhz, beta)
-    square = [(each @ frequency_mhz**2) / each.sum(axis=1) for each in (phantom, attenuated)]
+    of_tissue = _attenuate(phantom, spectra.depth_mm, frequency_mhz, beta)
+    square = [(power @ frequency_mhz**2) / power.sum(axis=1) for power in (phantom, of_tissue)]
     return Attenuation(beta, error, spectra.depth_mm, WIDENING / 2.0 * np.log(square[0] / square[1]))
 
 
@@ -135,12 +135,12 @@ def _loss(depth_mm: FloatArray) -> FloatArray:
     return 4.0 * NEPER_PER_DB * 0.1 * depth_mm
 
 
-def _attenuated(
+def _attenuate(
     power: FloatArray, depth_mm: FloatArray, frequency_mhz: FloatArray, difference: float
 ) -> FloatArray:
     """Spectrum by depth, with gain that keeps the band's middle."""
-    lost = difference * _loss(depth_mm)[:, None] * (frequency_mhz - frequency_mhz.mean())
-    return np.asarray(power * np.exp(-lost))
+    loss = difference * _loss(depth_mm)[:, None] * (frequency_mhz - frequency_mhz.mean())
+    return np.asarray(power * np.exp(-loss))
 
 
 def _fit_rows(
@@ -166,9 +166,9 @@ def _fit_rows(
     for row in zip(weight, log_power, log_reference, strict=True):
 
         def misfit(values: FloatArray, *row: FloatArray) -> FloatArray:
-            (gain, fall, log_noise), (weight, own, known) = values, row
-            model = np.logaddexp(known + gain - fall * f, log_noise)
-            return np.append(weight * (own - model), (log_noise - LITTLE_NOISE) / NOISE_SIGMA)
+            (gain, fall, log_noise), (weight, log_echo, reference) = values, row
+            model = np.logaddexp(reference + gain - fall * f, log_noise)
+            return np.append(weight * (log_echo - model), (log_noise - LITTLE_NOISE) / NOISE_SIGMA)
 
         starts = ([0.0, 0.0, log_noise] for log_noise in (LITTLE_NOISE, -1.0))
         fit = min((least_squares(misfit, x, method="lm", args=row) for x in starts), key=lambda f: f.cost)

@@ -27,7 +27,7 @@ from speckle3d.core.shown import shown
 from speckle3d.kernels.plane_misfit import EchoModels
 from speckle3d.kernels.statistics import INTERPOLATION, correlation_variance
 from speckle3d.matching.table import CorrelationTable
-from speckle3d.motion.planes import WELL_FALLEN, MotionProblem, fully_developed
+from speckle3d.motion.planes import LEVEL_END, MotionProblem, fully_developed
 
 CURVES_SIGMA = 0.002
 """Relative error of all distances that curves from some twenty independent blocks of phantom have."""
@@ -47,12 +47,12 @@ LEAST_GAIN = 0.5
 """Part of the correlation that noise leaves from which a patch counts for the scale: with less it is noise
 for the most part. Sweeps without such patches do not depend on it; halved, it moves the length over tissue by
 2 % where attenuation leaves noise at depth, and by 3.5 % under a shadow."""
-UNADAPTED_SIGMA = 0.15
+PHANTOM_SIGMA = 0.15
 """Relative error of distances by a phantom's curves where no patch tells its own scale, as in two frames:
 tissue reads 5 to 25 % short with them."""
 _BIN_EDGES_MM = np.concatenate([np.arange(0.0, 1.0, 0.03), np.arange(1.0, 4.01, 0.15)])
 """Fine where the curves fall, coarse where only structure is left."""
-ROUNDS, SETTLED, DIFFERENCE = 30, 1e-3, 1e-6
+ROUNDS, LAST_STEP, DIFFERENCE = 30, 1e-3, 1e-6
 """Most rounds of a fit, the step of its numbers that ends them, and that of derivatives."""
 MOST_SHARE, MOST_POWER = {"echo": 0.5, "intensity": 0.95}, 0.9
 """Bounds of c, by what is correlated, and of a. An echo that is structure for the most part is r^a alone, a
@@ -107,7 +107,7 @@ class Coherence:
 
 
 @dataclass(frozen=True)
-class _Binned:
+class _Binning:
     """Correlations of each patch of each piece, averaged over pairs of like distance, and their curves.
 
     Attributes
@@ -148,26 +148,26 @@ class _Binned:
         low, high = (-1.0, 1.0) if log_scale is None else (log_scale, log_scale)
         lowest, highest = np.array([low, 0.05, 0.0, 0.0]), np.array([high, 1.2, most_share, most_power])
         x = np.tile(np.clip([0.0, 0.95, 0.05, 0.1], lowest, highest), (len(self.mean), 1))
-        left = self._misfit(x, sigma)
+        misfit = self._misfit(x, sigma)
         damping = np.full((len(x), 1), 1e-2)
         for _ in range(ROUNDS):
             steps = DIFFERENCE * np.eye(4)
             jacobian = (
-                np.stack([self._misfit(x + step, sigma) - left for step in steps], axis=-1) / DIFFERENCE
+                np.stack([self._misfit(x + step, sigma) - misfit for step in steps], axis=-1) / DIFFERENCE
             )
-            gradient = np.einsum("kmn,km->kn", jacobian, left)
+            gradient = np.einsum("kmn,km->kn", jacobian, misfit)
             free = ~(((x <= lowest) & (gradient > 0)) | ((x >= highest) & (gradient < 0)))
             normal = np.einsum("kmn,kmo->kno", jacobian, jacobian) * (free[:, :, None] & free[:, None, :])
             diagonal = np.einsum("knn->kn", normal)
             diagonal += damping * diagonal + np.where(free, 1e-12, 1.0)
             step = np.linalg.solve(normal, np.where(free, gradient, 0.0)[:, :, None])[:, :, 0]
             trial = np.clip(x - step, lowest, highest)
-            trial_left = self._misfit(trial, sigma)
-            better = (trial_left**2).sum(axis=1) <= (left**2).sum(axis=1)
-            moved = np.abs(trial - x).max()
-            x[better], left[better] = trial[better], trial_left[better]
+            trial_misfit = self._misfit(trial, sigma)
+            better = (trial_misfit**2).sum(axis=1) <= (misfit**2).sum(axis=1)
+            largest_step = np.abs(trial - x).max()
+            x[better], misfit[better] = trial[better], trial_misfit[better]
             damping *= np.where(better, 0.2, 4.0)[:, None]
-            if moved < SETTLED:
+            if largest_step < LAST_STEP:
                 break
         return x
 
@@ -183,49 +183,49 @@ class _Binned:
         return np.append(self.weight * (gain * echo**2 - self.mean), share / sigma, axis=1)
 
 
-def _binned(
+def _bin_correlations(
     problem: MotionProblem, table: CorrelationTable, sound: BoolArray, path: FloatArray
-) -> tuple[_Binned, FloatArray]:
+) -> tuple[_Binning, FloatArray]:
     """Average correlations over pairs of like distance; returns the middles of the sweep's pieces, too."""
     first, second, correlation = table.first[sound], table.second[sound], table.correlation[sound]
     curves, levers, grid = problem.at_patches, problem.levers, problem.curves.distance_mm
     travel = np.append(0.0, np.cumsum(np.abs(np.diff(path[:, 0]))))
     pieces = max(1, int(travel[-1] / PIECE_MM))
     edges = np.searchsorted(travel, np.linspace(0, travel[-1], pieces + 1)[1:-1])
-    moved = np.zeros((first.size, 3))
-    moved[:, : path.shape[1]] = path[second] - path[first]
-    z, yaw, tilt = moved.T[:, :, None]
+    motion = np.zeros((first.size, 3))
+    motion[:, : path.shape[1]] = path[second] - path[first]
+    z, yaw, tilt = motion.T[:, :, None]
     along = z + yaw * levers.lateral_mm + tilt * levers.lever_mm
     distance = np.hypot(along, tilt * levers.spread_mm)
     usable = np.isfinite(correlation)
     if problem.end_amplitude.any():
         usable &= distance <= grid[-1]
-    patches, bins = correlation.shape[1], _BIN_EDGES_MM.size - 1
-    at = np.minimum(np.searchsorted(_BIN_EDGES_MM, distance, side="right") - 1, bins - 1)
+    patch_count, bin_count = correlation.shape[1], _BIN_EDGES_MM.size - 1
+    at = np.minimum(np.searchsorted(_BIN_EDGES_MM, distance, side="right") - 1, bin_count - 1)
     piece = np.searchsorted(edges, (first + second) / 2, side="right")
-    at = (at + bins * (np.arange(patches) + patches * piece[:, None]))[usable]
+    at = (at + bin_count * (np.arange(patch_count) + patch_count * piece[:, None]))[usable]
     count, by_distance, by_correlation = (
-        np.bincount(at, weights, pieces * patches * bins).reshape(-1, bins)
+        np.bincount(at, weights, pieces * patch_count * bin_count).reshape(-1, bin_count)
         for weights in (None, distance[usable], correlation[usable])
     )
-    some = np.maximum(count, 1)
-    mean = by_correlation / some
+    counts = np.maximum(count, 1)
+    mean = by_correlation / counts
     end = curves.amplitude[:, -1] ** 2
-    floor = np.where(end > WELL_FALLEN, 0.0, end)[:, None]
+    floor = np.where(end > LEVEL_END, 0.0, end)[:, None]
     amplitude = np.sqrt(np.clip((curves.amplitude**2 - floor) / (1 - floor), 0.0, 1.0))
     floor, cells = np.tile(floor, (pieces, 1)), np.tile(curves.cells, pieces)[:, None]
     variance = correlation_variance(np.clip(mean, 0.0, 0.995), cells, curves.of_echo) + INTERPOLATION**2
     # Scale, gain, share and power are four numbers.
     determined = (count > 0).sum(axis=1) >= 4
-    binned = _Binned(
-        by_distance / some,
+    binning = _Binning(
+        by_distance / counts,
         (mean - floor) / (1 - floor),
         (1 - floor) * np.sqrt(count / variance),
         np.tile(amplitude, (pieces, 1)),
         curves.step_mm,
         determined,
     )
-    return binned, (np.append(0, edges) + np.append(edges, len(path) - 1)) / 2
+    return binning, (np.append(0, edges) + np.append(edges, len(path) - 1)) / 2
 
 
 def standard_error(values: FloatArray, prior: int) -> float:
@@ -252,42 +252,42 @@ def estimate_coherence(
     path : ndarray, shape (n, 2) or (n, 3)
         Elevational position of each frame's centre, and its slopes along x and, if known, y.
     """
-    binned, centres = _binned(problem, table, sound, path)
-    determined, of_echo = binned.determined, problem.at_patches.of_echo
+    binning, centres = _bin_correlations(problem, table, sound, path)
+    is_determined, of_echo = binning.determined, problem.at_patches.of_echo
     # Curves of tissue hold its structure.
-    if problem.curves.of_tissue or not determined.any():
-        return Coherence(np.zeros(1), *fully_developed(len(problem.patches)), scale_sigma=UNADAPTED_SIGMA)
+    if problem.curves.of_tissue or not is_determined.any():
+        return Coherence(np.zeros(1), *fully_developed(len(problem.patches)), scale_sigma=PHANTOM_SIGMA)
     most_share = MOST_SHARE["echo" if of_echo else "intensity"]
 
     def row_medians(values: FloatArray) -> FloatArray:
-        by_piece = np.where(determined, values, np.nan).reshape(centres.size, -1)
+        by_piece = np.where(is_determined, values, np.nan).reshape(centres.size, -1)
         by_row = np.moveaxis(problem.patches.rows_of(by_piece), 1, 0)
         finite = (row[np.isfinite(row)] for row in by_row)
         return np.array([np.median(row) if row.size else np.nan for row in finite])
 
-    frozen = binned.fit(most_share)
-    typical = float(np.nanmean(row_medians(frozen[:, 2])))
+    static_fit = binning.fit(most_share)
+    typical = float(np.nanmean(row_medians(static_fit[:, 2])))
     if typical < NO_STRUCTURE:
         most_share = 0.0
-    fits = [binned.fit(most_share, MOST_POWER), *([frozen] if most_share and not of_echo else [])]
+    fits = [binning.fit(most_share, MOST_POWER), *([static_fit] if most_share and not of_echo else [])]
     # Where noise is most of the correlation, its course tells nothing of the scale.
-    clear = determined & (frozen[:, 1] >= LEAST_GAIN)
-    clear = clear if clear.any() else determined
+    clear = is_determined & (static_fit[:, 1] >= LEAST_GAIN)
+    clear = clear if clear.any() else is_determined
     medians = [float(np.median(fit[clear, 0])) for fit in fits]
     log_scale = float(np.mean(medians))
-    gain, share = binned.fit(most_share, 0.0, log_scale, max(typical, NO_STRUCTURE))[:, 1:3].T
+    gain, share = binning.fit(most_share, 0.0, log_scale, max(typical, NO_STRUCTURE))[:, 1:3].T
     # Patches that tell nothing are taken for the sweep's typical ones.
-    gain, share = (np.where(determined, v, np.median(v[determined])) for v in (gain, share))
-    own = np.mean(fits, axis=0)[:, 0] - log_scale
-    rows = RowScales(problem.patches.row_depth_mm, row_medians(own), row_medians(gain))
+    gain, share = (np.where(is_determined, v, np.median(v[is_determined])) for v in (gain, share))
+    patch_scales = np.mean(fits, axis=0)[:, 0] - log_scale
+    rows = RowScales(problem.patches.row_depth_mm, row_medians(patch_scales), row_medians(gain))
     # Deviations from a line over depth: tilt makes one.
-    known, line = np.isfinite(rows.logarithm), (0.0, 0.0)
-    if known.sum() > 2:
-        line = theilslopes(rows.logarithm[known], rows.depth_mm[known])[:2]
+    finite_rows, line = np.isfinite(rows.logarithm), (0.0, 0.0)
+    if finite_rows.sum() > 2:
+        line = theilslopes(rows.logarithm[finite_rows], rows.depth_mm[finite_rows])[:2]
     by_row = standard_error(rows.logarithm - np.polyval(line, rows.depth_mm), PRIOR_ROWS if most_share else 0)
     # Of few frames and rows, patches scatter more than structure's layers.
-    left = own - np.polyval(line, np.tile(problem.patches.depth_mm, centres.size))
-    by_patch = standard_error(left[clear], 0)
+    scatter = patch_scales - np.polyval(line, np.tile(problem.patches.depth_mm, centres.size))
+    by_patch = standard_error(scatter[clear], 0)
     errors = max(by_row, by_patch), np.ptp(medians) / np.sqrt(12.0), CURVES_SIGMA
     sigma = float(np.linalg.norm(errors))
     shape = centres.size, -1

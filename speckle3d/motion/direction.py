@@ -51,38 +51,38 @@ def sensed_orientation(sweep: Sweep, settings: SensorSettings) -> Rotation | Non
     time_s, sigma_s = sweep.frame_time_s, settings.smooth_s
     if not sensor.covers(time_s).all():
         return None
-    sensed = image_orientation(sensor, time_s)
+    orientation = image_orientation(sensor, time_s)
     if sigma_s == 0 or len(time_s) < 3:
-        return sensed
+        return orientation
     # As turns from their mean, of which they stay within a half turn.
-    mean, frames = sensed.mean(), sigma_s / float(np.median(np.diff(time_s)))
-    turns = gaussian_filter1d((mean.inv() * sensed).as_rotvec(), frames, axis=0, mode="nearest")
+    mean, frames = orientation.mean(), sigma_s / float(np.median(np.diff(time_s)))
+    turns = gaussian_filter1d((mean.inv() * orientation).as_rotvec(), frames, axis=0, mode="nearest")
     return mean * Rotation.from_rotvec(turns)
 
 
 def settle_direction(
-    sweep: Sweep, image: RigidTransform, settings: SensorSettings, turn_confirmed: bool = True
+    sweep: Sweep, image: RigidTransform, settings: SensorSettings, tells_direction: bool = True
 ) -> tuple[int, str]:
     """Sign of the elevational motion, which images alone cannot tell, and its source.
 
     Parameters
     ----------
-    turn_confirmed : bool
+    tells_direction : bool
         Whether roll or a gyroscope confirm the orientation sensor's turns; it is not asked otherwise.
     """
     if settings.direction:
         return settings.direction, "setting"
     time_s = sweep.frame_time_s
-    for sensor in (sweep.tracker, sweep.orientation if turn_confirmed else None):
+    for sensor in (sweep.tracker, sweep.orientation if tells_direction else None):
         if sensor is None or sensor.sensor_from_image is None:
             continue
-        covered = np.flatnonzero(sensor.covers(time_s))
-        if isinstance(sensor, Tracker) and covered.size > 1:
-            measured = sensor.world_from_image(time_s[covered])
-            return _same_way(measured, image[covered], sweep.grid.centre_mm), sensor.label
-        if isinstance(sensor, OrientationSensor) and covered.size >= LEAST_FRAMES:
-            both = sensor.world_from_image(time_s[covered]), image[covered].rotation
-            sign = same_turns(*((turn[0].inv() * turn).as_rotvec()[:, :2] for turn in both))
+        frames = np.flatnonzero(sensor.covers(time_s))
+        if isinstance(sensor, Tracker) and frames.size > 1:
+            sensor_poses = sensor.world_from_image(time_s[frames])
+            return _same_way(sensor_poses, image[frames], sweep.grid.centre_mm), sensor.label
+        if isinstance(sensor, OrientationSensor) and frames.size >= LEAST_FRAMES:
+            rotations = sensor.world_from_image(time_s[frames]), image[frames].rotation
+            sign = same_turns(*((turn[0].inv() * turn).as_rotvec()[:, :2] for turn in rotations))
             if sign is not None:
                 return sign, sensor.label
     if sweep.truth is not None:
@@ -90,13 +90,13 @@ def settle_direction(
     return 1, "assumed"
 
 
-def _same_way(one: RigidTransform, other: RigidTransform, centre_mm: FloatArray) -> int:
+def _same_way(poses: RigidTransform, image: RigidTransform, centre_mm: FloatArray) -> int:
     """Whether two records of poses go the same way along the first frame's normal (1) or not (-1)."""
-    z, own = ((poses[0].inv() * poses).apply(centre_mm)[:, 2] for poses in (one, other))
-    return 1 if (z - z.mean()) @ (own - own.mean()) >= 0 else -1
+    z, image_z = ((path[0].inv() * path).apply(centre_mm)[:, 2] for path in (poses, image))
+    return 1 if (z - z.mean()) @ (image_z - image_z.mean()) >= 0 else -1
 
 
-def same_turns(sensed: FloatArray, seen: FloatArray) -> int | None:
+def same_turns(sensor_turns: FloatArray, image_turns: FloatArray) -> int | None:
     """Whether two records of turns go the same way (1) or opposite ways (-1); None if chance may tell so.
 
     Told are a product that chance does not give records as slow as these, and the near correlation that the
@@ -104,7 +104,7 @@ def same_turns(sensed: FloatArray, seen: FloatArray) -> int | None:
 
     Parameters
     ----------
-    sensed, seen : ndarray, shape (n, 2)
+    sensor_turns, image_turns : ndarray, shape (n, 2)
         Tilt and yaw of each frame, rad.
 
     References
@@ -113,13 +113,13 @@ def same_turns(sensed: FloatArray, seen: FloatArray) -> int | None:
        Journal of the Royal Statistical Society 98, 1935: the variance of a correlation of series that change
        slowly.
     """
-    n = len(sensed)
+    n = len(sensor_turns)
     trend = np.vander(np.linspace(-1, 1, n), 3)
-    ours, theirs = (v - trend @ np.linalg.lstsq(trend, v, rcond=None)[0] for v in (sensed, seen))
-    product = float(np.sum(ours * theirs))
+    ours, images = (v - trend @ np.linalg.lstsq(trend, v, rcond=None)[0] for v in (sensor_turns, image_turns))
+    product = float(np.sum(ours * images))
     # Variance of the sum of products of independent series with these autocovariances (Bartlett).
-    columns = zip(ours.T, theirs.T, strict=True)
+    columns = zip(ours.T, images.T, strict=True)
     by_lag = sum(np.correlate(a, a, "full") * np.correlate(b, b, "full") for a, b in columns)
     by_chance = np.sqrt(max(float((1.0 - np.abs(np.arange(1 - n, n)) / n) @ by_lag) / n, 0.0))
-    same = abs(product) > SAME_CORRELATION * np.linalg.norm(ours) * np.linalg.norm(theirs)
-    return int(np.sign(product)) if same or abs(product) > LEAST_DEVIATIONS * by_chance else None
+    nearly_equal = abs(product) > SAME_CORRELATION * np.linalg.norm(ours) * np.linalg.norm(images)
+    return int(np.sign(product)) if nearly_equal or abs(product) > LEAST_DEVIATIONS * by_chance else None

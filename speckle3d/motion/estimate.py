@@ -24,7 +24,7 @@ from speckle3d.motion.planes import (
     patch_distances,
 )
 from speckle3d.motion.signs import RELATIVE_ERROR, UNADAPTED_ERROR, Strangers, likeliest_path, on_path
-from speckle3d.motion.trajectory import Trajectory, edges_of, solve_trajectory, unjoined
+from speckle3d.motion.trajectory import Trajectory, edges_of, loose_frames, solve_trajectory
 from speckle3d.motion.uncertainty import SlopeWeights, claimed_covariance, weigh_slopes
 
 ROUNDS = 2
@@ -77,7 +77,7 @@ class Motion:
     @property
     def unplaced(self) -> BoolArray:
         """Frames that no pair joins to earlier ones, shape (n,)."""
-        return unjoined(self.pairs.second, self.problem.frames)
+        return loose_frames(self.pairs.second, self.problem.frames)
 
     def claims(self, curves_sigma: float) -> tuple[SharedErrors, FloatArray]:
         """Errors that all frames share, and the covariance of every pose; see `claimed_covariance`.
@@ -122,30 +122,30 @@ def estimate_motion(problem: MotionProblem, table: CorrelationTable, sound: Bool
         If no pair determines a plane.
     """
     models = fully_developed(table.correlation.shape[1])
-    alike, determined = pair_planes(problem, table, alike_pairs(problem, table), models)
+    alike, firm = pair_planes(problem, table, alike_pairs(problem, table), models)
     apart = strangers(problem, table)
-    path = likeliest_path(alike[determined], problem.frames, apart, None, UNADAPTED_ERROR)
+    path = likeliest_path(alike[firm], problem.frames, apart, None, UNADAPTED_ERROR)
     sheet, tilt = problem.curves.nominal, problem.curves.tilt
     lens_rounds = LENS_ROUNDS if sheet and problem.curves.origin == "data sheet" else 0
-    for left in range(lens_rounds, -1, -1):
+    for lens_round in range(lens_rounds, -1, -1):
         # Tilt bends rows as a lens does: it is left out until the lens is known.
-        problem = replace(problem, curves=replace(problem.curves, tilt=None if left else tilt))
+        problem = replace(problem, curves=replace(problem.curves, tilt=None if lens_round else tilt))
         for _ in range(ROUNDS):
             coherence = estimate_coherence(problem, table, sound, path)
             pairs = _signed_planes(problem, table, sound, path * coherence.scale, coherence)
             slopes = weigh_slopes(pairs, coherence.scale_sigma, problem.planes)
-            _, solved = solve_planes(problem, table, slopes.applied(pairs))
-            path = elevation_of(solved.poses, problem.centre_mm)
+            _, trajectory = solve_planes(problem, table, slopes.applied(pairs))
+            path = elevation_of(trajectory.poses, problem.centre_mm)
         coherence = estimate_coherence(problem, table, sound, path)
-        if left and sheet and coherence.rows:
+        if lens_round and sheet and coherence.rows:
             path = path * coherence.scale
             problem = replace(problem, curves=with_fitted_lens(problem.curves, coherence.rows, sheet))
     if problem.curves.of_tissue:
         coherence = replace(coherence, scale_sigma=_disagreement(problem, table, pairs))
     slopes = weigh_slopes(pairs, coherence.scale_sigma, problem.planes)
     pairs = pairs.scaled(coherence.scale)
-    edges, solved = solve_planes(problem, table, slopes.applied(pairs), with_covariance=True)
-    return Motion(problem, table, pairs, coherence, slopes, edges, solved.poses, solved.covariance)
+    edges, trajectory = solve_planes(problem, table, slopes.applied(pairs), with_covariance=True)
+    return Motion(problem, table, pairs, coherence, slopes, edges, trajectory.poses, trajectory.covariance)
 
 
 def _disagreement(problem: MotionProblem, table: CorrelationTable, pairs: PairPlanes) -> float:
@@ -193,8 +193,8 @@ def _signed_planes(
     """Planes of the pairs near enough on a path, with the signs of the likeliest path through them."""
     apart = np.abs(path[table.second, 0] - path[table.first, 0])
     rows = _near_pairs(problem, table, apart, sound)
-    planes, determined = pair_planes(problem, table, rows, coherence.models(table.first[rows]), apart[rows])
-    planes = planes[determined]
+    planes, firm = pair_planes(problem, table, rows, coherence.models(table.first[rows]), apart[rows])
+    planes = planes[firm]
     if not len(planes):
         raise InsufficientDataError(
             f"expected frame pairs whose patches determine a plane, got none in {len(table)} pairs of "

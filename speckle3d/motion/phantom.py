@@ -95,7 +95,7 @@ def fit_curves(
     if not every:
         raise InsufficientDataError("expected samples of at least one phantom sweep, got none")
     depth, offset, tilt, rho = (
-        np.concatenate([getattr(one, name)[np.isfinite(one.correlation)] for one in every])
+        np.concatenate([getattr(sample, name)[np.isfinite(sample.correlation)] for sample in every])
         for name in ("depth_mm", "offset_mm", "tilt_rad", "correlation")
     )
     (rows, row), grid = np.unique(np.round(depth, 6), return_inverse=True), np.linspace(0, s.largest_mm, 251)
@@ -103,10 +103,10 @@ def fit_curves(
     fair = np.ones(depth.size, dtype=bool)
     # Turning distorts the curves a little and is itself read from them: estimate both in turn.
     for turn in range(TILT_ROUNDS):
-        own = [np.flatnonzero(fair & (row == number)) for number in range(rows.size)]
+        members = [np.flatnonzero(fair & (row == number)) for number in range(rows.size)]
         fits = [
-            _fit_row(at, grid, s.terms, of_echo, distance[some], rho[some])
-            for at, some in zip(rows, own, strict=True)
+            _fit_row(at, grid, s.terms, of_echo, distance[member], rho[member])
+            for at, member in zip(rows, members, strict=True)
         ]
         curves, cells, ends = (np.array(part) for part in zip(*fits, strict=True))
         if turn == TILT_ROUNDS - 1:
@@ -118,7 +118,7 @@ def fit_curves(
         distance = np.hypot(offset - pivot * tilt, spread * tilt)
         fair = np.abs(distance - np.abs(offset)) <= LITTLE_TILT_MM + LITTLE_TILT * np.abs(offset)
     grid = grid[: max(2, int(np.searchsorted(grid, ends.min(), side="right")))]
-    pairs = sum(one.pairs for one in every)
+    pairs = sum(sample.pairs for sample in every)
     return DecorrelationCurves(key, rows, grid, curves[:, : grid.size], cells, pairs, response)
 
 

@@ -30,7 +30,7 @@ from speckle3d.matching.table import CorrelationTable
 
 LEAST_CORRELATION = 0.03
 """A patch that correlates less than this holds no distance at all."""
-WELL_FALLEN = 0.1
+LEVEL_END = 0.1
 """Correlation above which a curve's end is where it was no longer measured, not where it has levelled out."""
 CROSSING_EVIDENCE = 6.0
 """Gain in twice the log-likelihood (a BIC) for which frames are taken to cross inside the image."""
@@ -120,7 +120,7 @@ class MotionProblem:
     def end_amplitude(self) -> FloatArray:
         """Amplitude at each patch's last distance, beyond which nothing is read; 0 if it has levelled out."""
         end = self.at_patches.amplitude[:, -1]
-        return np.where(end**2 > WELL_FALLEN, end, 0.0)
+        return np.where(end**2 > LEVEL_END, end, 0.0)
 
     @cached_property
     def _typical(self) -> FloatArray:
@@ -134,7 +134,7 @@ class MotionProblem:
     def typical_correlation(self, distance_mm: FloatArray) -> FloatArray:
         """Correlation of the median patch's fully developed speckle; 0 where it was not measured."""
         rho = self._typical**2
-        beyond = 0.0 if rho[-1] > WELL_FALLEN else rho[-1]
+        beyond = 0.0 if rho[-1] > LEVEL_END else rho[-1]
         return np.interp(distance_mm, self.curves.distance_mm, rho, right=beyond)
 
 
@@ -226,71 +226,71 @@ def pair_planes(
     correlation = table.correlation[rows]
     end = problem.end_amplitude
     least = models.gain * (models.share + (1 - models.share) * end) ** 2
-    used = np.isfinite(correlation) & ((end == 0.0) | (correlation > least))
-    used = used if subset is None else used & subset
-    used &= (used.sum(axis=1) > 3)[:, None]
+    members = np.isfinite(correlation) & ((end == 0.0) | (correlation > least))
+    members = members if subset is None else members & subset
+    members &= (members.sum(axis=1) > 3)[:, None]
     if start_mm is None:
         start = problem.typical_distance(np.sqrt(np.maximum(table.median[rows], 0.0)))
     else:
         start = np.maximum(start_mm, NEAR_MM)
-    sensed = slopes is not None
-    slopes_used = np.zeros((rows.size, 2)) if slopes is None else np.ascontiguousarray(slopes)
+    from_sensor = slopes is not None
+    start_slopes = np.zeros((rows.size, 2)) if slopes is None else np.ascontiguousarray(slopes)
     side = np.ones(rows.size, dtype=bool) if either_side is None else either_side
     settings = problem.planes
-    slope_sd = SENSED_SLOPE if sensed else LOOSE_SLOPE
-    rules = FitRules(sensed, slope_sd, LOOSE_SLOPE, settings.huber, OUTLYING, CROSSING_EVIDENCE, ROUNDS)
-    lost = _lost(problem, table.inplane[rows, :2])
-    fitted = FittedPlanes(
+    slope_sd = SENSED_SLOPE if from_sensor else LOOSE_SLOPE
+    rules = FitRules(from_sensor, slope_sd, LOOSE_SLOPE, settings.huber, OUTLYING, CROSSING_EVIDENCE, ROUNDS)
+    shift = _lever_shift(problem, table.inplane[rows, :2])
+    fits = FittedPlanes(
         np.full((rows.size, 3), np.nan), np.tile(np.eye(3), (rows.size, 1, 1)), np.zeros(rows.size)
     )
 
     def work(first: int, stop: int) -> None:
-        some = slice(first, stop)
+        block = slice(first, stop)
         fit_planes(
-            correlation[some],
-            used[some],
-            lost[some],
-            models if len(models.share) == 1 else EchoModels(models.share[some], models.gain[some]),
+            correlation[block],
+            members[block],
+            shift[block],
+            models if len(models.share) == 1 else EchoModels(models.share[block], models.gain[block]),
             problem.levers,
             problem.at_patches,
-            start[some],
-            slopes_used[some],
-            side[some],
+            start[block],
+            start_slopes[block],
+            side[block],
             rules,
-            FittedPlanes(*(array[some] for array in fitted)),
+            FittedPlanes(*(array[block] for array in fits)),
         )
 
     in_parallel(work, rows.size)
-    coefficients, information, cost = fitted
-    scatter = np.maximum(1.0, cost / np.maximum(used.sum(axis=1) - 3, 1))
+    coefficients, information, cost = fits
+    scatter = np.maximum(1.0, cost / np.maximum(members.sum(axis=1) - 3, 1))
     covariance = np.linalg.inv(information) * scatter[:, None, None]
     covariance[:, 0, 0] += settings.bias_mm**2
     # Where next to nothing of the echo is left, any distance fits as well: tens of metres have been seen.
     reach = float(problem.curves.distance_mm[-1])
     determined = (np.abs(coefficients[:, 0]) <= reach) & (covariance[:, 0, 0] <= reach**2)
-    if not sensed:
+    if not from_sensor:
         coefficients *= np.where(coefficients[:, :1] < 0, -1.0, 1.0)
-    planes = PairPlanes(rows, table.first[rows], table.second[rows], coefficients, covariance, used)
+    planes = PairPlanes(rows, table.first[rows], table.second[rows], coefficients, covariance, members)
     return planes, determined
 
 
-def _lost(problem: MotionProblem, moved_mm: FloatArray) -> FloatArray:
+def _lever_shift(problem: MotionProblem, shift_mm: FloatArray) -> FloatArray:
     """What in-plane motion takes from the patches' lateral positions and levers, shape (e, 2)."""
-    return moved_mm * [1.0, float(problem.curves.tilt is not None)]
+    return shift_mm * [1.0, float(problem.curves.tilt is not None)]
 
 
-def raised(problem: MotionProblem, moved_mm: FloatArray, slopes: FloatArray) -> FloatArray:
+def raised(problem: MotionProblem, shift_mm: FloatArray, slopes: FloatArray) -> FloatArray:
     """How much farther patches are than the image's centre on planes of some slopes, shape (e, p).
 
     Parameters
     ----------
-    moved_mm : ndarray, shape (e, 2)
+    shift_mm : ndarray, shape (e, 2)
         In-plane displacement of the second frame.
     slopes : ndarray, shape (e, 2)
         b and c.
     """
-    lost = (slopes * _lost(problem, moved_mm)).sum(axis=1, keepdims=True)
-    return np.asarray(slopes @ np.stack([problem.levers.lateral_mm, problem.levers.lever_mm]) - lost)
+    shift = (slopes * _lever_shift(problem, shift_mm)).sum(axis=1, keepdims=True)
+    return np.asarray(slopes @ np.stack([problem.levers.lateral_mm, problem.levers.lever_mm]) - shift)
 
 
 def patch_distances(
@@ -307,7 +307,7 @@ def patch_distances(
     def distances(rho: FloatArray) -> FloatArray:
         amplitude = (np.sqrt(np.maximum(rho, 0.0) / gain) - share) / (1.0 - share)
         columns = zip(np.where(amplitude > least, amplitude, np.nan).T, curves.amplitude, strict=True)
-        return np.stack([np.interp(-own, -row, problem.curves.distance_mm) for own, row in columns], axis=1)
+        return np.stack([np.interp(-a, -row, problem.curves.distance_mm) for a, row in columns], axis=1)
 
     variance = correlation_variance(np.clip(correlation, 0.0, 0.999), curves.cells, curves.of_echo)
     noise = np.sqrt(variance + INTERPOLATION**2)

@@ -45,25 +45,25 @@ def consistent_poses(motion: Motion, sweep: Sweep, settings: SensorSettings) -> 
     sweep : Sweep
         With the sensors that are to be used.
     """
-    sensed = sensed_orientation(sweep, settings)
-    if sensed is None:
+    orientation = sensed_orientation(sweep, settings)
+    if orientation is None:
         return ConsistentPoses(None, motion.pairs.used, float("nan"))
     problem, table, pairs, scale = motion.problem, motion.table, motion.pairs, motion.coherence.scale
     models, correlation = motion.coherence.models(pairs.first), table.correlation[pairs.row]
     sign = np.where(pairs.offset_mm < 0, -1.0, 1.0)
-    relative = (sensed[pairs.first].inv() * sensed[pairs.second]).as_matrix()[:, 2, :2]
-    moved, slopes = table.inplane[pairs.row, :2], sign[:, None] * relative
-    farther, offset = raised(problem, moved, slopes), np.abs(pairs.offset_mm)
+    relative = (orientation[pairs.first].inv() * orientation[pairs.second]).as_matrix()[:, 2, :2]
+    shift, slopes = table.inplane[pairs.row, :2], sign[:, None] * relative
+    farther, offset = raised(problem, shift, slopes), np.abs(pairs.offset_mm)
     # Only frames that cross, or nearly, leave the side open.
     open_side = offset < np.ptp(farther, axis=1)
     distance, sigma = (scale * v for v in patch_distances(problem, correlation, models))
-    agreed = consistent_subset(distance, sigma, farther, open_side, problem.planes.support_sigma)
-    planes, determined = pair_planes(problem, table, pairs.row, models, offset, agreed, slopes, open_side)
+    agreement = consistent_subset(distance, sigma, farther, open_side, problem.planes.support_sigma)
+    planes, firm = pair_planes(problem, table, pairs.row, models, offset, agreement, slopes, open_side)
     # Slopes are the sensor's; distances have the scale of all patches.
     planes.coefficients[:] *= [scale, 1.0, 1.0] * sign[:, None]
     planes.covariance[:] *= scale**2
     for name in ("coefficients", "covariance", "used"):
-        getattr(planes, name)[~determined] = getattr(pairs, name)[~determined]
+        getattr(planes, name)[~firm] = getattr(pairs, name)[~firm]
     rejected_share = 1.0 - float(planes.used[pairs.used].mean())
     return ConsistentPoses(solve_planes(problem, table, planes)[1].poses, planes.used, rejected_share)
 
@@ -99,14 +99,14 @@ def consistent_subset(
        orientation measurements", figure 4.
     """
     support = np.zeros(raised_mm.shape, dtype=bool)
-    for pair, known in enumerate(np.isfinite(distance_mm)):
-        if not known.any():
+    for pair, finite in enumerate(np.isfinite(distance_mm)):
+        if not finite.any():
             continue
-        d, sigma, farther = (v[pair, known].astype("f4") for v in (distance_mm, sigma_mm, raised_mm))
+        d, sigma, farther = (v[pair, finite].astype("f4") for v in (distance_mm, sigma_mm, raised_mm))
         offset = np.concatenate([d - farther, -d - farther] if either_side[pair] else [d - farther])
         misfit = np.abs((np.abs(offset[:, None] + farther) - d) / sigma)
         agree = misfit <= support_sigma
         # Among placements of equal support, the one whose supporters lie closest.
         score = agree.sum(axis=1) - (agree * misfit).sum(axis=1) / (d.size * support_sigma + 1.0)
-        support[pair, known] = agree[score.argmax()]
+        support[pair, finite] = agree[score.argmax()]
     return support

@@ -18,10 +18,10 @@ from speckle3d.core.relative import HELD, RelativePoses
 from speckle3d.matching.table import CorrelationTable
 from speckle3d.motion.planes import PairPlanes
 
-SETTLED = 1e-4
+LAST_STEP = 1e-4
 """Largest step, mm or rad, after which no further round is made."""
 ROUNDS = 6
-KNOWN_FRAMES = 40
+COVARIANCE_FRAMES = 40
 """Frames whose covariance is computed; those of the others are interpolated."""
 INPLANE_FLOOR = (1e-6, 1e-6, 1e-9)
 """Variances of in-plane motion (mm^2, mm^2, rad^2) that interpolation leaves, however many patches agree."""
@@ -70,7 +70,7 @@ def solve_trajectory(
         step = np.zeros((frames, 6))
         step[1:] = -normal.solve(gradient).reshape(-1, 6)
         poses = poses * RigidTransform.from_exp_coords(step[:, _TWIST])
-        if np.abs(step).max() < SETTLED:
+        if np.abs(step).max() < LAST_STEP:
             break
     covariance = np.zeros((frames, 6, 6))
     if with_covariance:
@@ -110,18 +110,18 @@ def _normal(
 
 def _marginals(normal: Any, frames: int) -> FloatArray:
     """Covariance of each frame's pose, shape (n, 6, 6); those between known frames are interpolated."""
-    known = np.unique(np.linspace(1, frames - 1, min(frames - 1, KNOWN_FRAMES)).astype(np.int64))
+    frame_numbers = np.unique(np.linspace(1, frames - 1, min(frames - 1, COVARIANCE_FRAMES)).astype(np.int64))
     blocks = [np.zeros((6, 6))]
-    for frame in known:
-        own = slice(6 * frame - 6, 6 * frame)
+    for frame in frame_numbers:
+        rows = slice(6 * frame - 6, 6 * frame)
         unit = np.zeros((6 * (frames - 1), 6))
-        unit[own] = np.eye(6)
-        blocks.append(normal.solve(unit)[own])
-    covariance = make_interp_spline(np.append(0, known), np.array(blocks), k=1)(np.arange(frames))
+        unit[rows] = np.eye(6)
+        blocks.append(normal.solve(unit)[rows])
+    covariance = make_interp_spline(np.append(0, frame_numbers), np.array(blocks), k=1)(np.arange(frames))
     return np.asarray(covariance + covariance.transpose(0, 2, 1)) / 2
 
 
-def unjoined(second: IntArray, frames: int) -> BoolArray:
+def loose_frames(second: IntArray, frames: int) -> BoolArray:
     """Frames after the first that are the second of no pair, shape (n,)."""
     lone = np.ones(frames, dtype=bool)
     lone[0] = False
@@ -131,7 +131,7 @@ def unjoined(second: IntArray, frames: int) -> BoolArray:
 
 def _with_loose_edges(pairs: RelativePoses, frames: int) -> RelativePoses:
     """Join frames that no pair joins to others by edges that say no more than that a probe does not jump."""
-    lone = np.flatnonzero(unjoined(pairs.second, frames))
+    lone = np.flatnonzero(loose_frames(pairs.second, frames))
     after = lone[lone + 1 < frames]
     return RelativePoses(
         np.concatenate([pairs.first, lone - 1, after]),

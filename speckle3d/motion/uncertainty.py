@@ -43,8 +43,8 @@ def claimed_covariance(
     turn = np.zeros((len(poses), 6, 6))
     turn[:, :3, :3] = turn[:, 3:, 3:] = poses.rotation.as_matrix()
     grown = SHARED * (1.0 + STRUCTURE * structure)
-    own = turn @ (independent * np.outer(grown, grown)) @ turn.transpose(0, 2, 1)
-    return np.asarray(own + shared_covariance(poses, centre_mm, shared))
+    pair_covariance = turn @ (independent * np.outer(grown, grown)) @ turn.transpose(0, 2, 1)
+    return np.asarray(pair_covariance + shared_covariance(poses, centre_mm, shared))
 
 
 def shared_covariance(poses: RigidTransform, centre_mm: FloatArray, shared: SharedErrors) -> FloatArray:
@@ -101,10 +101,10 @@ def joint_errors(
     """
     poses = world_from_image[0].inv() * world_from_image
     common = _common_factors(poses, centre_mm, shared or SharedErrors(0.0, 0.0, np.zeros(2)))
-    rest = covariance - np.einsum("mia,mib->iab", common, common)
+    remainder = covariance - np.einsum("mia,mib->iab", common, common)
     # In units of the whole, and no less than nothing: what all have in common may be more than a frame's own.
     size = np.sqrt(np.maximum(np.diagonal(covariance, axis1=1, axis2=2), 1e-24))
-    value, axes = np.linalg.eigh(rest / (size[:, :, None] * size[:, None, :]))
+    value, axes = np.linalg.eigh(remainder / (size[:, :, None] * size[:, None, :]))
     root = size[:, :, None] * (axes * np.sqrt(np.maximum(value, 0.0))[:, None, :]) @ axes.transpose(0, 2, 1)
     way = np.maximum(_travel(poses, centre_mm), 1e-6)
     begin, width = np.linspace(0.0, way[-1], WAY_STEPS, endpoint=False), way[-1] / WAY_STEPS
@@ -143,12 +143,12 @@ class SlopeWeights:
         covariance = planes.covariance
         keep = np.tile(np.diag([1.0, *self.share]), (len(planes), 1, 1))
         keep[:, :1, 1:] = -covariance[:, :1, 1:] @ np.linalg.inv(covariance[:, 1:, 1:]) * (1.0 - self.share)
-        kept = (keep @ planes.coefficients[:, :, None])[:, :, 0]
-        kept *= np.where(kept[:, :1] * planes.coefficients[:, :1] < 0, -1.0, 1.0)
+        coefficients = (keep @ planes.coefficients[:, :, None])[:, :, 0]
+        coefficients *= np.where(coefficients[:, :1] * planes.coefficients[:, :1] < 0, -1.0, 1.0)
         covariance = keep @ covariance @ keep.transpose(0, 2, 1)
-        left = np.maximum(np.abs(kept[:, :1]), TREMBLING_MM) * self.deviation_per_mm
-        covariance[:, [1, 2], [1, 2]] += left**2
-        return replace(planes, coefficients=kept, covariance=covariance)
+        turn_sigma = np.maximum(np.abs(coefficients[:, :1]), TREMBLING_MM) * self.deviation_per_mm
+        covariance[:, [1, 2], [1, 2]] += turn_sigma**2
+        return replace(planes, coefficients=coefficients, covariance=covariance)
 
 
 def weigh_slopes(planes: PairPlanes, scale_sigma: float, settings: PlaneSettings) -> SlopeWeights:
@@ -159,16 +159,16 @@ def weigh_slopes(planes: PairPlanes, scale_sigma: float, settings: PlaneSettings
     scale_sigma : float
         Relative standard deviation of the scale of distances.
     """
-    own = planes.covariance.copy()
-    own[:, 0, 0] -= settings.bias_mm**2
-    information = np.linalg.inv(own).sum(axis=0)
+    covariance = planes.covariance.copy()
+    covariance[:, 0, 0] -= settings.bias_mm**2
+    information = np.linalg.inv(covariance).sum(axis=0)
     information = information / information[0, 0]
     lever_mm = np.sqrt(np.diagonal(information)[1:] - information[0, 1:] ** 2)
     false = UNEVENNESS * scale_sigma / np.maximum(lever_mm, 1e-6)
     travel = np.maximum((planes.offset_mm**2).sum(), 1e-12)
-    seen = (planes.coefficients[:, 1:] * planes.coefficients[:, :1]).sum(axis=0) / travel
-    noise = planes.offset_mm**2 @ np.diagonal(own, axis1=1, axis2=2)[:, 1:] / travel**2
+    mean_slope = (planes.coefficients[:, 1:] * planes.coefficients[:, :1]).sum(axis=0) / travel
+    noise = planes.offset_mm**2 @ np.diagonal(covariance, axis1=1, axis2=2)[:, 1:] / travel**2
     usual = np.deg2rad(settings.turn_deg_per_mm) ** 2
-    expected = np.maximum(usual, seen**2 - BEYOND_DOUBT**2 * (false**2 + noise))
+    expected = np.maximum(usual, mean_slope**2 - BEYOND_DOUBT**2 * (false**2 + noise))
     share = expected / (expected + false**2)
     return SlopeWeights(share, np.sqrt(share) * false)

@@ -34,7 +34,7 @@ from speckle3d.correction.modes import PUBLISHED, require_modes
 from speckle3d.corrections import Correction, correct
 from speckle3d.crossing_sweeps import crossing_side, curves_from, require_pair, stack_for
 from speckle3d.examine.disagreements import differing_lengths
-from speckle3d.examine.sensors import believed, cleaned_readings, require_believed
+from speckle3d.examine.sensors import credible_sensors, repair_readings, require_credible
 from speckle3d.io.calibrations import apply_calibrations
 from speckle3d.io.fileset import FileSet
 from speckle3d.io.hdf5 import PathLike
@@ -189,7 +189,7 @@ def run_job(
         )
         write_reconstruction(part / RESULTS.primary, made, pairs)
         # The tracker alone is shown beside the modes, but is none of the reconstruction's.
-        trusted = believed(sweep, tracked.doubts)
+        trusted = credible_sensors(sweep, tracked.doubts)
         alone, centre = tracker_alone(trusted), sweep.grid.centre_mm
         if reference is None and trusted.tracker is None:
             compared = find_reference(trusted)
@@ -272,7 +272,7 @@ def require_possible(
             f"{sweep.name}: mode {SUBSET}: expected sensed orientation over every frame and the setting "
             "sensors.consistent_subset, got none"
         )
-    return find_reference(cleaned_readings(sweep)[0] if config.sensors.examine else sweep, reference)
+    return find_reference(repair_readings(sweep)[0] if config.sensors.examine else sweep, reference)
 
 
 def available_modes(sweep: Sweep, config: Config) -> Sequence[str]:
@@ -301,7 +301,7 @@ def _corrected(
             if mode == SUBSET and tracked.subset is not None:
                 poses[mode] = tracked.subset
             elif mode == SUBSET:
-                require_believed(tracked.doubts, sweep.orientation_source, where)
+                require_credible(tracked.doubts, sweep.orientation_source, where)
                 left_out[mode] = (
                     f"{where}: expected readings over every frame, got gaps where some are left out"
                 )

@@ -6,12 +6,12 @@ from scipy.spatial.transform import RigidTransform
 from speckle import curves
 
 from speckle3d.examine.images import (
+    doubt_clutter,
+    doubt_connection,
+    doubt_length,
+    doubt_order,
+    doubt_path,
     far_apart,
-    folded,
-    interleaved,
-    severed,
-    standing,
-    undetermined,
 )
 from speckle3d.matching.schedule import PairSchedule
 from speckle3d.matching.table import CorrelationTable
@@ -60,16 +60,16 @@ HONEST = {
 def test_honest_sweeps_are_not_doubted(motion, gain):
     position = HONEST[motion]
     table, usable = table_of(position, gain=gain), np.ones(position.size, dtype=bool)
-    assert interleaved(table, position.size, 0.2) is None
-    assert folded(table, along(position), PATCHES_MM, usable) is None
-    assert severed(table.first[table.median > 0.2], table.second[table.median > 0.2], usable) is None
+    assert doubt_order(table, position.size, 0.2) is None
+    assert doubt_path(table, along(position), PATCHES_MM, usable) is None
+    assert doubt_connection(table.first[table.median > 0.2], table.second[table.median > 0.2], usable) is None
 
 
 @pytest.mark.parametrize("sweeps", [2, 3])
 def test_sweeps_recorded_in_turn_are_refused(sweeps):
     count = 40
     position = np.repeat(np.linspace(0.0, 5.0, count), sweeps)
-    doubt = interleaved(table_of(position, source=np.tile(np.arange(sweeps), count)), position.size, 0.2)
+    doubt = doubt_order(table_of(position, source=np.tile(np.arange(sweeps), count)), position.size, 0.2)
     assert doubt is not None
     assert doubt.refuted
     assert "interleaved" in doubt.suspect
@@ -79,7 +79,7 @@ def test_a_path_that_turns_where_the_images_do_not_is_doubted():
     # Pairs across a turn are as alike as others and on this path nearer to each other.
     once, often = np.where(SWEEP < 6.0, SWEEP, 12.0 - SWEEP), np.abs((SWEEP + 0.5) % 1.0 - 0.5)
     for path, refuted in ((once, False), (often, True)):
-        doubt = folded(table_of(SWEEP), along(path), PATCHES_MM, np.ones(SWEEP.size, dtype=bool))
+        doubt = doubt_path(table_of(SWEEP), along(path), PATCHES_MM, np.ones(SWEEP.size, dtype=bool))
         assert doubt is not None
         assert doubt.refuted == refuted
         ((first, last),) = doubt.frames
@@ -95,7 +95,7 @@ def test_a_path_that_turns_where_the_images_do_not_is_doubted():
 )
 def test_a_length_that_is_left_open_is_doubted(length_mm, sigma_mm, refused):
     position = np.linspace(0.0, length_mm, 20)
-    doubt = undetermined(position, np.linspace(0.0, sigma_mm, 20), 2.5)
+    doubt = doubt_length(position, np.linspace(0.0, sigma_mm, 20), 2.5)
     assert doubt is not None
     assert doubt.refuted == refused
     assert f"{sigma_mm:.3g} mm" in doubt.evidence
@@ -123,7 +123,7 @@ def test_frames_far_apart_are_beyond_the_reach_of_speckle():
     ],
 )
 def test_echoes_that_stand_still_are_doubted(share, refuted):
-    doubt = standing(share, PAIRS, CELLS)
+    doubt = doubt_clutter(share, PAIRS, CELLS)
     assert doubt is not None
     assert doubt.refuted == refuted
 
@@ -132,7 +132,7 @@ def test_a_sweep_in_pieces_is_flagged_at_each_cut():
     usable = np.ones(30, dtype=bool)
     usable[[10, 20]] = False
     chain = np.array([(k, k + 1) for k in range(29) if k + 1 not in (10, 20)])
-    doubt = severed(chain[:, 0], chain[:, 1], usable)
+    doubt = doubt_connection(chain[:, 0], chain[:, 1], usable)
     assert doubt is not None
     assert not doubt.refuted
     assert doubt.frames == ((10, 10), (20, 20))

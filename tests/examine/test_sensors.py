@@ -10,7 +10,7 @@ from speckle3d.core.errors import MismatchError
 from speckle3d.corrections import correct
 from speckle3d.examine.conventions import doubts_of_gyroscope
 from speckle3d.examine.disagreements import differing_lengths, disagreements
-from speckle3d.examine.sensors import cleaned_readings, examined_sensors
+from speckle3d.examine.sensors import examine_sensors, repair_readings
 from speckle3d.motion.direction import settle_direction
 
 AGAINST_THEMSELVES = {
@@ -49,17 +49,17 @@ REFUTED = (
 
 
 def doubts_of(sweep, tracking):
-    examined = examined_sensors(sweep, tracking.image)
-    return examined, disagreements(examined.trusted, tracking.image, tracking.covariance)
+    examined = examine_sensors(sweep, tracking.image)
+    return examined, disagreements(examined.credible, tracking.image, tracking.covariance)
 
 
 def test_good_sensors_are_not_doubted(sweep, tracking):
     assert tracking.doubts == ()
     examined, found = doubts_of(sweep, tracking)
     assert examined.doubts == found == ()
-    assert examined.turn_confirmed
-    assert examined.trusted.tracker is sweep.tracker
-    assert examined.trusted.orientation is sweep.orientation
+    assert examined.tells_direction
+    assert examined.credible.tracker is sweep.tracker
+    assert examined.credible.orientation is sweep.orientation
 
 
 @pytest.mark.parametrize("name", AGAINST_THEMSELVES)
@@ -76,7 +76,7 @@ def test_a_sensor_that_contradicts_itself_is_named(name, sweep, tracking):
 def test_images_and_a_sensor_that_differ_are_told_side_by_side_and_nobody_is_left_out(name, sweep, tracking):
     bad = spoil(sweep, name)
     examined, found = doubts_of(bad, tracking)
-    assert examined.trusted.tracker is not None
+    assert examined.credible.tracker is not None
     assert found
     assert not any(doubt.refuted for doubt in found)
     assert all("by the images" in doubt.evidence and "by the tracker" in doubt.evidence for doubt in found)
@@ -97,14 +97,14 @@ def test_no_sign_is_taken_from_turns_that_nothing_confirms(name, sweep, tracking
     # Without what it measures beside its orientation, only the images are left to say so.
     bare = replace(bad, orientation=replace(bad.orientation, gyroscope_rad_s=None, accelerometer_m_s2=None))
     for recorded in (bad, bare):
-        examined = examined_sensors(recorded, tracking.image)
-        sign = settle_direction(examined.trusted, tracking.image, Config().sensors, examined.turn_confirmed)
+        examined = examine_sensors(recorded, tracking.image)
+        sign = settle_direction(examined.credible, tracking.image, Config().sensors, examined.tells_direction)
         assert sign == (1, "assumed")
 
 
 def test_a_sensor_that_contradicts_itself_gives_no_mode_unless_told_to(sweep, tracking):
     bad = spoil(sweep, "tracker frozen")
-    doubts = examined_sensors(bad, tracking.image).doubts
+    doubts = examine_sensors(bad, tracking.image).doubts
     with pytest.raises(MismatchError, match=r"pose.*tracker.*frozen"):
         correct(replace(tracking, doubts=doubts), bad, ["pose"])
     config = Config(sensors={"examine": False})
@@ -113,7 +113,7 @@ def test_a_sensor_that_contradicts_itself_gives_no_mode_unless_told_to(sweep, tr
 
 def test_spikes_are_left_out_and_counted(sweep, tracking):
     bad = spoil(sweep, "tracker spikes of 30 mm")
-    cleaned, (doubt,) = cleaned_readings(bad)
+    cleaned, (doubt,) = repair_readings(bad)
     places = [each.tracker.readings.world_from_sensor.translation for each in (bad, sweep)]
     spiked = np.linalg.norm(places[0] - places[1], axis=1) > 10.0
     left_out = len(bad.tracker.readings) - len(cleaned.tracker.readings)
@@ -131,7 +131,7 @@ def test_spikes_are_left_out_and_counted(sweep, tracking):
 
 def test_a_gyroscope_on_other_axes_does_not_refute_the_readings(sweep, tracking):
     turned_round = replace(sweep.orientation, gyroscope_rad_s=-sweep.orientation.gyroscope_rad_s)
-    examined = examined_sensors(replace(sweep, tracker=None, orientation=turned_round), tracking.image)
+    examined = examine_sensors(replace(sweep, tracker=None, orientation=turned_round), tracking.image)
     assert [(doubt.refuted, "gyroscope" in doubt.suspect) for doubt in examined.doubts] == [(False, True)]
 
 

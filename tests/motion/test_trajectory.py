@@ -123,7 +123,7 @@ def test_one_false_pair_among_many_is_overruled():
 def test_a_chain_of_equal_steps_is_a_random_walk():
     """More frames than covariances are computed for; those between are interpolated."""
     frames, step = 250, np.diag([4e-4, 1e-4, 9e-4, 1e-8, 1e-8, 1e-8])
-    assert frames > 2 * trajectory.KNOWN_FRAMES
+    assert frames > 2 * trajectory.COVARIANCE_FRAMES
     first = np.arange(frames - 1)
     still = RigidTransform.from_translation(np.zeros((frames - 1, 3)))
     pairs = RelativePoses(first, first + 1, still, np.tile(step, (frames - 1, 1, 1)))

@@ -11,7 +11,7 @@ from speckle3d.core.arrays import IntArray
 from speckle3d.core.doubts import Doubt
 from speckle3d.core.reconstruction import Reconstruction
 from speckle3d.core.sweep import BModeSettings, Sweep, read_frame
-from speckle3d.examine.sensors import cleaned_readings
+from speckle3d.examine.sensors import repair_readings
 from speckle3d.matching.intensity import IntensityExtractor
 from speckle3d.matching.patches import lay_patches
 from speckle3d.matching.quality import FrameFeatures, FrameFlag, flag_frames, inspect_frame
@@ -56,7 +56,7 @@ class FrameFindings:
         self._features: list[FrameFeatures] = []
         trust = None if reconstruction is None else reconstruction.trust
         self.flags: IntArray | None = None if trust is None else trust.flags
-        self.doubts = cleaned_readings(sweep)[1] if doubts is None else tuple(doubts)
+        self.doubts = repair_readings(sweep)[1] if doubts is None else tuple(doubts)
         if trust is None:
             self._extractor = IntensityExtractor(sweep.signal, sweep.grid, config.intensity)
             self._patches = lay_patches(self._extractor.grid, config.patches)
