@@ -12,7 +12,7 @@ SPREAD = (0.002, 0.003, 0.004, 0.1, 0.2, 0.3)
 """Standard errors: tilt, yaw and roll in rad, x, y and z in mm."""
 
 
-def made(sensor="tracker", **changes):
+def example_calibration(sensor="tracker", **changes):
     calibration = Calibration(
         method="plane",
         sensor="tracker",

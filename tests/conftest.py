@@ -102,9 +102,9 @@ def python():
     """Run a few lines in a fresh interpreter and return what it prints."""
 
     def run(code):
-        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300)
-        assert done.returncode == 0, done.stderr
-        return done.stdout
+        process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300)
+        assert process.returncode == 0, process.stderr
+        return process.stdout
 
     return run
 

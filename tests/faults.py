@@ -14,8 +14,8 @@ from speckle3d.core.streams import TimedPoses, TimedRotations
 def spoil(sweep, name):
     """The sweep with a fault of its tracker or orientation sensor, by which its name begins."""
     rng = np.random.default_rng([0, *name.encode()])
-    which = name.split()[0]
-    return replace(sweep, **{which: FAULTS[name](sweep, getattr(sweep, which), rng)})
+    sensor = name.split()[0]
+    return replace(sweep, **{sensor: FAULTS[name](sweep, getattr(sweep, sensor), rng)})
 
 
 def _readings(change):
@@ -35,20 +35,20 @@ def _positions(change):
     )
 
 
-def _scaled(factor):
+def _scale(factor):
     return _positions(lambda places, rng: places * factor)
 
 
-def _stuck(first, last=1.0):
+def _freeze(first, last=1.0):
     """Repeat the reading at share `first` until share `last`."""
 
-    def stuck(poses, rng):
+    def freeze(poses, rng):
         index = np.arange(len(poses))
         start, stop = int(first * len(poses)), int(last * len(poses))
         index[start:stop] = start
         return poses[index]
 
-    return _readings(stuck)
+    return _readings(freeze)
 
 
 def _spikes(places, rng):
@@ -68,52 +68,54 @@ def _random_poses(poses, rng):
     return RigidTransform.from_components(rng.uniform(-300, 300, (n, 3)), Rotation.random(n, rng=rng))
 
 
-def _mount_turned(degrees, axis):
+def _turn_mount(degrees, axis):
     turn = RigidTransform.from_rotation(Rotation.from_euler(axis, degrees, degrees=True))
     return lambda sweep, sensor, rng: replace(sensor, sensor_from_image=sensor.sensor_from_image * turn)
 
 
 def _quaternions(wxyz):
     return _readings(
-        lambda turned, rng: Rotation.from_quat(turned.as_quat(scalar_first=True) * wxyz, scalar_first=True)
+        lambda rotations, rng: Rotation.from_quat(
+            rotations.as_quat(scalar_first=True) * wxyz, scalar_first=True
+        )
     )
 
 
-def _flips(turned, rng):
-    axis = rng.standard_normal((len(turned), 3))
+def _flips(rotations, rng):
+    axis = rng.standard_normal((len(rotations), 3))
     axis *= np.pi / np.linalg.norm(axis, axis=1, keepdims=True)
-    return turned * Rotation.from_rotvec(axis * (rng.random((len(turned), 1)) < 0.05))
+    return rotations * Rotation.from_rotvec(axis * (rng.random((len(rotations), 1)) < 0.05))
 
 
 def _heading_drift(sweep, sensor, rng):
     time_s = sensor.readings.time_s
     turn = Rotation.from_rotvec(np.outer(np.deg2rad(5.0) * (time_s - time_s[0]), [0, 0, 1]))
-    return _readings(lambda turned, _: turn * turned)(sweep, sensor, rng)
+    return _readings(lambda rotations, _: turn * rotations)(sweep, sensor, rng)
 
 
 FAULTS = {
-    "tracker in metres": _scaled(1e-3),
-    "tracker in centimetres": _scaled(0.1),
-    "tracker in inches": _scaled(1 / 25.4),
-    "tracker frozen": _stuck(0.0),
-    "tracker frozen from halfway": _stuck(0.5),
-    "tracker frozen in the middle fifth": _stuck(0.4, 0.6),
+    "tracker in metres": _scale(1e-3),
+    "tracker in centimetres": _scale(0.1),
+    "tracker in inches": _scale(1 / 25.4),
+    "tracker frozen": _freeze(0.0),
+    "tracker frozen from halfway": _freeze(0.5),
+    "tracker frozen in the middle fifth": _freeze(0.4, 0.6),
     "tracker matrices inverted": _readings(lambda poses, rng: poses.inv()),
-    "tracker mount turned by 180 deg about x": _mount_turned(180, "x"),
-    "tracker mount turned by 20 deg about y": _mount_turned(20, "y"),
+    "tracker mount turned by 180 deg about x": _turn_mount(180, "x"),
+    "tracker mount turned by 20 deg about y": _turn_mount(20, "y"),
     "tracker spikes of 30 mm": _positions(_spikes),
     "tracker noise of 3 mm": _positions(lambda places, rng: places + 3.0 * rng.standard_normal(places.shape)),
     "tracker drift of 5 mm": _positions(_drift),
     "tracker random": _readings(_random_poses),
     "orientation stored xyzw": _readings(
-        lambda turned, rng: Rotation.from_quat(turned.as_quat(scalar_first=False), scalar_first=True)
+        lambda rotations, rng: Rotation.from_quat(rotations.as_quat(scalar_first=False), scalar_first=True)
     ),
-    "orientation inverted": _readings(lambda turned, rng: turned.inv()),
+    "orientation inverted": _readings(lambda rotations, rng: rotations.inv()),
     "orientation mirrored": _quaternions([1.0, -1.0, -1.0, 1.0]),
     "orientation x of the other sign": _quaternions([1.0, -1.0, 1.0, 1.0]),
-    "orientation random": _readings(lambda turned, rng: Rotation.random(len(turned), rng=rng)),
+    "orientation random": _readings(lambda rotations, rng: Rotation.random(len(rotations), rng=rng)),
     "orientation spikes of 180 deg": _readings(_flips),
-    "orientation constant": _stuck(0.0),
-    "orientation frozen from halfway": _stuck(0.5),
+    "orientation constant": _freeze(0.0),
+    "orientation frozen from halfway": _freeze(0.5),
     "orientation heading drift of 5 deg/s": _heading_drift,
 }

@@ -7,12 +7,12 @@ import os
 def made_once(tmp_path_factory, name, make):
     """Folder of a name that `make` has filled, in this run of the tests; nothing may change it afterwards."""
     base = tmp_path_factory.getbasetemp()
-    shared = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
-    folder, done = shared / name, shared / f"{name}.made"
-    with open(shared / f"{name}.lock", "w", encoding="utf-8") as lock:
+    root = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+    folder, marker = root / name, root / f"{name}.made"
+    with open(root / f"{name}.lock", "w", encoding="utf-8") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        if not done.exists():
+        if not marker.exists():
             folder.mkdir()
             make(folder)
-            done.touch()
+            marker.touch()
     return folder

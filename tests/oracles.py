@@ -26,13 +26,13 @@ def between_images(images, grid, world_from_image, points_mm, reach_mm, alone_mm
         d = np.where(side & ~np.isnan(level), np.abs(away), np.inf)
         k = d.argmin(axis=0), np.arange(d.shape[1])
         sides += [d[k], np.where(np.isfinite(d[k]), level[k], np.nan)]
-    behind, one, front, other = sides
-    both, measured = np.isfinite(behind + front), np.minimum(behind, front) <= alone_mm
+    behind, low, front, high = sides
+    between, near = np.isfinite(behind + front), np.minimum(behind, front) <= alone_mm
     with np.errstate(invalid="ignore"):
-        blend = np.where(behind > 0, one + behind / (behind + front) * (other - one), one)
-    found = np.where(both, blend, np.where(np.isfinite(behind), one, other))
-    measured &= ~np.isnan(found)
-    return np.where(measured | both, found, np.nan), np.where(measured, 1, 2 * both)
+        blend = np.where(behind > 0, low + behind / (behind + front) * (high - low), low)
+    values = np.where(between, blend, np.where(np.isfinite(behind), low, high))
+    near &= ~np.isnan(values)
+    return np.where(near | between, values, np.nan), np.where(near, 1, 2 * between)
 
 
 def splat(images, index, shape, splat, rule, weights):
@@ -42,24 +42,24 @@ def splat(images, index, shape, splat, rule, weights):
     """
     mean, over, best = np.zeros(shape), np.zeros(shape), np.full(shape, np.nan)
     for levels, points, weight in zip(images.astype(float), index, weights, strict=True):
-        own, own_over = np.zeros(shape), np.zeros(shape)
-        for at, share in _reached(points, splat):
-            kept = ((at >= 0) & (at < shape)).all(axis=-1) & ~np.isnan(levels) & (share > 0) & (weight > 0)
+        total, total_weight = np.zeros(shape), np.zeros(shape)
+        for at, share in _corners(points, splat):
+            valid = ((at >= 0) & (at < shape)).all(axis=-1) & ~np.isnan(levels) & (share > 0) & (weight > 0)
             if rule in ("latest", "maximum") and splat == "linear":
-                kept &= share >= 0.125
-            where = tuple(at[kept].T)
-            np.add.at(own, where, (share * weight * levels)[kept])
-            np.add.at(own_over, where, (share * weight)[kept])
-            np.fmax.at(best, where, levels[kept])
+                valid &= share >= 0.125
+            where = tuple(at[valid].T)
+            np.add.at(total, where, (share * weight * levels)[valid])
+            np.add.at(total_weight, where, (share * weight)[valid])
+            np.fmax.at(best, where, levels[valid])
         if rule == "latest":
-            mean[own_over > 0], over[own_over > 0] = 0.0, 0.0
-        mean, over = mean + own, over + own_over
+            mean[total_weight > 0], over[total_weight > 0] = 0.0, 0.0
+        mean, over = mean + total, over + total_weight
     if rule == "maximum":
         return best
     return np.divide(mean, over, out=np.full(shape, np.nan), where=over > 0)
 
 
-def _reached(points, splat):
+def _corners(points, splat):
     """Voxels (..., 3) that points give something, one for each corner, and the share they give it."""
     if splat == "nearest":
         yield np.floor(points + 0.5 + 2.0**-24).astype(int), np.ones(points.shape[:-1])
@@ -84,16 +84,16 @@ def linear_array_response(points_mm, frequency_hz, *, step_mm, pitch_mm, element
     z = ((np.arange(round(height_mm / step_mm)) + 0.5) / round(height_mm / step_mm) - 0.5) * height_mm
     lens_path = lens_focus_mm - np.sqrt(lens_focus_mm**2 + z**2)
     k = 2e-3 * np.pi * np.asarray(frequency_hz) / speed_m_s
-    turned = []
+    apertures = []
     for focus, width in zip(focus_mm, widths_mm, strict=True):
         hump = edge_weight + (1 - edge_weight) * np.cos(np.pi * element / width) ** 2
         weight = np.where(np.abs(element) <= width / 2, hump, 0)
-        turned.append(weight[:, None] * np.exp(-1j * np.outer(focus - np.sqrt(focus**2 + element**2), k)))
+        apertures.append(weight[:, None] * np.exp(-1j * np.outer(focus - np.sqrt(focus**2 + element**2), k)))
     out = []
     for px, py, pz in points_mm:
         r = np.sqrt((px - x[:, :, None]) ** 2 + py**2 + (pz - z) ** 2)[..., None]
         field = (py / r**2 * np.exp(-1j * k * (r + lens_path[:, None]))).sum(axis=(1, 2))
-        out.append(np.prod([(each * field).sum(axis=0) for each in turned], axis=0))
+        out.append(np.prod([(aperture * field).sum(axis=0) for aperture in apertures], axis=0))
     return np.array(out)
 
 
@@ -137,8 +137,8 @@ def of_patches(fixed, moving, first, size, shift, least_overlap, alike):
         b = {lag: moving[tuple((at + about + np.subtract(lag, 1)).T)] for lag in np.ndindex(3, 3)}
         common = np.isfinite([a, *b.values()]).all(axis=0)
         if common.any() and common.sum() >= least_overlap * common.size:
-            for lag, theirs in b.items():
-                out[p][lag] = alike(a[common], theirs[common], places[common])
+            for lag, second_samples in b.items():
+                out[p][lag] = alike(a[common], second_samples[common], places[common])
     return out
 
 
@@ -151,7 +151,7 @@ def coherence(ramp_rad):
 
     def alike(a, b, places):
         energy = np.vdot(a, a).real * np.vdot(b, b).real
-        turned = b * np.exp(1j * places @ ramp_rad)
-        return np.abs(np.vdot(a, turned)) ** 2 / energy if energy > 0 else np.nan
+        aligned = b * np.exp(1j * places @ ramp_rad)
+        return np.abs(np.vdot(a, aligned)) ** 2 / energy if energy > 0 else np.nan
 
     return alike

@@ -16,34 +16,34 @@ def problem_of(curves, patches, grid, frames=2, **settings):
     )
 
 
-def table_of(rho, moved_mm=(0.0, 0.0), first=None, second=None):
+def table_of(rho, shift_mm=(0.0, 0.0), first=None, second=None):
     """Pairs of frames 0 and 1, or of others, with correlations of shape (e, p)."""
     rho = np.asarray(rho, np.float32)
-    motion = np.tile([*moved_mm, 0.0], (len(rho), 1)), np.tile(1e-6 * np.eye(3), (len(rho), 1, 1))
+    motion = np.tile([*shift_mm, 0.0], (len(rho), 1)), np.tile(1e-6 * np.eye(3), (len(rho), 1, 1))
     first = np.zeros(len(rho), int) if first is None else np.asarray(first)
     second = np.ones(len(rho), int) if second is None else np.asarray(second)
     return CorrelationTable(first, second, rho, *motion)
 
 
-def fit_many(problem, rho, moved_mm=(0.0, 0.0), models=None, **known):
+def fit_many(problem, rho, shift_mm=(0.0, 0.0), models=None, **priors):
     """Planes of pairs from correlations of shape (e, p), and which are determined."""
     models = models or fully_developed(rho.shape[1])
-    return pair_planes(problem, table_of(rho, moved_mm), np.arange(len(rho)), models, **known)
+    return pair_planes(problem, table_of(rho, shift_mm), np.arange(len(rho)), models, **priors)
 
 
-def fit(problem, rho, moved_mm=(0.0, 0.0), share=None, gain=None, **known):
+def fit(problem, rho, shift_mm=(0.0, 0.0), share=None, gain=None, **priors):
     """Plane of one pair, from correlations of shape (p,); None if they determine none."""
-    alone = {name: np.asarray(value)[None] for name, value in known.items()}
+    alone = {name: np.asarray(value)[None] for name, value in priors.items()}
     models = None if share is None else EchoModels(share[None], gain[None])
-    planes, determined = fit_many(problem, np.asarray(rho)[None], moved_mm, models=models, **alone)
-    if not determined[0]:
+    planes, is_determined = fit_many(problem, np.asarray(rho)[None], shift_mm, models=models, **alone)
+    if not is_determined[0]:
         return None
     offset, slope_x, slope_y = planes.coefficients[0]
     fields = {name: value[0] for name, value in vars(planes).items()}
     return SimpleNamespace(offset_mm=offset, slope_x=slope_x, slope_y=slope_y, **fields)
 
 
-def made(first, second, coefficients, covariance, patches=1):
+def from_coefficients(first, second, coefficients, covariance, patches=1):
     """Planes given by their coefficients, (e, 3), and covariances, (e, 3, 3) or one for all."""
     coefficients = np.asarray(coefficients, float).reshape(-1, 3)
     pairs = len(coefficients)

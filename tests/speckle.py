@@ -53,7 +53,7 @@ class Speckle:
         ]
         self.origin = np.array([-margin_mm, grid.first_sample_depth_mm - margin_mm])
 
-    def seen(self, x_mm=0.0, y_mm=0.0, roll_rad=0.0):
+    def image(self, x_mm=0.0, y_mm=0.0, roll_rad=0.0):
         """Complex amplitude, shape (vector, sample), of an image moved in its plane about its centre."""
         g = self.grid
         x = np.arange(g.vectors) * g.vector_pitch_mm - g.centre_mm[0]
@@ -74,9 +74,9 @@ def intensity(amplitude):
     return (np.abs(amplitude) ** 2).astype(np.float32)
 
 
-def decorrelated(amplitude, other, rho):
+def mix(amplitude, independent, rho):
     """`amplitude` mixed with independent speckle so that intensities correlate by `rho`."""
-    return np.sqrt(rho) * amplitude + np.sqrt(1.0 - rho) * other
+    return np.sqrt(rho) * amplitude + np.sqrt(1.0 - rho) * independent
 
 
 RF = RFSettings(

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 
-def spoiled(sweep, frames, order=None):
+def with_frames(sweep, frames, order=None):
     """A sweep of other frames at its own rate, without sensors; `order`: the frames whose truth they have."""
     order = np.arange(len(frames)) if order is None else np.asarray(order)
     step = float(np.median(np.diff(sweep.frame_time_s)))
@@ -19,18 +19,18 @@ def spoiled(sweep, frames, order=None):
     )
 
 
-def narrowed(sweep):
+def first_vectors(sweep):
     """The first 24 vectors of a sweep, held in memory."""
     frames = np.stack([sweep.frames[k][:24] for k in range(len(sweep))]).astype(np.float32)
-    return spoiled(replace(sweep, frames=frames, grid=replace(sweep.grid, vectors=24)), frames)
+    return with_frames(replace(sweep, frames=frames, grid=replace(sweep.grid, vectors=24)), frames)
 
 
-def shadowed(sweep, columns, rows):
+def shadow(sweep, columns, rows):
     """A bone's shadow: nothing but fresh noise of 3 counts in some vectors and samples of every frame."""
     rng = np.random.default_rng(5)
     frames = np.array([sweep.frames[k] for k in range(len(sweep))], np.float32)
     frames[:, columns, rows] *= 0.002
-    return spoiled(sweep, np.rint(frames + rng.normal(0.0, 3.0, frames.shape)))
+    return with_frames(sweep, np.rint(frames + rng.normal(0.0, 3.0, frames.shape)))
 
 
 def ringing(sweep, columns):
@@ -39,10 +39,10 @@ def ringing(sweep, columns):
     frames = np.array([sweep.frames[k] for k in range(len(sweep))], np.float32)
     sample = np.arange(frames.shape[2])
     frames[:, columns] = 800.0 * np.exp(-sample / 150.0) * np.sin(0.7 * sample)
-    return spoiled(sweep, np.rint(frames + rng.normal(0.0, 3.0, frames.shape)))
+    return with_frames(sweep, np.rint(frames + rng.normal(0.0, 3.0, frames.shape)))
 
 
-def labelled(sweep):
+def text_overlay(sweep):
     """White dots among the letters' strokes, in three blocks of a third of the image by a tenth."""
     rng = np.random.default_rng(7)
     frames = np.array([sweep.frames[k] for k in range(len(sweep))], np.float32)
@@ -50,12 +50,12 @@ def labelled(sweep):
     for vector, sample in ((0, 2 * high), (wide + 8, 4.5 * high), (2, 7 * high)):
         block = np.s_[:, vector : vector + wide, int(sample) : int(sample) + high]
         frames[block][:, rng.random((wide, high)) < 0.02] = 255
-    return spoiled(sweep, frames)
+    return with_frames(sweep, frames)
 
 
 def in_order(sweep, order):
     """Frames of a sweep in another order, some of them twice or not at all."""
-    return spoiled(sweep, sweep.frames[np.asarray(order)], order)
+    return with_frames(sweep, sweep.frames[np.asarray(order)], order)
 
 
 def level_by_depth(frames):
@@ -68,10 +68,10 @@ def at_rest(sweep, snr_db):
     """A probe that rests on the first frame's tissue, with fresh noise in every frame."""
     level = 10 ** (-snr_db / 20) * level_by_depth(sweep.frames[:1])
     noise = level * np.random.default_rng(1).standard_normal(sweep.frames.shape)
-    return spoiled(sweep, sweep.frames[:1] + noise, np.zeros(len(sweep), dtype=int))
+    return with_frames(sweep, sweep.frames[:1] + noise, np.zeros(len(sweep), dtype=int))
 
 
-def cluttered(sweep, pattern):
+def clutter(sweep, pattern):
     """The same pattern added to every frame, as strong at each depth as the signal is."""
     pattern = pattern / np.maximum(level_by_depth(pattern[None]), 1e-9)
-    return spoiled(sweep, sweep.frames + level_by_depth(sweep.frames) * pattern)
+    return with_frames(sweep, sweep.frames + level_by_depth(sweep.frames) * pattern)

@@ -32,7 +32,7 @@ VOLUME = Volume(
 
 
 @contextmanager
-def limited(size):
+def file_size_limit(size):
     """Let no file of this process become larger than `size` bytes."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
@@ -60,21 +60,25 @@ def test_a_full_disk_is_one_line_and_the_old_file_stays(tmp_path, name, capfd):
     if name == "attached.h5":
         write_sweep(path, SWEEP)
     WRITERS[name](path)
-    before = {each.name: each.read_bytes() for each in tmp_path.iterdir()}
+    before = {file.name: file.read_bytes() for file in tmp_path.iterdir()}
     size = len(before[name])
     # The last bytes are those that are lost silently: they are written when the file is closed.
     for room in (size // 2, size - 1):
-        with limited(room), pytest.raises(NoSpaceError, match=FULL) as caught:
+        with file_size_limit(room), pytest.raises(NoSpaceError, match=FULL) as error:
             WRITERS[name](path)
-        assert str(path) in str(caught.value)
-        assert "\n" not in str(caught.value)
-        assert ".part-" not in str(caught.value)
-        assert {each.name: each.read_bytes() for each in tmp_path.iterdir()} == before
+        assert str(path) in str(error.value)
+        assert "\n" not in str(error.value)
+        assert ".part-" not in str(error.value)
+        assert {file.name: file.read_bytes() for file in tmp_path.iterdir()} == before
     assert capfd.readouterr().err == ""
 
 
 def test_a_recording_keeps_what_fitted(tmp_path):
-    with limited(1200), closing(RawFile(tmp_path / "r.mtb")) as file, pytest.raises(NoSpaceError, match=FULL):
+    with (
+        file_size_limit(1200),
+        closing(RawFile(tmp_path / "r.mtb")) as file,
+        pytest.raises(NoSpaceError, match=FULL),
+    ):
         file.append(bytes(50000))
     assert (tmp_path / "r.mtb").stat().st_size == 1200
 
@@ -89,9 +93,9 @@ main()
 
 def test_the_command_ends_with_one_line_and_no_crash(data_folder, tmp_path):
     arguments = ("convert", str(data_folder / "phantom.h5"), str(tmp_path / "copy.h5"))
-    done = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-c", COMMAND, *arguments], capture_output=True, text=True, timeout=60
     )
-    assert done.returncode == 1
-    assert done.stderr.splitlines()[-1] == f"speckle3d: {tmp_path / 'copy.h5'}: cannot be written: {FULL}"
+    assert process.returncode == 1
+    assert process.stderr.splitlines()[-1] == f"speckle3d: {tmp_path / 'copy.h5'}: cannot be written: {FULL}"
     assert list(tmp_path.iterdir()) == []

@@ -15,10 +15,10 @@ def part(sweep):
     return replace(sweep.part(0, 32), tracker=None, orientation=None)
 
 
-def turned_over(curves):
+def reverse(curves):
     """Curves reversed in depth, all that belongs to a depth with them."""
-    tilt = TiltResponse(*(each[::-1].copy() for each in vars(curves.tilt).values()))
-    size = SpeckleSize(*(each[::-1].copy() for each in vars(curves.speckle).values()))
+    tilt = TiltResponse(*(field[::-1].copy() for field in vars(curves.tilt).values()))
+    size = SpeckleSize(*(field[::-1].copy() for field in vars(curves.speckle).values()))
     rho, cells = curves.correlation[::-1].copy(), curves.cells[::-1].copy()
     return replace(curves, correlation=rho, cells=cells, tilt=tilt, speckle=size)
 
@@ -31,7 +31,7 @@ def at_rate(sweep, factor):
 
 def test_reversed_curves_are_refused(part, curves):
     with pytest.raises(MismatchError, match="all depths"):
-        track(part, turned_over(curves))
+        track(part, reverse(curves))
 
 
 def test_scaled_distances_are_refused(part, curves):
@@ -46,7 +46,7 @@ def test_curves_of_other_depths_are_refused(part, curves):
 
 
 def test_curves_and_sweep_at_another_sampling_rate_are_refused(part, curves):
-    other = at_rate(part, 2.0)
-    key = replace(curves.key, signal=other.signal)
+    resampled = at_rate(part, 2.0)
+    key = replace(curves.key, signal=resampled.signal)
     with pytest.raises(MismatchError, match=r"^phantom: (images: expected echoes|the curves do not match)"):
-        track(other, replace(curves, key=key))
+        track(resampled, replace(curves, key=key))

@@ -17,25 +17,25 @@ from speckle3d.tracking import track
 
 def test_steps_follow_the_truth(sweep, tracking):
     centre = sweep.grid.centre_mm
-    found, true = ((p[:-1].inv() * p[1:]).apply(centre) - centre for p in (tracking.image, sweep.truth))
+    steps, true = ((p[:-1].inv() * p[1:]).apply(centre) - centre for p in (tracking.image, sweep.truth))
     # Two vectors' pitch is 0.6 mm, a step 0.13 mm on average: a tenth of a pitch and of a millimetre.
-    assert np.sqrt(np.mean((found - true) ** 2, axis=0)) == pytest.approx(0, abs=0.04)
-    assert np.corrcoef(found[:, 2], true[:, 2])[0, 1] > 0.9
+    assert np.sqrt(np.mean((steps - true) ** 2, axis=0)) == pytest.approx(0, abs=0.04)
+    assert np.corrcoef(steps[:, 2], true[:, 2])[0, 1] > 0.9
 
 
 def test_progress_images_and_pairs_come_in_order(sweep, curves):
     progress, images, pairs = [], [], []
     short = sweep.part(0, 12)
-    found = track(
+    tracking = track(
         short,
         curves,
-        progress=lambda done, total: progress.append((done, total)),
+        progress=lambda *step: progress.append(step),
         sink=pairs.append,
         images=lambda index, image: images.append((index, image.shape[0])),
     )
     assert progress == [(i + 1, 12) for i in range(12)]
     assert images == [(i, sweep.grid.vectors) for i in range(12)]
-    assert sum(len(table) for table in pairs) == found.pairs
+    assert sum(len(table) for table in pairs) == tracking.pairs
     seconds = np.concatenate([table.second for table in pairs])
     assert (np.diff(seconds) >= 0).all()
     assert all((table.first < table.second).all() for table in pairs)
@@ -45,11 +45,11 @@ def test_setting_then_tracker_then_nothing_settles_the_direction(sweep, tracking
     assert tracking.direction_from == "tracker"
     assert not tracking.flags.any()
     bare = replace(sweep, tracker=None, orientation=None, truth=None)
-    other = mirrored(tracking.image)
+    mirror_image = mirrored(tracking.image)
     assert settle_direction(sweep, tracking.image, SensorSettings()) == (1, "tracker")
-    assert settle_direction(sweep, other, SensorSettings()) == (-1, "tracker")
+    assert settle_direction(sweep, mirror_image, SensorSettings()) == (-1, "tracker")
     assert settle_direction(sweep, tracking.image, SensorSettings(direction=-1)) == (-1, "setting")
-    assert settle_direction(bare, other, SensorSettings()) == (1, "assumed")
+    assert settle_direction(bare, mirror_image, SensorSettings()) == (1, "assumed")
 
 
 def spoilt(sweep, numbers, change):
@@ -67,44 +67,44 @@ def test_frames_without_speckle_are_flagged_and_too_many_refused(sweep, curves):
         return rng.normal(0, 300, frame.shape)
 
     # The last three share nothing with anything; with the last twelve it is no sweep any more.
-    found = track(spoilt(short, range(17, 20), noise), curves)
-    assert np.flatnonzero(found.flags).tolist() == [17, 18, 19]
-    assert (found.flags[17:] & (FrameFlag.NO_SPECKLE | FrameFlag.LIFTED)).all()
+    tracking = track(spoilt(short, range(17, 20), noise), curves)
+    assert np.flatnonzero(tracking.flags).tolist() == [17, 18, 19]
+    assert (tracking.flags[17:] & (FrameFlag.NO_SPECKLE | FrameFlag.LIFTED)).all()
     with pytest.raises(InsufficientDataError, match="frames"):
         track(spoilt(short, range(8, 20), noise), curves)
 
 
-@pytest.mark.parametrize("lost", [(20, 21, 22, 23), (9, 10, 11)])
-def test_the_path_goes_on_past_frames_without_speckle(sweep, curves, lost):
+@pytest.mark.parametrize("gap", [(20, 21, 22, 23), (9, 10, 11)])
+def test_the_path_goes_on_past_frames_without_speckle(sweep, curves, gap):
     """Where the next is 0.6 mm on, speckle itself has little left."""
-    found = track(spoilt(sweep.part(0, 48), lost, np.zeros_like), curves)
-    assert np.flatnonzero(found.flags).tolist() == list(lost)
+    tracking = track(spoilt(sweep.part(0, 48), gap, np.zeros_like), curves)
+    assert np.flatnonzero(tracking.flags).tolist() == list(gap)
     centre = sweep.grid.centre_mm
-    true, seen = (path[0].inv() * path[47] for path in (sweep.truth, found.image))
-    assert seen.apply(centre)[2] == pytest.approx(true.apply(centre)[2], rel=0.06)
+    true, estimate = (path[0].inv() * path[47] for path in (sweep.truth, tracking.image))
+    assert estimate.apply(centre)[2] == pytest.approx(true.apply(centre)[2], rel=0.06)
 
 
 @pytest.mark.parametrize("value", [0.0, np.nan])
 def test_a_sweep_goes_on_from_frames_without_echo_at_its_start(sweep, curves, value):
-    found = track(spoilt(sweep.part(0, 20), [0, 1], lambda frame: np.full_like(frame, value)), curves)
-    assert (found.flags[:2] & FrameFlag.NO_SPECKLE).all()
-    assert not found.flags[3:].any()
+    tracking = track(spoilt(sweep.part(0, 20), [0, 1], lambda frame: np.full_like(frame, value)), curves)
+    assert (tracking.flags[:2] & FrameFlag.NO_SPECKLE).all()
+    assert not tracking.flags[3:].any()
 
 
 @pytest.mark.parametrize("flag", [FrameFlag.SATURATED, FrameFlag.NO_SPECKLE])
 def test_a_spoilt_frame_is_placed_between_its_neighbours_and_not_trusted(sweep, curves, flag):
     short = sweep.part(0, 24)
-    good = track(short, curves)
+    clean_tracking = track(short, curves)
     gain = 30 if flag == FrameFlag.SATURATED else 0
-    found = track(spoilt(short, [11], lambda f: np.clip(gain * f.astype(int), -8192, 8191)), curves)
-    assert found.flags[11] & flag
-    assert not np.delete(found.flags, 11).any()
+    tracking = track(spoilt(short, [11], lambda f: np.clip(gain * f.astype(int), -8192, 8191)), curves)
+    assert tracking.flags[11] & flag
+    assert not np.delete(tracking.flags, 11).any()
     centre = sweep.grid.centre_mm
-    z, expected = (each.image.apply(centre)[:, 2] for each in (found, good))
+    z, expected = (t.image.apply(centre)[:, 2] for t in (tracking, clean_tracking))
     # Some eight frames to the millimetre: a frame between its neighbours is a tremor off.
     assert np.abs(np.delete(z - expected, 11)).max() < 0.02
     assert abs(z[11] - expected[11]) < 0.08
-    deviation = np.sqrt(found.covariance[:, 2, 2])
+    deviation = np.sqrt(tracking.covariance[:, 2, 2])
     assert deviation[11] > 3 * np.delete(deviation, [0, 11]).max()
 
 
@@ -117,8 +117,8 @@ def test_curves_of_intensity_do_not_serve_echoes(sweep, curves):
 def test_curves_beside_a_recording_are_taken_and_said(data_folder):
     sweep = load_sweep(data_folder / "phantom.h5").part(0, 12)
     with pytest.warns(UserWarning, match=r"curves\.h5, by phantom; .* % \(95 %\)"):
-        found = track(sweep)
+        tracking = track(sweep)
     expected = track(sweep, read_curves(data_folder / "curves.h5"))
-    np.testing.assert_array_equal(found.image.as_matrix(), expected.image.as_matrix())
+    np.testing.assert_array_equal(tracking.image.as_matrix(), expected.image.as_matrix())
     with pytest.raises(InvalidInputError, match="load_curves"):
         track(replace(sweep, path=None))

@@ -15,7 +15,7 @@ from speckle3d.tracking import track
 @pytest.fixture(scope="module")
 def narrow(sweep):
     """Two columns of patches of the shipped sweep."""
-    return spoil.narrowed(sweep)
+    return spoil.first_vectors(sweep)
 
 
 @pytest.fixture(scope="module")
@@ -24,18 +24,18 @@ def pattern(narrow):
     return narrow.frames[40][::-1].copy()
 
 
-def length_of(sweep, found):
+def length_of(sweep, tracking):
     """Farthest distance travelled by truth and as found, and the standard error claimed there, mm."""
     centre = sweep.grid.centre_mm
     true = (sweep.truth[0].inv() * sweep.truth).apply(centre)[:, 2]
     at = int(np.argmax(np.abs(true)))
-    seen = found.image.apply(centre)[:, 2]
-    return abs(true[at]), abs(seen[at]), float(np.sqrt(found.covariance[at, 2, 2]))
+    estimate = tracking.image.apply(centre)[:, 2]
+    return abs(true[at]), abs(estimate[at]), float(np.sqrt(tracking.covariance[at, 2, 2]))
 
 
 def test_static_clutter_as_strong_as_the_signal_is_refused(narrow, curves, pattern):
     with pytest.raises(InsufficientDataError, match="static clutter"):
-        track(spoil.cluttered(narrow, pattern), curves)
+        track(spoil.clutter(narrow, pattern), curves)
 
 
 def test_noise_on_a_probe_at_rest_is_no_sweep(narrow, curves):
@@ -44,12 +44,12 @@ def test_noise_on_a_probe_at_rest_is_no_sweep(narrow, curves):
 
 
 def test_a_shadow_is_left_out_and_told_and_the_length_stays(sweep, curves):
-    spoilt = spoil.shadowed(sweep.part(0, 48), slice(12, 36), slice(1200, None))
-    found = track(spoilt, curves)
-    true, seen, claimed = length_of(spoilt, found)
-    assert abs(seen / true - 1) < 0.03
-    assert abs(seen - true) < 2 * claimed
-    assert any("which is left out" in str(doubt) for doubt in found.doubts)
+    spoilt = spoil.shadow(sweep.part(0, 48), slice(12, 36), slice(1200, None))
+    tracking = track(spoilt, curves)
+    true, estimate, sigma = length_of(spoilt, tracking)
+    assert abs(estimate / true - 1) < 0.03
+    assert abs(estimate - true) < 2 * sigma
+    assert any("which is left out" in str(doubt) for doubt in tracking.doubts)
 
 
 @pytest.mark.parametrize("signal", ["rf", "bmode"])
@@ -57,12 +57,12 @@ def test_what_stands_still_is_left_out_and_the_length_stays(sweep, curves, signa
     """Ringing in a gap of gel over a third of the image; text on images of grey."""
     part = sweep.part(0, 48)
     if signal == "rf":
-        spoilt, own = spoil.ringing(part, slice(0, 16)), curves
+        spoilt, probe_curves = spoil.ringing(part, slice(0, 16)), curves
     else:
         part = received(part, dynamic_range_db=60.0)
-        spoilt, own = spoil.labelled(part), data_sheet_curves(SHEET, part)
-    clean, found = (length_of(some, track(some, own)) for some in (part, spoilt))
-    assert found[1] == pytest.approx(clean[1], rel=0.015)
+        spoilt, probe_curves = spoil.text_overlay(part), data_sheet_curves(SHEET, part)
+    clean, spoilt = (length_of(s, track(s, probe_curves)) for s in (part, spoilt))
+    assert spoilt[1] == pytest.approx(clean[1], rel=0.015)
 
 
 def test_what_stands_still_outside_the_region_changes_nothing(sweep, curves):
@@ -70,16 +70,16 @@ def test_what_stands_still_outside_the_region_changes_nothing(sweep, curves):
     frames = np.array([part.frames[k] for k in range(len(part))], np.float32)
     frames[:, 24:] = frames[0, 24:]
     settings = Config(patches={"region": "rectangle 0,0 7,40"})
-    true, seen, claimed = length_of(part, track(spoil.spoiled(part, frames), curves, settings))
-    assert abs(seen / true - 1) < 0.03
-    assert abs(seen - true) < 2 * claimed
+    true, estimate, sigma = length_of(part, track(spoil.with_frames(part, frames), curves, settings))
+    assert abs(estimate / true - 1) < 0.03
+    assert abs(estimate - true) < 2 * sigma
 
 
 @pytest.mark.slow
 def test_a_gap_is_told_and_counts_in_the_error(narrow, curves):
     sweep = spoil.in_order(narrow, [*range(40), *range(56, 96)])
-    found = track(sweep, curves)
-    true, seen, sigma = length_of(sweep, found)
-    assert ["frames lost" in doubt.suspect for doubt in found.doubts] == [True]
+    tracking = track(sweep, curves)
+    true, estimate, sigma = length_of(sweep, tracking)
+    assert ["frames lost" in doubt.suspect for doubt in tracking.doubts] == [True]
     assert sigma > 0.8
-    assert abs(seen - true) < 4 * sigma
+    assert abs(estimate - true) < 4 * sigma

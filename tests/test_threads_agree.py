@@ -12,23 +12,23 @@ from speckle3d.tracking import track
 
 
 def poses_of(tracking, sweep):
-    corrected = correct(tracking, sweep, ["orientation", "pose"])
+    modes = correct(tracking, sweep, ["orientation", "pose"])
     return {
         "image": tracking.image.as_matrix(),
         "covariance": tracking.covariance,
         "subset": tracking.subset.as_matrix(),
         "flags": tracking.flags,
-    } | {mode: each.poses.as_matrix() for mode, each in corrected.items()}
+    } | {mode: m.poses.as_matrix() for mode, m in modes.items()}
 
 
 def test_poses_do_not_depend_on_threads(sweep, curves, many_threads):
     part = sweep.part(0, 40)
-    shared = poses_of(track(part, curves), part)
-    with pytest.MonkeyPatch.context() as one:
-        one.setattr(threads, "cores", lambda: 1)
-        alone = poses_of(track(part, curves), part)
-    for name, values in alone.items():
-        np.testing.assert_array_equal(shared[name], values, err_msg=name)
+    threaded = poses_of(track(part, curves), part)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(threads, "cores", lambda: 1)
+        single = poses_of(track(part, curves), part)
+    for name, values in single.items():
+        np.testing.assert_array_equal(threaded[name], values, err_msg=name)
 
 
 class OneBuffer:
@@ -49,6 +49,6 @@ class OneBuffer:
 
 def test_frames_that_share_their_memory_are_read_one_at_a_time(sweep, curves, many_threads):
     part = sweep.part(0, 24)
-    shared = track(replace(part, frames=OneBuffer(part.frames)), curves)
-    np.testing.assert_array_equal(shared.image.as_matrix(), track(part, curves).image.as_matrix())
-    assert not shared.flags.any()
+    from_buffer = track(replace(part, frames=OneBuffer(part.frames)), curves)
+    np.testing.assert_array_equal(from_buffer.image.as_matrix(), track(part, curves).image.as_matrix())
+    assert not from_buffer.flags.any()

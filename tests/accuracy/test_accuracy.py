@@ -12,9 +12,9 @@ LEAST_PERCENT, LEAST_DEG = 0.3, 0.1
 """Errors so small are luck of the draw: a change that means nothing moves them by as much."""
 
 TABLE = read_table()
-CLAIMED = {row: values for row, values in TABLE.items() if "claim_percent" in values}
+CLAIMS = {row: values for row, values in TABLE.items() if "claim_percent" in values}
 every_row = pytest.mark.parametrize("row", TABLE)
-every_claim = pytest.mark.parametrize("row", CLAIMED)
+every_claim = pytest.mark.parametrize("row", CLAIMS)
 
 
 @pytest.fixture(scope="session")

@@ -77,16 +77,16 @@ def spoilt(sweep, is_bmode):
     """The same sweep at rest, as machines show it where something is in the way."""
     _, vectors, samples = sweep.frames.shape
     third = vectors // 3
-    yield "a third in shadow", spoil.shadowed(sweep, slice(third, 2 * third), slice(samples // 4, None))
+    yield "a third in shadow", spoil.shadow(sweep, slice(third, 2 * third), slice(samples // 4, None))
     yield "a third without contact", spoil.ringing(sweep, slice(0, third))
     if not is_bmode:
         return
     image = in_memory(grey(sweep))
-    yield "text", spoil.labelled(image)
+    yield "text", spoil.text_overlay(image)
     for count in (2, 3):
         sums = np.cumsum(np.pad(image.frames.astype(float), ((1, 0), (0, 0), (0, 0))), axis=0)
         means = np.rint((sums[count:] - sums[:-count]) / count).astype(np.uint8)
-        yield f"means of {count} frames", spoil.spoiled(image, means, range(count - 1, len(image)))
+        yield f"means of {count} frames", spoil.with_frames(image, means, range(count - 1, len(image)))
     pitch = image.grid.vector_pitch_mm, image.grid.sample_spacing_mm
     for range_db in (40.0, 80.0):
         image = in_memory(received(sweep, dynamic_range_db=range_db))

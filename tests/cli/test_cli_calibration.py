@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from calibration_files import made
+from calibration_files import example_calibration
 from scipy.spatial.transform import Rotation
 
 from speckle3d.io.calibrations import write_calibration
@@ -22,7 +22,7 @@ def test_a_turned_calibration_turns_the_reference(run, bench, sweep, tmp_path):
     own, path, grid = sweep.tracker.sensor_from_image, tmp_path / "cal.h5", GreyImages(sweep, 60.0).grid
     turned = {"rotation": own.rotation * about_z, "translation_mm": own.translation, "time_offset_s": None}
     pixel_mm = np.array([grid.vector_pitch_mm, grid.sample_spacing_mm])
-    write_calibration(path, made("tracker", pixel_mm=pixel_mm, **turned))
+    write_calibration(path, example_calibration("tracker", pixel_mm=pixel_mm, **turned))
     options = ("--drift", "pose", "--calibration", path)
     code, _, err = run("reconstruct", bench / "sweep.h5", "-o", tmp_path / "o", *options)
     assert code == 0, err

@@ -2,7 +2,7 @@
 
 import h5py
 import pytest
-from calibration_files import made
+from calibration_files import example_calibration
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.io.calibrations import read_calibration, write_calibration
@@ -17,7 +17,7 @@ def held(back, tmp_path):
         mounting = RigidTransform.from_matrix(file["tracker"].attrs["sensor_from_image"])
     path = tmp_path / "held.h5"
     placed = {"rotation": mounting.rotation, "translation_mm": mounting.translation}
-    write_calibration(path, made(time_offset_s=None, pixel_mm=None, **placed))
+    write_calibration(path, example_calibration(time_offset_s=None, pixel_mm=None, **placed))
     return path
 
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import h5py
 import pytest
-from calibration_files import made
+from calibration_files import example_calibration
 
 from speckle3d.io.calibrations import write_calibration
 
@@ -22,7 +22,7 @@ def is_plain(text):
 
 def test_what_a_file_says_of_itself_is_shown_escaped_and_json_stays_json(run, tmp_path):
     path = tmp_path / "c.h5"
-    write_calibration(path, replace(made(), verdict=HOSTILE))
+    write_calibration(path, replace(example_calibration(), verdict=HOSTILE))
     with h5py.File(path, "r+") as file:
         file["frames/reason"][0] = HOSTILE
     code, out, _ = run("info", path)

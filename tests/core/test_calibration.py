@@ -3,7 +3,7 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 import sweep_examples
-from calibration_files import ROTATION, made
+from calibration_files import ROTATION, example_calibration
 from scipy.spatial.transform import Rotation
 
 from speckle3d.core.calibration import calibrated, mounting_difference
@@ -11,49 +11,49 @@ from speckle3d.core.errors import InvalidInputError, MismatchError
 
 
 def test_a_pixel_is_where_the_readings_and_the_calibration_put_it():
-    sweep = calibrated(sweep_examples.rf_sweep(), made(time_offset_s=0.0))
+    sweep = calibrated(sweep_examples.rf_sweep(), example_calibration(time_offset_s=0.0))
     time_s = sweep.tracker.readings.time_s[4]
     world_from_sensor = sweep.tracker.readings.world_from_sensor[4].as_matrix()
-    expected = world_from_sensor @ made().pixel_matrix() @ [3.0, 7.0, 0.0, 1.0]
-    got = sweep.tracker.world_from_image(time_s).apply([0.137 * 3.0, 0.138 * 7.0, 0.0])
-    np.testing.assert_allclose(got, expected[:3], atol=1e-9)
+    expected = world_from_sensor @ example_calibration().pixel_matrix() @ [3.0, 7.0, 0.0, 1.0]
+    position = sweep.tracker.world_from_image(time_s).apply([0.137 * 3.0, 0.138 * 7.0, 0.0])
+    np.testing.assert_allclose(position, expected[:3], atol=1e-9)
 
 
 @pytest.mark.parametrize("name", ["tracker", "orientation"])
 @pytest.mark.parametrize("offset_s", [-0.0125, None])
 def test_a_calibration_goes_on_its_sensor_and_nothing_else(name, offset_s):
     sweep = sweep_examples.rf_sweep()
-    got = calibrated(sweep, made(name, time_offset_s=offset_s))
-    sensor, before = getattr(got, name), getattr(sweep, name)
+    with_calibration = calibrated(sweep, example_calibration(name, time_offset_s=offset_s))
+    sensor, before = getattr(with_calibration, name), getattr(sweep, name)
     mounting = sensor.sensor_from_image
     turn = mounting.rotation if name == "tracker" else mounting
     assert (turn.inv() * ROTATION).magnitude() < 1e-12
     assert sensor.time_offset_s == (before.time_offset_s if offset_s is None else offset_s)
     assert sensor.readings is before.readings
-    others = {field.name for field in fields(sweep)} - {name}
-    assert all(getattr(got, other) is getattr(sweep, other) for other in others)
+    fields_beside = {field.name for field in fields(sweep)} - {name}
+    assert all(getattr(with_calibration, other) is getattr(sweep, other) for other in fields_beside)
 
 
 @pytest.mark.parametrize("sensor", ["tracker", "orientation"])
 def test_a_sweep_without_the_sensor_is_refused(sensor):
     sweep = replace(sweep_examples.rf_sweep(), **{sensor: None})
     with pytest.raises(MismatchError):
-        calibrated(sweep, made(sensor))
+        calibrated(sweep, example_calibration(sensor))
 
 
 @pytest.mark.parametrize("sensor", ["tracker", "orientation"])
 def test_mountings_are_compared_where_both_are_known(sensor):
-    sweep = calibrated(sweep_examples.rf_sweep(), made(sensor))
-    other = made(sensor, rotation=ROTATION * Rotation.from_euler("y", 7, degrees=True))
-    moved_mm = 0.0
+    sweep = calibrated(sweep_examples.rf_sweep(), example_calibration(sensor))
+    remount = example_calibration(sensor, rotation=ROTATION * Rotation.from_euler("y", 7, degrees=True))
+    shift_mm = 0.0
     if sensor == "tracker":
-        moved_mm, other = (
+        shift_mm, remount = (
             5.0,
-            replace(other, translation_mm=other.translation_mm + np.array([3.0, 0.0, -4.0])),
+            replace(remount, translation_mm=remount.translation_mm + np.array([3.0, 0.0, -4.0])),
         )
-    assert mounting_difference(sweep, other) == pytest.approx((7.0, moved_mm), abs=1e-6)
+    assert mounting_difference(sweep, remount) == pytest.approx((7.0, shift_mm), abs=1e-6)
     unknown = replace(sweep, **{sensor: replace(getattr(sweep, sensor), sensor_from_image=None)})
-    assert mounting_difference(unknown, other) == (0.0, 0.0)
+    assert mounting_difference(unknown, remount) == (0.0, 0.0)
 
 
 @pytest.mark.parametrize(
@@ -62,4 +62,4 @@ def test_mountings_are_compared_where_both_are_known(sensor):
 )
 def test_what_cannot_be_a_calibration_is_refused(changes):
     with pytest.raises(InvalidInputError, match=next(iter(changes))):
-        replace(made(), **changes)
+        replace(example_calibration(), **changes)

@@ -18,34 +18,34 @@ def looks(seed, count=1):
     return (np.abs(field) ** 2).mean(axis=0)
 
 
-def compressed(intensity, range_db):
+def grey_levels(intensity, range_db):
     """Grey levels, the mean 20 dB below white."""
     level = 1 + (10 * np.log10(intensity / intensity.mean()) - 20) / range_db
     return np.rint(255 * np.clip(level, 0, 1)).astype(np.uint8)
 
 
-def estimated(frames):
+def estimate(frames):
     return estimate_dynamic_range(frames, PITCH_MM, SPACING_MM)
 
 
 @pytest.mark.parametrize("range_db", [40.0, 60.0, 80.0])
 def test_one_look_tells_the_range(range_db):
-    seen, sigma = estimated(compressed(looks(1), range_db))
-    assert abs(seen / range_db - 1) < 0.1
-    assert abs(seen - range_db) < 2 * sigma < 0.2 * range_db
+    estimate_db, sigma = estimate(grey_levels(looks(1), range_db))
+    assert abs(estimate_db / range_db - 1) < 0.1
+    assert abs(estimate_db - range_db) < 2 * sigma < 0.2 * range_db
 
 
 @pytest.mark.parametrize("range_db", [45.0, 60.0, 75.0])
 def test_smoothing_and_two_looks_widen_it_and_do_not_shift_it(range_db):
-    one = estimated(compressed(looks(2), range_db))
-    smooth = uniform_filter(compressed(looks(2), range_db).astype(float), (0, 3, 3)).astype(np.uint8)
-    for frames in (smooth, compressed(looks(3, 2), range_db)):
-        seen, sigma = estimated(frames)
-        assert sigma > 1.5 * one[1]
-        assert abs(seen - range_db) < 2.5 * sigma
-    assert abs(estimated(smooth)[0] / USUAL_DB - 1) < 0.35
+    _, single_sigma = estimate(grey_levels(looks(2), range_db))
+    smooth = uniform_filter(grey_levels(looks(2), range_db).astype(float), (0, 3, 3)).astype(np.uint8)
+    for frames in (smooth, grey_levels(looks(3, 2), range_db)):
+        estimate_db, sigma = estimate(frames)
+        assert sigma > 1.5 * single_sigma
+        assert abs(estimate_db - range_db) < 2.5 * sigma
+    assert abs(estimate(smooth)[0] / USUAL_DB - 1) < 0.35
 
 
 def test_images_too_small_to_tell_are_asked_for():
     assert estimate_dynamic_range(np.zeros((3, 5, 4), np.uint8), 0.1, 0.1) is None
-    assert estimated(np.zeros((3, 96, 400), np.uint8)) is None
+    assert estimate(np.zeros((3, 96, 400), np.uint8)) is None

@@ -18,11 +18,11 @@ from speckle3d.core.errors import InvalidInputError, MismatchError
 )
 def test_curves_of_another_signal_or_geometry_are_refused_and_the_setting_named(setting, value):
     if hasattr(speckle.RF, setting):
-        other = replace(speckle.KEY, signal=replace(speckle.RF, **{setting: value}))
+        key = replace(speckle.KEY, signal=replace(speckle.RF, **{setting: value}))
     else:
-        other = replace(speckle.KEY, **{setting: value})
+        key = replace(speckle.KEY, **{setting: value})
     with pytest.raises(MismatchError, match=f"^c.h5: {setting} is "):
-        speckle.KEY.require_same(other, "c.h5")
+        speckle.KEY.require_same(key, "c.h5")
 
 
 def test_curves_serve_the_probe_however_its_echoes_were_sampled():
@@ -32,25 +32,27 @@ def test_curves_serve_the_probe_however_its_echoes_were_sampled():
     baseband = replace(
         speckle.RF, sampling_rate_hz=1.3 * (high - low), demodulation_frequency_hz=(low + high) / 2
     )
-    for other in (faster, baseband):
-        key = replace(speckle.KEY, signal=other)
+    for signal in (faster, baseband):
+        key = replace(speckle.KEY, signal=signal)
         speckle.KEY.require_same(key)
         key.require_same(speckle.KEY)
 
 
 def test_curves_of_another_probe_are_refused_where_both_are_named():
-    mine, theirs = (replace(speckle.KEY, probe=name) for name in ("L12-5, focus 2 cm", "L12-5, focus 3 cm"))
-    mine.require_same(mine)
-    mine.require_same(speckle.KEY)
-    speckle.KEY.require_same(theirs)
+    near_focus, far_focus = (
+        replace(speckle.KEY, probe=name) for name in ("L12-5, focus 2 cm", "L12-5, focus 3 cm")
+    )
+    near_focus.require_same(near_focus)
+    near_focus.require_same(speckle.KEY)
+    speckle.KEY.require_same(far_focus)
     with pytest.raises(MismatchError):
-        mine.require_same(theirs)
+        near_focus.require_same(far_focus)
 
 
 def test_between_two_depths_the_width_lies_between():
-    made = speckle.curves(sigma_mm=[0.3, 0.6], depth_mm=(10.0, 20.0))
-    between = made.at(np.array([10.0, 15.0, 20.0, 15.0]))
-    d = made.distance_mm[:60]
+    curves = speckle.curves(sigma_mm=[0.3, 0.6], depth_mm=(10.0, 20.0))
+    between = curves.at(np.array([10.0, 15.0, 20.0, 15.0]))
+    d = curves.distance_mm[:60]
     for row, width in zip(between.correlation, (0.3, 0.4, 0.6, 0.4), strict=True):
         # sqrt(-ln rho) = d / (sigma sqrt 2) is linear in 1 / sigma: halfway lies 2 / (1/.3 + 1/.6) = 0.4.
         np.testing.assert_allclose(row[:60], speckle.gaussian_correlation(d, width), rtol=1e-9)
@@ -66,9 +68,9 @@ def test_between_two_depths_the_width_lies_between():
     ],
 )
 def test_curves_that_cannot_be_are_refused(name, spoil):
-    made = speckle.curves()
+    curves = speckle.curves()
     with pytest.raises(InvalidInputError, match=name):
-        replace(made, **{name: spoil(getattr(made, name))})
+        replace(curves, **{name: spoil(getattr(curves, name))})
 
 
 def test_curves_of_a_fan_are_of_its_array_however_deep_it_is_recorded():
@@ -76,6 +78,6 @@ def test_curves_of_a_fan_are_of_its_array_however_deep_it_is_recorded():
     fan.require_same(replace(fan, vector_pitch_mm=0.5))
     speckle.KEY.require_same(fan)  # of a file that does not say how lines lie
     parallel = replace(speckle.KEY, lines="parallel")
-    for other in (replace(fan, array_radius_mm=40.0), replace(fan, line_step_rad=0.006), parallel):
+    for key in (replace(fan, array_radius_mm=40.0), replace(fan, line_step_rad=0.006), parallel):
         with pytest.raises(MismatchError):
-            fan.require_same(other)
+            fan.require_same(key)

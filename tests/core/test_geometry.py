@@ -50,8 +50,8 @@ def test_quaternions_are_scalar_first_and_a_bad_one_is_named():
 def test_single_precision_is_rigid_enough_and_what_is_not_rigid_is_named(diagonal):
     matrices = np.tile(np.eye(4), (4, 1, 1))
     matrices[1, :3, :3] = Rotation.random(rng=np.random.default_rng(1)).as_matrix()
-    found = transforms_from_matrices(matrices.astype(np.float32), "poses")
-    np.testing.assert_allclose(found.as_matrix(), matrices, atol=1e-4)
+    transforms = transforms_from_matrices(matrices.astype(np.float32), "poses")
+    np.testing.assert_allclose(transforms.as_matrix(), matrices, atol=1e-4)
     matrices[2] = np.diag(diagonal)
     with pytest.raises(InvalidInputError, match=r"tracker\[\(?2"):
         transforms_from_matrices(matrices, "tracker")
@@ -61,10 +61,12 @@ def test_single_precision_is_rigid_enough_and_what_is_not_rigid_is_named(diagona
 @given(seed=st.integers(0, 2**32 - 1), columns=st.sampled_from([2, 3]))
 def test_no_rotation_is_nearer_than_the_nearest(seed, columns):
     rng = np.random.default_rng(seed)
-    given_ = Rotation.random(4, rng=rng).as_matrix()[:, :, :columns] + 0.2 * rng.normal(size=(4, 3, columns))
-    found = nearest_rotation(given_)
-    others = (Rotation.from_rotvec(rng.normal(0, 0.1, (20, 1, 3))) * Rotation.from_matrix(found)).as_matrix()
-    far = [np.sum((one[..., :columns] - given_) ** 2, axis=(-2, -1)) for one in (found, others)]
-    np.testing.assert_allclose(np.linalg.det(found), 1.0)
+    noisy = Rotation.random(4, rng=rng).as_matrix()[:, :, :columns] + 0.2 * rng.normal(size=(4, 3, columns))
+    nearest = nearest_rotation(noisy)
+    neighbours = (
+        Rotation.from_rotvec(rng.normal(0, 0.1, (20, 1, 3))) * Rotation.from_matrix(nearest)
+    ).as_matrix()
+    far = [np.sum((r[..., :columns] - noisy) ** 2, axis=(-2, -1)) for r in (nearest, neighbours)]
+    np.testing.assert_allclose(np.linalg.det(nearest), 1.0)
     assert (far[0] <= far[1] + 1e-12).all()
     np.testing.assert_allclose(nearest_rotation(np.diag([1.0, 1.0, -0.5])), np.eye(3), atol=1e-15)

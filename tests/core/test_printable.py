@@ -8,20 +8,20 @@ from speckle3d.core.errors import FileError, InvalidInputError, naming
 from speckle3d.core.printable import printable
 
 HOSTILE = "a\x1b[31m\r\n\x9b\u202e\u2028\udc80\x00b"
-SHOWN = r"a\x1b[31m\r\n\x9b\u202e\u2028\udc80\x00b"
+ESCAPES = r"a\x1b[31m\r\n\x9b\u202e\u2028\udc80\x00b"
 
 
 def test_what_drives_a_terminal_is_escaped_once():
-    assert printable(HOSTILE) == SHOWN
-    assert printable(SHOWN) == SHOWN
+    assert printable(HOSTILE) == ESCAPES
+    assert printable(ESCAPES) == ESCAPES
     assert printable("a\nb\x1b", kept="\n") == "a\nb\\x1b"
 
 
 @pytest.mark.parametrize("kind", [InvalidInputError, FileError])
 def test_an_error_is_one_line_whatever_it_quotes(kind):
     error = kind(f"{HOSTILE}: expected a")
-    assert str(error) == f"{SHOWN}: expected a"
+    assert str(error) == f"{ESCAPES}: expected a"
     assert str(pickle.loads(pickle.dumps(error))) == str(error)
-    with pytest.raises(kind) as caught, naming(HOSTILE):
+    with pytest.raises(kind) as info, naming(HOSTILE):
         raise kind(f"{HOSTILE}: expected a")
-    assert str(caught.value) == str(error)
+    assert str(info.value) == str(error)

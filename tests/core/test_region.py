@@ -33,8 +33,8 @@ def test_fan_is_between_its_angles_and_radii(apex, angles, radii):
     least = np.min(past, axis=0)
     # Samples on a side itself are a matter of rounding.
     sure = np.abs(least) > 1e-4
-    found = Region("fan " + _text([apex, angles, radii])).mask(GRID)
-    np.testing.assert_array_equal(found[sure], least[sure] > 0)
+    mask = Region("fan " + _text([apex, angles, radii])).mask(GRID)
+    np.testing.assert_array_equal(mask[sure], least[sure] > 0)
 
 
 @settings(max_examples=10, deadline=None)

@@ -11,7 +11,7 @@ from xsens.logs.samples import ImuLog
 
 @pytest.fixture(scope="module")
 def things(sweep, curves, tracking):
-    corrected = s3.correct(tracking, sweep, ["pose", "orientation", "fused"])
+    modes = s3.correct(tracking, sweep, ["pose", "orientation", "fused"])
     volume = Volume(np.zeros((4, 3, 2), np.uint8), (0.5, 0.5, 1.0), RigidTransform.identity())
     log = ImuLog(np.arange(500) / 100, gyroscope_rad_s=np.zeros((500, 3)))
     return [
@@ -23,7 +23,7 @@ def things(sweep, curves, tracking):
         tracking,
         volume,
         log,
-        *corrected.values(),
+        *modes.values(),
     ]
 
 
@@ -55,9 +55,9 @@ def test_frames_become_a_labelled_array(sweep):
 
 
 def test_a_volume_lies_in_napari_where_it_lies_in_the_world():
-    turned = RigidTransform.from_components([1.0, 2.0, 3.0], RigidTransform.identity().rotation)
-    volume = Volume(np.arange(24, dtype=np.uint8).reshape(4, 3, 2), (0.5, 0.5, 1.0), turned)
-    voxels, known, kind = volume.to_napari()
+    placement = RigidTransform.from_components([1.0, 2.0, 3.0], RigidTransform.identity().rotation)
+    volume = Volume(np.arange(24, dtype=np.uint8).reshape(4, 3, 2), (0.5, 0.5, 1.0), placement)
+    voxels, fields, kind = volume.to_napari()
     assert kind == "image"
     assert voxels is volume.voxels
-    np.testing.assert_allclose(known["affine"] @ [2, 1, 1, 1], [2.0, 2.5, 4.0, 1.0])
+    np.testing.assert_allclose(fields["affine"] @ [2, 1, 1, 1], [2.0, 2.5, 4.0, 1.0])

@@ -18,19 +18,19 @@ def test_poses_slerp_and_move_linearly_between_uneven_samples():
     times = np.cumsum(rng.uniform(0.01, 0.15, 20))
     rate, velocity = rng.normal(0.0, 3.0, 3), rng.normal(0.0, 50.0, 3)
     stream = TimedPoses(times, RigidTransform.from_components(np.outer(times, velocity), steady(rate, times)))
-    asked = np.append(rng.uniform(times[0], times[-1], 30), times)
-    found = stream.at(asked)
-    np.testing.assert_allclose(found.translation, np.outer(asked, velocity), atol=1e-9)
-    turns = TimedRotations(times, steady(rate, times)).at(asked)
-    for rotation in (found.rotation, turns):
-        assert (rotation.inv() * steady(rate, asked)).magnitude().max() < 1e-7
+    queries = np.append(rng.uniform(times[0], times[-1], 30), times)
+    poses = stream.at(queries)
+    np.testing.assert_allclose(poses.translation, np.outer(queries, velocity), atol=1e-9)
+    turns = TimedRotations(times, steady(rate, times)).at(queries)
+    for rotation in (poses.rotation, turns):
+        assert (rotation.inv() * steady(rate, queries)).magnitude().max() < 1e-7
 
 
 def test_gaps_and_times_outside_the_samples_are_not_covered():
     times = np.array([0.0, 0.1, 0.2, 0.6, 0.7])
     stream = TimedRotations(times, steady([1.0, 0, 0], times), max_gap_s=0.2)
-    asked = [0.15, 0.2, 0.4, 0.6, 0.65, -0.001, 0.701, np.nan]
-    assert stream.covers(asked).tolist() == [True, True, False, True, True, False, False, False]
+    queries = [0.15, 0.2, 0.4, 0.6, 0.65, -0.001, 0.701, np.nan]
+    assert stream.covers(queries).tolist() == [True, True, False, True, True, False, False, False]
     for time_s in (0.4, -0.001, 0.701, np.nan):
         with pytest.raises(InsufficientDataError):
             stream.at([0.1, time_s])

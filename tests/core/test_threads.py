@@ -18,26 +18,26 @@ def four_cores(monkeypatch):
 
 @pytest.mark.parametrize("count", [0, 1, 2, 7, 100])
 def test_does_every_item_once(count):
-    done = np.zeros(count, dtype=int)
+    visits = np.zeros(count, dtype=int)
 
-    def one(first, stop):
-        done[first:stop] += 1
+    def visit(first, stop):
+        visits[first:stop] += 1
 
-    in_parallel(one, count)
-    assert (done == 1).all()
+    in_parallel(visit, count)
+    assert (visits == 1).all()
 
 
 def test_calls_may_be_nested_deeper_than_there_are_threads():
-    done = []
+    leaves = []
 
-    def nested(first, stop, depth=4):
+    def recurse(first, stop, depth=4):
         if depth:
-            in_parallel(lambda f, s: nested(f, s, depth - 1), 8)
+            in_parallel(lambda f, s: recurse(f, s, depth - 1), 8)
         else:
-            done.append(1)
+            leaves.append(1)
 
-    in_parallel(nested, 8)
-    assert len(done) >= 8
+    in_parallel(recurse, 8)
+    assert len(leaves) >= 8
 
 
 def test_workers_of_a_cluster_and_the_environment_limit_the_threads(monkeypatch):
@@ -51,16 +51,16 @@ def test_workers_of_a_cluster_and_the_environment_limit_the_threads(monkeypatch)
 
 
 def test_results_made_ahead_come_in_order_and_not_too_many_of_them():
-    begun = []
+    starts = []
 
     def slowest_first(item):
-        begun.append(item)
+        starts.append(item)
         threading.Event().wait(0.002 * (8 - item))
         return 10 * item
 
     results = ahead(slowest_first, range(8), most=3)
     assert next(results) == 0
-    assert max(begun) <= 4
+    assert max(starts) <= 4
     assert list(results) == [10 * item for item in range(1, 8)]
 
 
@@ -77,11 +77,11 @@ from speckle3d.core import threads
 
 start = threading.Thread.start
 
-def interrupted(thread):
+def interrupt(thread):
     start(thread)
     raise KeyboardInterrupt
 
-threading.Thread.start = interrupted
+threading.Thread.start = interrupt
 threads.processors = lambda: 2
 try:
     threads.in_parallel(lambda first, end: None, 100)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform
-from spoiled_images import in_order, narrowed
+from spoiled_images import first_vectors, in_order
 
 from speckle3d.core.errors import MismatchError
 from speckle3d.core.streams import TimedPoses
@@ -39,7 +39,7 @@ def test_evidence_of_the_scale_counts_by_its_information_against_the_images_clai
 
 def test_a_loop_of_the_images_says_nothing_of_their_scale(sweep, curves):
     # Edges between both visits once made shrinking cheap: every edge counts in the images' own millimetres.
-    loop = in_order(narrowed(sweep), [*range(32), *range(31, -1, -1)])
+    loop = in_order(first_vectors(sweep), [*range(32), *range(31, -1, -1)])
     found = fused(track(loop, curves), loop)
     assert found.log_scale == pytest.approx(0.0, abs=1e-3)
     assert found.log_scale_sigma > 0.8 * 0.03

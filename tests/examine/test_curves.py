@@ -20,56 +20,62 @@ CURVES = replace(speckle.curves(depth_mm=tuple(ROWS)), speckle=SIZE)
 CLEAR = np.ones(ROWS.size)
 
 
-@pytest.mark.parametrize(("factor", "refuted"), [(1.0, False), (5.0, False), (1000.0, True)])
-def test_curves_wider_than_any_beam_are_refuted(factor, refuted):
-    found = doubt_widths(replace(CURVES, distance_mm=factor * CURVES.distance_mm))
-    assert [d.refuted for d in found] == [True] * refuted
+@pytest.mark.parametrize(("factor", "refutes"), [(1.0, False), (5.0, False), (1000.0, True)])
+def test_curves_wider_than_any_beam_are_refuted(factor, refutes):
+    doubts = doubt_widths(replace(CURVES, distance_mm=factor * CURVES.distance_mm))
+    assert [d.refuted for d in doubts] == [True] * refutes
 
 
-@pytest.mark.parametrize(("factor", "refuted"), [(1.0, False), (1.1, False), (1.5, True), (0.5, True)])
-def test_distances_scaled_after_the_measurement_contradict_the_tilt(factor, refuted):
+@pytest.mark.parametrize(("factor", "refutes"), [(1.0, False), (1.1, False), (1.5, True), (0.5, True)])
+def test_distances_scaled_after_the_measurement_contradict_the_tilt(factor, refutes):
     # 0.45 mm: where -ln(rho) of `speckle.gaussian_correlation` is a half.
     spread = np.full(ROWS.size, two_way_wavenumber(speckle.RF) * 0.45**2)
-    turned = replace(CURVES, tilt=TiltResponse(np.zeros(ROWS.size), spread))
-    found = doubt_widths(replace(turned, distance_mm=factor * turned.distance_mm))
-    assert [d.refuted for d in found] == [True] * refuted
+    tilt_curves = replace(CURVES, tilt=TiltResponse(np.zeros(ROWS.size), spread))
+    doubts = doubt_widths(replace(tilt_curves, distance_mm=factor * tilt_curves.distance_mm))
+    assert [d.refuted for d in doubts] == [True] * refutes
 
 
-def bent(by, rows=9, gain=1.0):
+def row_scales(by, rows=9, gain=1.0):
     """Scales that rise by so much from the first row to the middle."""
     line = by * np.linspace(-1, 1, rows)
     return RowScales(np.linspace(3, 30, rows), line, np.full(rows, gain))
 
 
 @pytest.mark.parametrize(
-    ("rows", "refuted"),
-    [(bent(0.08), None), (bent(0.25), False), (bent(0.6), True), (bent(0.6, gain=0.5), None), (None, None)],
+    ("rows", "refutes"),
+    [
+        (row_scales(0.08), None),
+        (row_scales(0.25), False),
+        (row_scales(0.6), True),
+        (row_scales(0.6, gain=0.5), None),
+        (None, None),
+    ],
     ids=["right", "doubtful", "reversed", "noisy", "not adapted to"],
 )
-def test_depths_that_disagree_doubt_the_curves(rows, refuted):
+def test_depths_that_disagree_doubt_the_curves(rows, refutes):
     doubt = doubt_bend(rows)
-    assert (doubt and doubt.refuted) == refuted
+    assert (doubt and doubt.refuted) == refutes
 
 
-def scaled(lateral=1.0, axial=1.0):
+def speckle_size(lateral=1.0, axial=1.0):
     return SpeckleSize(SIZE.lateral_mm * lateral, SIZE.axial_mm * axial)
 
 
 @pytest.mark.parametrize(
-    ("seen", "refuted"),
+    ("image_speckle", "refutals"),
     [
-        (scaled(), []),
-        (scaled(1.1, 1.2), []),
-        (scaled(0.9, 0.8), []),
-        (scaled(1.16), [False]),
-        (scaled(0.7), [True]),
-        (scaled(axial=0.5), [True]),
-        (scaled(1.4, 2.0), [True, True]),
+        (speckle_size(), []),
+        (speckle_size(1.1, 1.2), []),
+        (speckle_size(0.9, 0.8), []),
+        (speckle_size(1.16), [False]),
+        (speckle_size(0.7), [True]),
+        (speckle_size(axial=0.5), [True]),
+        (speckle_size(1.4, 2.0), [True, True]),
     ],
 )
-def test_speckle_of_another_size_doubts_the_curves(seen, refuted):
-    assert [d.refuted for d in doubt_size(seen, CURVES, PATCHES, CLEAR)] == refuted
+def test_speckle_of_another_size_doubts_the_curves(image_speckle, refutals):
+    assert [d.refuted for d in doubt_size(image_speckle, CURVES, PATCHES, CLEAR)] == refutals
 
 
 def test_rows_of_noise_say_nothing_of_the_size_of_speckle():
-    assert doubt_size(scaled(0.7, 0.5), CURVES, PATCHES, 0.5 * CLEAR) == ()
+    assert doubt_size(speckle_size(0.7, 0.5), CURVES, PATCHES, 0.5 * CLEAR) == ()

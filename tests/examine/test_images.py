@@ -26,13 +26,13 @@ def table_of(position_mm, seed=0, noise=0.03, gain=1.0, source=None):
     source = np.zeros(len(position_mm)) if source is None else source
     rows = []
     for frame in range(len(position_mm)):
-        found = {}
+        correlations = {}
         for first in schedule.references(frame):
             rho = gain * np.exp(-((position_mm[frame] - position_mm[first]) ** 2) / (2 * WIDTH_MM**2))
             rho *= source[frame] == source[first]
-            found[first] = float(np.clip(rho + noise * (1 - rho) * rng.standard_normal(), 0.0, 1.0))
-        rows += [(first, frame, found[first]) for first in sorted(found)]
-        schedule.settle(frame, found)
+            correlations[first] = float(np.clip(rho + noise * (1 - rho) * rng.standard_normal(), 0.0, 1.0))
+        rows += [(first, frame, correlations[first]) for first in sorted(correlations)]
+        schedule.settle(frame, correlations)
     first, second, median = (np.array(column) for column in zip(*rows, strict=True))
     correlation = np.repeat(median[:, None], len(PATCHES_MM), axis=1).astype(np.float32)
     nothing = np.zeros((len(rows), 3)), np.tile(np.eye(3), (len(rows), 1, 1))
@@ -78,10 +78,10 @@ def test_sweeps_recorded_in_turn_are_refused(sweeps):
 def test_a_path_that_turns_where_the_images_do_not_is_doubted():
     # Pairs across a turn are as alike as others and on this path nearer to each other.
     once, often = np.where(SWEEP < 6.0, SWEEP, 12.0 - SWEEP), np.abs((SWEEP + 0.5) % 1.0 - 0.5)
-    for path, refuted in ((once, False), (often, True)):
+    for path, refutes in ((once, False), (often, True)):
         doubt = doubt_path(table_of(SWEEP), along(path), PATCHES_MM, np.ones(SWEEP.size, dtype=bool))
         assert doubt is not None
-        assert doubt.refuted == refuted
+        assert doubt.refuted == refutes
         ((first, last),) = doubt.frames
         assert f"about frame {(first + last + 1) // 2}" in doubt.evidence
         if path is once:
@@ -90,29 +90,29 @@ def test_a_path_that_turns_where_the_images_do_not_is_doubted():
 
 
 @pytest.mark.parametrize(
-    ("length_mm", "sigma_mm", "refused"),
+    ("length_mm", "sigma_mm", "refutes"),
     [(3.58, 12111.0, True), (12.0, 6.5, True), (12.0, 4.0, False), (0.1, 2.6, True)],
 )
-def test_a_length_that_is_left_open_is_doubted(length_mm, sigma_mm, refused):
+def test_a_length_that_is_left_open_is_doubted(length_mm, sigma_mm, refutes):
     position = np.linspace(0.0, length_mm, 20)
     doubt = doubt_length(position, np.linspace(0.0, sigma_mm, 20), 2.5)
     assert doubt is not None
-    assert doubt.refuted == refused
+    assert doubt.refuted == refutes
     assert f"{sigma_mm:.3g} mm" in doubt.evidence
 
 
 def test_frames_far_apart_are_beyond_the_reach_of_speckle():
-    known, frames = curves(sigma_mm=WIDTH_MM), np.arange(0, 230, 15)
+    gaussian, frames = curves(sigma_mm=WIDTH_MM), np.arange(0, 230, 15)
     position = np.concatenate([np.zeros(30), np.linspace(0.0, 30.0, 200)])
-    chosen = far_apart(position, frames, known)
-    assert len(chosen) > 80
+    distant_frames = far_apart(position, frames, gaussian)
+    assert len(distant_frames) > 80
     # exp(-d^2 / 2 w^2) is 0.03 at d = 2.65 w.
-    assert np.abs(np.diff(position[chosen])).min() >= 2.6 * WIDTH_MM
-    assert far_apart(np.zeros(230), frames, known).size == 0
+    assert np.abs(np.diff(position[distant_frames])).min() >= 2.6 * WIDTH_MM
+    assert far_apart(np.zeros(230), frames, gaussian).size == 0
 
 
 @pytest.mark.parametrize(
-    ("share", "refuted"),
+    ("share", "refutes"),
     [
         (np.full(50, 0.02), False),
         (np.r_[np.full(5, 0.3), np.zeros(45)], False),
@@ -122,10 +122,10 @@ def test_frames_far_apart_are_beyond_the_reach_of_speckle():
         (np.r_[np.full(26, 0.5), np.zeros(24)], True),
     ],
 )
-def test_echoes_that_stand_still_are_doubted(share, refuted):
+def test_echoes_that_stand_still_are_doubted(share, refutes):
     doubt = doubt_clutter(share, PAIRS, CELLS)
     assert doubt is not None
-    assert doubt.refuted == refuted
+    assert doubt.refuted == refutes
 
 
 def test_a_sweep_in_pieces_is_flagged_at_each_cut():

@@ -49,46 +49,48 @@ REFUTED = (
 
 
 def doubts_of(sweep, tracking):
-    examined = examine_sensors(sweep, tracking.image)
-    return examined, disagreements(examined.credible, tracking.image, tracking.covariance)
+    examination = examine_sensors(sweep, tracking.image)
+    return examination, disagreements(examination.credible, tracking.image, tracking.covariance)
 
 
 def test_good_sensors_are_not_doubted(sweep, tracking):
     assert tracking.doubts == ()
-    examined, found = doubts_of(sweep, tracking)
-    assert examined.doubts == found == ()
-    assert examined.tells_direction
-    assert examined.credible.tracker is sweep.tracker
-    assert examined.credible.orientation is sweep.orientation
+    examination, conflicts = doubts_of(sweep, tracking)
+    assert examination.doubts == conflicts == ()
+    assert examination.tells_direction
+    assert examination.credible.tracker is sweep.tracker
+    assert examination.credible.orientation is sweep.orientation
 
 
 @pytest.mark.parametrize("name", AGAINST_THEMSELVES)
 def test_a_sensor_that_contradicts_itself_is_named(name, sweep, tracking):
-    examined, _ = doubts_of(spoil(sweep, name), tracking)
+    examination, _ = doubts_of(spoil(sweep, name), tracking)
     about = "tracker" if name.startswith("tracker") else "orientation sensor"
-    assert {doubt.about for doubt in examined.doubts} == {about}
-    assert any(AGAINST_THEMSELVES[name] in doubt.suspect for doubt in examined.doubts)
+    assert {doubt.about for doubt in examination.doubts} == {about}
+    assert any(AGAINST_THEMSELVES[name] in doubt.suspect for doubt in examination.doubts)
     if name in REFUTED:
-        assert any(doubt.refuted for doubt in examined.doubts)
+        assert any(doubt.refuted for doubt in examination.doubts)
 
 
 @pytest.mark.parametrize("name", BESIDE_THE_IMAGES)
 def test_images_and_a_sensor_that_differ_are_told_side_by_side_and_nobody_is_left_out(name, sweep, tracking):
     bad = spoil(sweep, name)
-    examined, found = doubts_of(bad, tracking)
-    assert examined.credible.tracker is not None
-    assert found
-    assert not any(doubt.refuted for doubt in found)
-    assert all("by the images" in doubt.evidence and "by the tracker" in doubt.evidence for doubt in found)
-    assert BESIDE_THE_IMAGES[name] in f"{found[0].suspect} {found[0].evidence}"
+    examination, conflicts = doubts_of(bad, tracking)
+    assert examination.credible.tracker is not None
+    assert conflicts
+    assert not any(doubt.refuted for doubt in conflicts)
+    assert all(
+        "by the images" in doubt.evidence and "by the tracker" in doubt.evidence for doubt in conflicts
+    )
+    assert BESIDE_THE_IMAGES[name] in f"{conflicts[0].suspect} {conflicts[0].evidence}"
 
 
 def test_lengths_of_modes_beyond_three_joint_claims_are_told_with_both_numbers():
     lengths = {"image": (12.0, 0.3), "pose": (10.0, 0.1), "fused": (11.5, 0.3)}
-    told = differing_lengths(lengths)
-    assert [doubt.about for doubt in told] == ["modes image and pose", "modes pose and fused"]
-    assert "12.00 +- 0.59 mm" in told[0].evidence
-    assert "10.00 +- 0.20 mm" in told[0].evidence
+    conflicts = differing_lengths(lengths)
+    assert [doubt.about for doubt in conflicts] == ["modes image and pose", "modes pose and fused"]
+    assert "12.00 +- 0.59 mm" in conflicts[0].evidence
+    assert "10.00 +- 0.20 mm" in conflicts[0].evidence
 
 
 @pytest.mark.parametrize("name", ["orientation stored xyzw", "orientation inverted", "orientation random"])
@@ -96,9 +98,11 @@ def test_no_sign_is_taken_from_turns_that_nothing_confirms(name, sweep, tracking
     bad = spoil(replace(sweep, tracker=None, truth=None), name)
     # Without what it measures beside its orientation, only the images are left to say so.
     bare = replace(bad, orientation=replace(bad.orientation, gyroscope_rad_s=None, accelerometer_m_s2=None))
-    for recorded in (bad, bare):
-        examined = examine_sensors(recorded, tracking.image)
-        sign = settle_direction(examined.credible, tracking.image, Config().sensors, examined.tells_direction)
+    for spoilt_sweep in (bad, bare):
+        examination = examine_sensors(spoilt_sweep, tracking.image)
+        sign = settle_direction(
+            examination.credible, tracking.image, Config().sensors, examination.tells_direction
+        )
         assert sign == (1, "assumed")
 
 
@@ -113,35 +117,35 @@ def test_a_sensor_that_contradicts_itself_gives_no_mode_unless_told_to(sweep, tr
 
 def test_spikes_are_left_out_and_counted(sweep, tracking):
     bad = spoil(sweep, "tracker spikes of 30 mm")
-    cleaned, (doubt,) = repair_readings(bad)
-    places = [each.tracker.readings.world_from_sensor.translation for each in (bad, sweep)]
-    spiked = np.linalg.norm(places[0] - places[1], axis=1) > 10.0
-    left_out = len(bad.tracker.readings) - len(cleaned.tracker.readings)
-    assert left_out >= spiked.sum()
+    trusted, (doubt,) = repair_readings(bad)
+    places = [s.tracker.readings.world_from_sensor.translation for s in (bad, sweep)]
+    spikes = np.linalg.norm(places[0] - places[1], axis=1) > 10.0
+    left_out = len(bad.tracker.readings) - len(trusted.tracker.readings)
+    assert left_out >= spikes.sum()
     assert str(left_out) in doubt.evidence
-    at = bad.tracker.readings.time_s[spiked] + bad.tracker.time_offset_s
+    at = bad.tracker.readings.time_s[spikes] + bad.tracker.time_offset_s
     at = at[(at >= sweep.frame_time_s[0]) & (at <= sweep.frame_time_s[-1])]
-    named = np.concatenate([np.arange(first, last + 1) for first, last in doubt.frames])
-    assert np.isin(np.abs(sweep.frame_time_s[:, None] - at).argmin(axis=0), named).all()
-    good, mended = (correct(tracking, each, ["pose"])["pose"].poses for each in (sweep, bad))
-    ends = [(p[0].inv() * p[-1]).apply(sweep.grid.centre_mm)[2] for p in (good, mended)]
+    doubtful_frames = np.concatenate([np.arange(first, last + 1) for first, last in doubt.frames])
+    assert np.isin(np.abs(sweep.frame_time_s[:, None] - at).argmin(axis=0), doubtful_frames).all()
+    clean_poses, trusted_poses = (correct(tracking, s, ["pose"])["pose"].poses for s in (sweep, bad))
+    ends = [(p[0].inv() * p[-1]).apply(sweep.grid.centre_mm)[2] for p in (clean_poses, trusted_poses)]
     # A tenth of the readings less: their jitter of 0.15 mm over some 20 that tell an end.
     assert ends[1] == pytest.approx(ends[0], abs=0.05)
 
 
 def test_a_gyroscope_on_other_axes_does_not_refute_the_readings(sweep, tracking):
-    turned_round = replace(sweep.orientation, gyroscope_rad_s=-sweep.orientation.gyroscope_rad_s)
-    examined = examine_sensors(replace(sweep, tracker=None, orientation=turned_round), tracking.image)
-    assert [(doubt.refuted, "gyroscope" in doubt.suspect) for doubt in examined.doubts] == [(False, True)]
+    opposite = replace(sweep.orientation, gyroscope_rad_s=-sweep.orientation.gyroscope_rad_s)
+    examination = examine_sensors(replace(sweep, tracker=None, orientation=opposite), tracking.image)
+    assert [(doubt.refuted, "gyroscope" in doubt.suspect) for doubt in examination.doubts] == [(False, True)]
 
 
 def test_readings_that_jitter_about_the_gyroscopes_turns_are_not_doubted(sweep):
     sensor = sweep.orientation
     time_s = sensor.readings.time_s
-    turned = np.deg2rad(2.0) * np.sin(np.pi * time_s[:, None] + np.arange(3))
-    jitter = np.random.default_rng(0).normal(0.0, np.deg2rad(0.15), turned.shape)
-    readings = replace(sensor.readings, world_from_sensor=Rotation.from_rotvec(turned + jitter))
-    rate = np.gradient(turned, time_s, axis=0)
+    rotvec = np.deg2rad(2.0) * np.sin(np.pi * time_s[:, None] + np.arange(3))
+    jitter = np.random.default_rng(0).normal(0.0, np.deg2rad(0.15), rotvec.shape)
+    readings = replace(sensor.readings, world_from_sensor=Rotation.from_rotvec(rotvec + jitter))
+    rate = np.gradient(rotvec, time_s, axis=0)
     slow = replace(sensor, readings=readings, gyroscope_rad_s=rate, accelerometer_m_s2=None)
     assert list(doubts_of_gyroscope(slow)) == []
 

@@ -94,15 +94,15 @@ def read(path):
     from speckle3d.io.shapes.surfaces import SUFFIXES, read_surface
     from speckle3d.io.tum import read_tum
 
-    others = {".tum": read_tum, ".csv": read_points, **dict.fromkeys(SUFFIXES, read_surface)}
-    others.get(path.suffix, describe)(path)
+    readers = {".tum": read_tum, ".csv": read_points, **dict.fromkeys(SUFFIXES, read_surface)}
+    readers.get(path.suffix, describe)(path)
     if path.parent.name != "shapes" and not RECORDS & {path.stem.split("_")[0]}:
         sweep = load_sweep(path)
         for i in range(len(sweep)):
             sweep.frames[i]
 
 
-def damaged(content, rng):
+def damage(content, rng):
     """Bytes with a few changed, a run of zeros in them, or cut off."""
     how, data = rng.integers(0, 6), bytearray(content)
     at, length = int(rng.integers(0, len(data))), int(rng.integers(1, 64))
@@ -143,7 +143,7 @@ def run(kind, first, count):
             print(seed, flush=True)
             rng = np.random.default_rng([*kind.encode(), seed])
             path = paths[int(rng.integers(0, len(paths)))]
-            path.write_bytes(damaged(whole[path], rng))
+            path.write_bytes(damage(whole[path], rng))
             faulthandler.dump_traceback_later(CASE_S, exit=True)
             try:
                 read(path)
@@ -157,9 +157,9 @@ def run(kind, first, count):
 @pytest.mark.parametrize("kind", KINDS)
 def test_damage_is_read_or_refused_in_one_line(kind):
     command = [sys.executable, __file__, kind, "0", str(CASES)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=900)
-    last = done.stdout.split()[-1:]
-    assert done.returncode == 0, f"{kind}: case {last}:\n{done.stderr[-3000:]}"
+    process = subprocess.run(command, capture_output=True, text=True, timeout=900)
+    last = process.stdout.split()[-1:]
+    assert process.returncode == 0, f"{kind}: case {last}:\n{process.stderr[-3000:]}"
 
 
 if __name__ == "__main__":

@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import sweep_examples
-from calibration_files import made
+from calibration_files import example_calibration
 
 from speckle3d.core.errors import MismatchError
 from speckle3d.io.calibrations import apply_calibrations, write_calibration
@@ -12,17 +12,17 @@ from speckle3d.io.hdf5 import sha256_of
 
 @pytest.fixture
 def path(tmp_path):
-    write_calibration(tmp_path / "cal.h5", made())
+    write_calibration(tmp_path / "cal.h5", example_calibration())
     return tmp_path / "cal.h5"
 
 
 def test_both_sensors_are_calibrated_from_their_files_and_the_files_told(path):
     turn = path.with_name("turn.h5")
-    write_calibration(turn, made("orientation"))
+    write_calibration(turn, example_calibration("orientation"))
     sweep, held = apply_calibrations(sweep_examples.rf_sweep(), [path, turn])
-    off = sweep.tracker.sensor_from_image.inv() * made().sensor_from_image
+    off = sweep.tracker.sensor_from_image.inv() * example_calibration().sensor_from_image
     np.testing.assert_allclose(off.as_matrix(), np.eye(4), atol=1e-9)
-    assert (sweep.orientation.sensor_from_image.inv() * made().rotation).magnitude() < 1e-12
+    assert (sweep.orientation.sensor_from_image.inv() * example_calibration().rotation).magnitude() < 1e-12
     assert [(one.sensor, one.path, one.sha256) for one in held] == [
         ("tracker", str(path), sha256_of(path)),
         ("orientation", str(turn), sha256_of(turn)),
@@ -31,7 +31,7 @@ def test_both_sensors_are_calibrated_from_their_files_and_the_files_told(path):
 
 def test_two_for_one_sensor_or_one_for_none_are_refused_with_the_file(path):
     again = path.with_name("again.h5")
-    write_calibration(again, made())
+    write_calibration(again, example_calibration())
     with pytest.raises(MismatchError, match=r"again\.h5"):
         apply_calibrations(sweep_examples.rf_sweep(), [path, again])
     with pytest.raises(MismatchError, match=r"cal\.h5: example"):

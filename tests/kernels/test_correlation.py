@@ -16,22 +16,24 @@ lags = st.tuples(st.integers(-17, 17), st.integers(-33, 33))
 
 def echoes(seed):
     """Two frames of complex Gaussian echoes, half of them in common."""
-    own, other, common = (re + 1j * im for re, im in np.random.default_rng(seed).normal(size=(3, 2, *SHAPE)))
-    return own + common, other + common
+    first, second, common = (
+        re + 1j * im for re, im in np.random.default_rng(seed).normal(size=(3, 2, *SHAPE))
+    )
+    return first + common, second + common
 
 
 def parts(echo):
     return np.stack([echo.real, echo.imag]).astype(np.float32)
 
 
-def correlated(fixed, moving, first, shift, least_overlap=0.6):
+def correlate(fixed, moving, first, shift, least_overlap=0.6):
     out = np.empty((len(first), 5))
     images = fixed.astype(np.float32), moving.astype(np.float32)
     patch_correlations(*images, np.array(first), SIZE, np.array(shift), least_overlap, out)
     return out
 
 
-def cohered(fixed, moving, first, shift, ramp=(0.0, 0.0), least_overlap=0.6):
+def cohere(fixed, moving, first, shift, ramp=(0.0, 0.0), least_overlap=0.6):
     out = np.empty((len(first), 5))
     place = np.array(first), SIZE, np.array(shift), np.array(ramp)
     patch_coherences(parts(fixed), parts(moving), *place, least_overlap, out)
@@ -48,20 +50,20 @@ def cohered(fixed, moving, first, shift, ramp=(0.0, 0.0), least_overlap=0.6):
 )
 def test_they_are_numpys_of_what_overlaps_at_every_lag(seed, first, data, ramp, least_overlap):
     shift = data.draw(st.lists(lags, min_size=len(first), max_size=len(first)))
-    one, two = echoes(seed)
+    fixed, moving = echoes(seed)
     place = first, SIZE, shift
     # Sums in float32 are right to 1e-7 of the energy.
-    a, b = np.abs(one) ** 2, np.abs(two) ** 2
+    a, b = np.abs(fixed) ** 2, np.abs(moving) ** 2
     expected = oracles.of_patches(a, b, *place, least_overlap, oracles.pearson)[:, *CROSS]
-    np.testing.assert_allclose(correlated(a, b, first, shift, least_overlap), expected, atol=5e-6)
-    expected = oracles.of_patches(one, two, *place, least_overlap, oracles.coherence(ramp))[:, *CROSS]
-    np.testing.assert_allclose(cohered(one, two, first, shift, ramp, least_overlap), expected, atol=5e-6)
+    np.testing.assert_allclose(correlate(a, b, first, shift, least_overlap), expected, atol=5e-6)
+    expected = oracles.of_patches(fixed, moving, *place, least_overlap, oracles.coherence(ramp))[:, *CROSS]
+    np.testing.assert_allclose(cohere(fixed, moving, first, shift, ramp, least_overlap), expected, atol=5e-6)
 
 
 def test_flat_patches_have_no_correlation_nor_empty_ones_coherence():
-    one, _ = echoes(2)
-    assert np.isnan(correlated(np.full(SHAPE, 1e5), np.abs(one), [(4, 10)], [(0, 0)])).all()
-    assert np.isnan(cohered(one, 0 * one, [(4, 10)], [(0, 0)])).all()
+    field, _ = echoes(2)
+    assert np.isnan(correlate(np.full(SHAPE, 1e5), np.abs(field), [(4, 10)], [(0, 0)])).all()
+    assert np.isnan(cohere(field, 0 * field, [(4, 10)], [(0, 0)])).all()
 
 
 @settings(deadline=None, max_examples=30)

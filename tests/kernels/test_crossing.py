@@ -23,13 +23,13 @@ def test_grey_levels_that_grow_evenly_in_space_are_found_with_their_slopes():
     values, place, slopes = np.empty(400), np.empty(400), np.zeros((400, 3))
     planes = np.ascontiguousarray(poses.inv().as_matrix()[:, :3])
     look_up(points, volume, planes, PIXELS, values, slopes, place)
-    known = np.isfinite(values)
+    finite = np.isfinite(values)
     # Inside the images all but those beside the one that is missing.
     low, high = PIXELS[2:], PIXELS[2:] + PIXELS[:2] * np.subtract(SHAPE[1:], 1)
     inside = ((points[:, :2] > low + 0.3) & (points[:, :2] < high - 0.3)).all(axis=1)
     inside &= (points[:, 2] > 0.1) & (points[:, 2] < 4.3)
     assert inside.sum() > 150
-    assert 0 < (~known & inside).sum() < 10
+    assert 0 < (~finite & inside).sum() < 10
     # Neighbouring planes are turned by 0.004 rad against each other, 0.4 mm apart.
-    np.testing.assert_allclose(values[known], points[known] @ growth, atol=2e-3)
-    np.testing.assert_allclose(slopes[known], np.tile(growth, (known.sum(), 1)), atol=0.02)
+    np.testing.assert_allclose(values[finite], points[finite] @ growth, atol=2e-3)
+    np.testing.assert_allclose(slopes[finite], np.tile(growth, (finite.sum(), 1)), atol=0.02)

@@ -28,33 +28,33 @@ def cells(power):
 
 @cache
 def fields():
-    return [speckle.Speckle(np.random.default_rng(seed)).seen() for seed in range(25)]
+    return [speckle.Speckle(np.random.default_rng(seed)).image() for seed in range(25)]
 
 
 @cache
-def sampled(rho):
+def sample_correlations(rho):
     """Correlations of echo and of intensity, patch by patch, of frames that have `rho` in common."""
-    found = np.empty((2, len(fields()) - 1, len(PATCHES)))
+    correlations = np.empty((2, len(fields()) - 1, len(PATCHES)))
     still, out = np.zeros((len(PATCHES), 2), np.int64), np.empty((len(PATCHES), 5))
-    for k, (one, other) in enumerate(zip(fields()[:-1], fields()[1:], strict=True)):
-        two = speckle.decorrelated(one, other, rho)
-        echoes = (np.stack([z.real, z.imag]).astype(np.float32) for z in (one, two))
+    for k, (fixed, independent) in enumerate(zip(fields()[:-1], fields()[1:], strict=True)):
+        moving = speckle.mix(fixed, independent, rho)
+        echoes = (np.stack([z.real, z.imag]).astype(np.float32) for z in (fixed, moving))
         place = PATCHES.first, PATCHES.size, still
         patch_coherences(*echoes, *place, np.zeros(2), 0.6, out)
-        found[0, k] = out[:, 2]
-        patch_correlations(speckle.intensity(one), speckle.intensity(two), *place, 0.6, out)
-        found[1, k] = out[:, 2]
-    return found
+        correlations[0, k] = out[:, 2]
+        patch_correlations(speckle.intensity(fixed), speckle.intensity(moving), *place, 0.6, out)
+        correlations[1, k] = out[:, 2]
+    return correlations
 
 
 @pytest.mark.parametrize("rho", [0.0, 0.4, 0.9])
 def test_variance_of_the_echos_correlation_over_speckle(rho):
     """With cells from the field's own autocorrelation, nothing fitted: 10 % of the deviation."""
-    claimed = np.sqrt(correlation_variance(rho, cells(2), True))
-    assert sampled(rho)[0].std() == pytest.approx(claimed, rel=0.1)
+    sigma = np.sqrt(correlation_variance(rho, cells(2), True))
+    assert sample_correlations(rho)[0].std() == pytest.approx(sigma, rel=0.1)
 
 
 def test_variance_of_intensitys_correlation_where_speckle_is_gone():
     """There nothing but the cells counts, and intensity, the echo's square, has twice as many."""
-    claimed = correlation_variance(0.0, cells(4), False)
-    assert sampled(0.0)[1].var() == pytest.approx(claimed, rel=0.15)
+    variance = correlation_variance(0.0, cells(4), False)
+    assert sample_correlations(0.0)[1].var() == pytest.approx(variance, rel=0.15)

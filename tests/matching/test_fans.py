@@ -7,8 +7,8 @@ from speckle3d.core.sweep import BModeSettings, Sweep
 from speckle3d.matching.matcher import FrameMatcher
 
 PIXEL_MM = 0.05
-CURVED = ImageGrid.of_fan(193, 401, 0.08, 60.0, tuple(np.deg2rad((-25.0, 25.0))))
-PHASED = ImageGrid.of_fan(129, 401, 0.08, 0.0, tuple(np.deg2rad((-35.0, 35.0))), 12.0)
+CONVEX = ImageGrid.of_fan(193, 401, 0.08, 60.0, tuple(np.deg2rad((-25.0, 25.0))))
+SECTOR = ImageGrid.of_fan(129, 401, 0.08, 0.0, tuple(np.deg2rad((-35.0, 35.0))), 12.0)
 
 
 def speckle(grid, seed=0):
@@ -31,14 +31,14 @@ def frame(grid, field, margin, motion):
     return np.rint(np.clip(level, 0, 255)).astype(np.uint8)
 
 
-@pytest.mark.parametrize("grid", [CURVED, PHASED], ids=["curved", "phased"])
+@pytest.mark.parametrize("grid", [CONVEX, SECTOR], ids=["convex", "sector"])
 @pytest.mark.parametrize("motion", [(0.3, 0.0, 0.0), (0.0, 0.25, 0.0), (-0.4, 0.2, 0.008)])
 def test_motion_in_the_plane_of_a_fan(grid, motion):
     field, margin = speckle(grid)
-    frames = np.stack([frame(grid, field, margin, each) for each in (np.zeros(3), motion)])
+    frames = np.stack([frame(grid, field, margin, m) for m in (np.zeros(3), motion)])
     sweep = Sweep(frames, grid, BModeSettings(60.0), np.arange(2.0))
     matcher = FrameMatcher(sweep)
-    first, second = (matcher.prepare(matcher.echo(each)) for each in frames)
+    first, second = (matcher.prepare(matcher.echo(f)) for f in frames)
     match = matcher.match({0: first}, 1, second, [matcher.search(first, second)])
     # The same field is seen again: within a fifth of a sample, and no elevational motion to read.
     np.testing.assert_allclose(match.inplane[0, :2], motion[:2], atol=0.016)

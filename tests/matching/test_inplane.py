@@ -39,7 +39,7 @@ def speckle_of(seed, spectrum):
     """Speckle, the same at rest, and unrelated speckle."""
     rng = np.random.default_rng(seed)
     common = speckle.Speckle(rng, spectrum)
-    return common, common.seen(), speckle.Speckle(rng, spectrum).seen()
+    return common, common.image(), speckle.Speckle(rng, spectrum).image()
 
 
 def pair(seed, motion=(0.0, 0.0, 0.0), rho=1.0, spectrum=speckle.gaussian, strain=0.0):
@@ -47,20 +47,20 @@ def pair(seed, motion=(0.0, 0.0, 0.0), rho=1.0, spectrum=speckle.gaussian, strai
 
     What lies deeper in the tissue than in the image comes with so much more phase.
     """
-    common, first, other = speckle_of(seed, spectrum)
-    moved = copy(common)
-    moved.grid = replace(GRID, sample_spacing_mm=GRID.sample_spacing_mm * (1 + strain))
+    common, first, independent = speckle_of(seed, spectrum)
+    probe = copy(common)
+    probe.grid = replace(GRID, sample_spacing_mm=GRID.sample_spacing_mm * (1 + strain))
     x_mm, y_mm, roll_rad = motion
     across = np.arange(GRID.vectors)[:, None] * GRID.vector_pitch_mm - GRID.centre_mm[0]
-    steps = np.arange(GRID.samples) * moved.grid.sample_spacing_mm
-    down = steps + GRID.first_sample_depth_mm - moved.grid.centre_mm[1]
-    seen = np.sin(roll_rad) * across + np.cos(roll_rad) * down + y_mm + moved.grid.centre_mm[1]
-    shown = np.arange(GRID.samples) * GRID.sample_spacing_mm + GRID.first_sample_depth_mm
-    second = speckle.decorrelated(moved.seen(x_mm, y_mm, roll_rad), other, rho)
-    return first, second * np.exp(1j * WAVENUMBER_PER_MM * (seen - shown))
+    steps = np.arange(GRID.samples) * probe.grid.sample_spacing_mm
+    down = steps + GRID.first_sample_depth_mm - probe.grid.centre_mm[1]
+    tissue_mm = np.sin(roll_rad) * across + np.cos(roll_rad) * down + y_mm + probe.grid.centre_mm[1]
+    image_mm = np.arange(GRID.samples) * GRID.sample_spacing_mm + GRID.first_sample_depth_mm
+    second = speckle.mix(probe.image(x_mm, y_mm, roll_rad), independent, rho)
+    return first, second * np.exp(1j * WAVENUMBER_PER_MM * (tissue_mm - image_mm))
 
 
-def prepared(echo, matcher=MATCHER, of_echo=False):
+def prepare(echo, matcher=MATCHER, of_echo=False):
     frame = matcher.prepare(Echo(speckle.intensity(echo), None))
     parts = np.stack([echo.real, echo.imag]).astype(np.float32)
     return frame._replace(echo=parts) if of_echo else frame
@@ -68,7 +68,7 @@ def prepared(echo, matcher=MATCHER, of_echo=False):
 
 def match(echoes, start=None, of_echo=False, matcher=MATCHER, wavenumber_per_mm=WAVENUMBER_PER_MM):
     """In-plane motion, its covariance, and the patches' correlations."""
-    fixed, moving = (prepared(echo, matcher, of_echo) for echo in echoes)
+    fixed, moving = (prepare(echo, matcher, of_echo) for echo in echoes)
     begin = matcher.search(fixed, moving) if start is None else np.array(start)
     matcher._wavenumber = wavenumber_per_mm
     table = matcher.match({0: fixed}, 1, moving, [begin])
@@ -97,8 +97,8 @@ def test_sub_sample_shift_and_roll_are_found_from_a_whole_frame_search(
 ):
     off = []
     for seed, motion in enumerate(motions(10, largest_roll_deg=0.6)):
-        got, _, _ = match(pair(seed, motion, rho, spectrum))
-        off.append((got - motion) * [1, 1, np.rad2deg(1)])
+        estimate, _, _ = match(pair(seed, motion, rho, spectrum))
+        off.append((estimate - motion) * [1, 1, np.rad2deg(1)])
     rms = np.sqrt(np.mean(np.square(off), axis=0))
     assert (rms < [lateral_mm, axial_mm, roll_deg]).all(), rms
 
@@ -107,29 +107,29 @@ def test_covariance_is_of_the_errors_size():
     """Within a factor of 2.5 for speckle that correlates well; one would be exact."""
     pulls = []
     for seed, motion in enumerate(motions(12, 0.3, seed=1)):
-        got, covariance, _ = match(pair(seed, motion, 0.7), motion)
-        pulls.append((got - motion) / np.sqrt(np.diag(covariance)))
+        estimate, covariance, _ = match(pair(seed, motion, 0.7), motion)
+        pulls.append((estimate - motion) / np.sqrt(np.diag(covariance)))
     rms = np.sqrt(np.mean(np.square(pulls), axis=0))
     assert (rms > 0.4).all(), rms
     assert (rms < 2.5).all(), rms
 
 
 def test_without_enough_patches_the_start_is_kept_and_told_to_be_unknown():
-    got, covariance, correlation = match((pair(0)[0], np.ones_like(pair(0)[0])), (0.3, 0.06, 0.01))
-    assert got.tolist() == [0.3, 0.06, 0.01]
+    estimate, covariance, correlation = match((pair(0)[0], np.ones_like(pair(0)[0])), (0.3, 0.06, 0.01))
+    assert estimate.tolist() == [0.3, 0.06, 0.01]
     assert np.array_equal(covariance, np.eye(3))
     assert np.isnan(correlation).all()
 
 
 def test_patches_that_left_the_image_or_are_masked_are_nan_and_the_others_are_not():
     motion = (2.4, 0.0, 0.0)
-    fixed, moving = (prepared(echo) for echo in pair(4, motion))
-    gone = PATCHES.centre_mm[:, 0] < PATCHES.centre_mm[:, 0].min() + 0.1
-    gone[[20, 30]] = fixed.usable[20] = moving.usable[30] = False
-    gone[[20, 30]] = True
+    fixed, moving = (prepare(echo) for echo in pair(4, motion))
+    outside = PATCHES.centre_mm[:, 0] < PATCHES.centre_mm[:, 0].min() + 0.1
+    outside[[20, 30]] = fixed.usable[20] = moving.usable[30] = False
+    outside[[20, 30]] = True
     (correlation,) = MATCHER.match({0: fixed}, 1, moving, [np.array(motion)]).correlation
-    assert np.isnan(correlation[gone]).all()
-    assert (correlation[~gone] > 0.95).all()
+    assert np.isnan(correlation[outside]).all()
+    assert (correlation[~outside] > 0.95).all()
 
 
 # ---- correlation at the motion ---------------------------------------------------------------------------
@@ -142,31 +142,31 @@ def test_correlation_left_is_the_elevational_one_whatever_the_in_plane_motion(sp
     """A half-degree's roll turns an echo's phase by a third of a cycle over a patch: it is undone."""
     means = []
     for seed, motion in enumerate(motions(6, 0.5, seed=2)):
-        moved = np.nanmean(match(pair(seed, motion, rho, spectrum), motion, of_echo)[2])
+        moving = np.nanmean(match(pair(seed, motion, rho, spectrum), motion, of_echo)[2])
         still = np.nanmean(match(pair(seed, (0, 0, 0), rho, spectrum), (0, 0, 0), of_echo)[2])
-        means.append((moved, still))
-    moved, still = np.mean(means, axis=0)
+        means.append((moving, still))
+    moving, still = np.mean(means, axis=0)
     # 56 patches of 80 cells, six times: a standard error of 0.005 at most. The rest is interpolation. The
     # squared coherence of N = 45 cells is (1 - rho)^2 / N high by nature.
     assert abs(still - of_echo * (1 - rho) ** 2 / 45 - rho) < 0.025
-    assert abs(moved - still) < 0.015
+    assert abs(moving - still) < 0.015
 
 
 @pytest.mark.parametrize(("roll_deg", "strain"), [(0.5, 0.0), (0.0, -0.005), (0.4, 0.004)])
 def test_the_ramp_undoes_what_roll_and_axial_strain_do_to_the_echo(roll_deg, strain):
     motion = (0.1, 0.2, np.deg2rad(roll_deg))
-    start, found = (0.1, 0.2 + strain * GRID.depth_mm / 2, motion[2]), []
-    for turned in (1, 0, -1):
-        wavenumber = turned * WAVENUMBER_PER_MM
+    start, means = (0.1, 0.2 + strain * GRID.depth_mm / 2, motion[2]), []
+    for sign in (1, 0, -1):
+        wavenumber = sign * WAVENUMBER_PER_MM
         every = [
             match(pair(k, motion, 0.8, strain=strain), start, True, MATCHER, wavenumber) for k in range(4)
         ]
-        found.append(np.nanmean([correlation for _, _, correlation in every]))
+        means.append(np.nanmean([correlation for _, _, correlation in every]))
     # Over a patch of 3.6 x 3.0 mm the phase turns evenly by 57/mm slope side; sinc^2 of half that is left.
     turns = WAVENUMBER_PER_MM * np.array([np.deg2rad(roll_deg) * 3.6, strain * 3.0]) / (2 * np.pi)
-    assert found[0] == pytest.approx(0.8, abs=0.015)
-    assert found[1] == pytest.approx(0.8 * np.prod(np.sinc(turns) ** 2), abs=0.025)
-    assert found[2] < found[1] - 0.1
+    assert means[0] == pytest.approx(0.8, abs=0.015)
+    assert means[1] == pytest.approx(0.8 * np.prod(np.sinc(turns) ** 2), abs=0.025)
+    assert means[2] < means[1] - 0.1
 
 
 # ---- search over the whole frame -------------------------------------------------------------------------
@@ -176,10 +176,10 @@ def test_the_ramp_undoes_what_roll_and_axial_strain_do_to_the_echo(roll_deg, str
 def test_whole_sample_shifts_are_found_from_nowhere_within_the_range(shift):
     field = speckle.Speckle(np.random.default_rng(6), margin_mm=8.0)
     motion = -np.array([*shift * PATCHES.spacing_mm, 0.0])
-    fixed, moving = prepared(field.seen()), prepared(field.seen(*motion))
+    fixed, moving = prepare(field.image()), prepare(field.image(*motion))
     np.testing.assert_allclose(MATCHER.search(fixed, moving), motion, atol=1e-9)
     near = matcher_of(search_mm=1.0)
-    fixed, moving = prepared(field.seen(), near), prepared(field.seen(*motion), near)
+    fixed, moving = prepare(field.image(), near), prepare(field.image(*motion), near)
     assert (np.abs(near.search(fixed, moving)) <= 1.3).all()
 
 

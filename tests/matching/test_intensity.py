@@ -22,9 +22,9 @@ def extractor(signal=RF, samples=1800, vectors=6, **settings_):
     return IntensityExtractor(signal, grid, IntensitySettings(**settings_))
 
 
-def step(made, signal):
+def step(extractor, signal):
     """Distance of the intensity's samples, in samples of the signal."""
-    return made.grid.sample_spacing_mm / signal.sample_spacing_mm
+    return extractor.grid.sample_spacing_mm / signal.sample_spacing_mm
 
 
 def pulse(signal, samples, at, vectors=6):
@@ -47,26 +47,26 @@ def plain_intensity(rf, signal, at, edge_fraction=0.1):
     edge = edge_fraction * (high - low)
     off = np.maximum(low - f, f - high)
     weight = np.where(off <= 0, 1, np.where(off < edge, 0.5 + 0.5 * np.cos(np.pi * off / edge), 0)) * (f > 0)
-    held = np.flatnonzero(weight)
-    spectrum = 2 * weight[held] * fft.fft(rf.astype(float), n, axis=1)[:, held] / n
-    turning = np.exp(2j * np.pi * np.outer(f[held] / signal.sampling_rate_hz, at))
+    band = np.flatnonzero(weight)
+    spectrum = 2 * weight[band] * fft.fft(rf.astype(float), n, axis=1)[:, band] / n
+    turning = np.exp(2j * np.pi * np.outer(f[band] / signal.sampling_rate_hz, at))
     return np.abs(spectrum @ turning) ** 2
 
 
 @pytest.mark.parametrize(("signal", "samples"), BANDS)
 def test_resampled_intensity_is_the_plain_one_at_its_samples(signal, samples):
-    made = extractor(signal, samples)
+    package = extractor(signal, samples)
     rf = noise(samples)
-    at = step(made, signal) * np.arange(made.grid.samples)
-    assert samples - 1 - step(made, signal) < at[-1] <= samples - 1
+    at = step(package, signal) * np.arange(package.grid.samples)
+    assert samples - 1 - step(package, signal) < at[-1] <= samples - 1
     expected = plain_intensity(rf, signal, at)
-    got = made.intensity(rf)
-    assert got.shape == (6, made.grid.samples) == expected.shape
+    intensity = package.intensity(rf)
+    assert intensity.shape == (6, package.grid.samples) == expected.shape
     # The filter's tail, cut where the package pads and the plain one does not, is 1e-4 of the amplitude.
-    np.testing.assert_allclose(got, expected, rtol=2e-3, atol=1e-3 * expected.mean())
+    np.testing.assert_allclose(intensity, expected, rtol=2e-3, atol=1e-3 * expected.mean())
 
 
-def demodulated(rf, signal, middle_hz, every):
+def demodulate(rf, signal, middle_hz, every):
     """I/Q by mixing and a brick-wall filter, in double precision."""
     n = rf.shape[1]
     turns = middle_hz / signal.sampling_rate_hz * np.arange(n)
@@ -87,12 +87,12 @@ def test_i_and_q_give_what_their_rf_gives(middle_hz, every):
         signal, sampling_rate_hz=signal.sampling_rate_hz / every, demodulation_frequency_hz=middle_hz
     )
     of_rf, of_iq = extractor(signal, samples), extractor(baseband, samples // every)
-    iq = demodulated(rf, signal, middle_hz, every).astype(np.complex64)
-    expected, got = of_rf.intensity(rf.astype(np.float32)), of_iq.intensity(iq)
+    iq = demodulate(rf, signal, middle_hz, every).astype(np.complex64)
+    expected, intensity = of_rf.intensity(rf.astype(np.float32)), of_iq.intensity(iq)
     # 4 um at 40 mm: 1e-4 of the rate, of which the echoes' speckle of 0.1 mm sees 1e-3.
     assert abs(of_iq.grid.sample_spacing_mm / of_rf.grid.sample_spacing_mm - 1) < 1e-4
-    shared = min(expected.shape[1], got.shape[1])
-    np.testing.assert_allclose(got[:, :shared], expected[:, :shared], atol=3e-3 * expected.max())
+    count = min(expected.shape[1], intensity.shape[1])
+    np.testing.assert_allclose(intensity[:, :count], expected[:, :count], atol=3e-3 * expected.max())
 
 
 @settings(deadline=None, max_examples=50)
@@ -102,10 +102,10 @@ def test_i_and_q_give_what_their_rf_gives(middle_hz, every):
     full=st.sampled_from([255.0, 250.0, 1.0]),
 )
 def test_log_compression_is_undone(decibel, dynamic_range, full):
-    made = IntensityExtractor(BModeSettings(dynamic_range, full), ImageGrid(2, 3, 0.1, 0.1))
+    bmode = IntensityExtractor(BModeSettings(dynamic_range, full), ImageGrid(2, 3, 0.1, 0.1))
     grey = full * (1 + decibel / dynamic_range)
-    got = made.intensity(np.full((2, 3), grey))
-    np.testing.assert_allclose(got, 10 ** (decibel / 10), rtol=1e-4)  # float32 of a 60 dB range
+    intensity = bmode.intensity(np.full((2, 3), grey))
+    np.testing.assert_allclose(intensity, 10 ** (decibel / 10), rtol=1e-4)  # float32 of a 60 dB range
 
 
 # ---- equalising ------------------------------------------------------------------------------------------
@@ -114,8 +114,8 @@ def test_log_compression_is_undone(decibel, dynamic_range, full):
 @pytest.fixture(scope="module")
 def two_views():
     rng = np.random.default_rng(5)
-    field, other = speckle.Speckle(rng).seen(), speckle.Speckle(rng).seen()
-    return speckle.intensity(field), speckle.intensity(speckle.decorrelated(field, other, 0.4))
+    field, independent = speckle.Speckle(rng).image(), speckle.Speckle(rng).image()
+    return speckle.intensity(field), speckle.intensity(speckle.mix(field, independent, 0.4))
 
 
 @pytest.fixture(scope="module")
@@ -134,8 +134,8 @@ def equaliser():
 def test_equalising_leaves_the_correlation_of_speckle_and_takes_away_that_of_brightness(
     two_views, ramp, equaliser
 ):
-    ramped = [view * ramp for view in two_views]
-    equalised = [view * equaliser.gain(view) for view in ramped]
-    plain, steep, level = (np.corrcoef(a.ravel(), b.ravel())[0, 1] for a, b in (two_views, ramped, equalised))
+    ramps = [view * ramp for view in two_views]
+    levels = [view * equaliser.gain(view) for view in ramps]
+    plain, steep, level = (np.corrcoef(a.ravel(), b.ravel())[0, 1] for a, b in (two_views, ramps, levels))
     assert abs(level - plain) < 0.04
     assert steep > plain + 0.1

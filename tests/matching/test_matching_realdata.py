@@ -48,10 +48,10 @@ def test_neighbouring_frames_are_matched(recording):
     frames = [ready(matcher, sweep.frames[i]) for i in range(len(sweep))]
     for fixed, moving in pairwise(frames):
         motion, correlation = match(matcher, fixed, moving)
-        known = np.isfinite(correlation)
-        assert known.mean() > 0.7
+        finite = np.isfinite(correlation)
+        assert finite.mean() > 0.7
         # The mouse's frames lie close together: they share speckle, and moved little within the plane. Echoes
         # of breathing tissue share less than their intensity does, yet ten times what unrelated ones do.
         elsewhere = match(matcher, fixed, moving, np.array([0.0, 1.5, 0.0]))[1]
-        assert np.median(correlation[known]) > max(0.08, 10 * np.nanmedian(elsewhere))
+        assert np.median(correlation[finite]) > max(0.08, 10 * np.nanmedian(elsewhere))
         assert np.hypot(*motion[:2]) < 0.5

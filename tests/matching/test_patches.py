@@ -23,11 +23,11 @@ def test_whole_patches_tile_the_image_without_overlap(vectors, samples, pitch, s
     except InvalidInputError:
         assert grid.width_mm < 3.6 + pitch or grid.depth_mm < 2.0 + 2 * 3.0 + 3 * spacing
         return
-    taken = np.zeros((vectors, samples), int)
+    cover = np.zeros((vectors, samples), int)
     for v, s in patches.first:
-        taken[v : v + patches.size[0], s : s + patches.size[1]] += 1
-    assert taken.max() == 1
-    assert taken.sum() == len(patches) * patches.size.prod()
+        cover[v : v + patches.size[0], s : s + patches.size[1]] += 1
+    assert cover.max() == 1
+    assert cover.sum() == len(patches) * patches.size.prod()
     assert (patches.first >= 0).all()
     assert (patches.first + patches.size <= (vectors, samples)).all()
     sides = patches.size * patches.spacing_mm
@@ -49,10 +49,10 @@ def test_depths_that_hold_less_than_half_of_the_rows_are_refused(depths):
 
 def test_a_region_keeps_its_patches_and_rows():
     grid = ImageGrid(96, 1000, 0.3, 0.04)
-    every = lay_patches(grid)
-    some = lay_patches(grid, PatchSettings(region="rectangle 0,8 15,20"))
-    assert len(every) > len(some) > some.inside.sum() > 0
-    x, y = some.centre_mm[some.inside].T
+    whole = lay_patches(grid)
+    part = lay_patches(grid, PatchSettings(region="rectangle 0,8 15,20"))
+    assert len(whole) > len(part) > part.inside.sum() > 0
+    x, y = part.centre_mm[part.inside].T
     assert (x < 15).all()
     assert (y > 8).all()
     assert (y < 20).all()

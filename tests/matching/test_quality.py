@@ -20,12 +20,6 @@ from speckle3d.matching.quality import (
 )
 from speckle3d.simulation.presets import SimulationSettings, simulate
 
-FROZEN, SATURATED, LIFTED, NO_SPECKLE = (
-    FrameFlag.FROZEN,
-    FrameFlag.SATURATED,
-    FrameFlag.LIFTED,
-    FrameFlag.NO_SPECKLE,
-)
 RAIL = 8191
 """Of 14 bits."""
 NOISE_COUNTS = 3.5
@@ -33,7 +27,7 @@ NOISE_COUNTS = 3.5
 BMODE = BModeSettings(60.0)
 
 
-def inspected(frames, signal, grid):
+def features_of(frames, signal, grid):
     extractor = IntensityExtractor(signal, grid)
     patches, is_bmode = lay_patches(extractor.grid), isinstance(signal, BModeSettings)
     with np.errstate(all="ignore"):
@@ -42,7 +36,7 @@ def inspected(frames, signal, grid):
 
 
 def flags_of(frames, signal, grid):
-    return flag_frames(inspected(frames, signal, grid)).tolist()
+    return flag_frames(features_of(frames, signal, grid)).tolist()
 
 
 def counts(samples):
@@ -63,22 +57,22 @@ def air(frame, grid):
     return counts(echo + noise(frame))
 
 
-def lifted(frame, grid):
+def lift(frame, grid):
     first = int(3.0 / grid.sample_spacing_mm)
     return np.concatenate([frame[:, :first], noise(frame)[:, first:]], axis=1)
 
 
 BAD = {
-    "clipped": (lambda f, g: counts(30.0 * f), SATURATED),
-    "noise": (lambda f, g: noise(f), LIFTED),
-    "lifted": (lambda f, g: lifted(f, g), LIFTED),
-    "air": (air, LIFTED),
-    "black": (lambda f, g: np.zeros_like(f), NO_SPECKLE),
+    "clipped": (lambda f, g: counts(30.0 * f), FrameFlag.SATURATED),
+    "noise": (lambda f, g: noise(f), FrameFlag.LIFTED),
+    "lifted": (lambda f, g: lift(f, g), FrameFlag.LIFTED),
+    "air": (air, FrameFlag.LIFTED),
+    "black": (lambda f, g: np.zeros_like(f), FrameFlag.NO_SPECKLE),
     "ramp both ways": (
         lambda f, g: counts(
             np.linspace(-3000, 3000, f.shape[0])[:, None] + np.linspace(-4000, 4000, f.shape[1])
         ),
-        NO_SPECKLE,
+        FrameFlag.NO_SPECKLE,
     ),
 }
 
@@ -90,8 +84,8 @@ def phantom(sweep):
 
 @pytest.fixture(scope="module")
 def tissue():
-    simulated = simulate(SimulationSettings(preset="tissue", seed=5, vectors=24, length_mm=4.0, frames=6))
-    sweep = simulated[0].sweep
+    settings = SimulationSettings(preset="tissue", seed=5, vectors=24, length_mm=4.0, frames=6)
+    sweep = simulate(settings)[0].sweep
     return [sweep.frames[i] for i in range(6)], sweep.signal, sweep.grid
 
 
@@ -109,7 +103,7 @@ def grey(frame, signal, grid):
 
 def test_good_frames_are_not_flagged(good):
     frames, signal, grid = good
-    features = inspected(frames, signal, grid)
+    features = features_of(frames, signal, grid)
     assert not flag_frames(features).any()
     # Tissue holds fascias and fibres finer than a patch in some patches: 0.63 was the least on other seeds.
     assert min(f.speckle_share for f in features) > 0.5
@@ -121,34 +115,45 @@ def test_good_frames_are_not_flagged(good):
 def test_a_bad_frame_among_good_ones_is_flagged_and_no_other(good, name):
     frames, signal, grid = good
     spoil, flag = BAD[name]
-    mixed = [spoil(frame, grid) if i in (1, 4) else frame for i, frame in enumerate(frames)]
+    mixture = [spoil(frame, grid) if i in (1, 4) else frame for i, frame in enumerate(frames)]
     expected = [int(flag) if i in (1, 4) else 0 for i in range(len(frames))]
-    assert flags_of(mixed, signal, grid) == expected
+    assert flags_of(mixture, signal, grid) == expected
 
 
 def test_only_the_repeat_of_the_frame_before_is_frozen(phantom):
     frames, signal, grid = phantom
     a, b = frames[:2]
-    touched = b.copy()
-    touched[20, 1700] += 30  # in the band, as an offset of the line would not be
-    order = [a, a, b, a, b, b.copy(), b, touched]
-    assert flags_of(order, signal, grid) == [0, FROZEN, 0, 0, 0, FROZEN, FROZEN, 0]
+    edit = b.copy()
+    edit[20, 1700] += 30  # in the band, as an offset of the line would not be
+    order = [a, a, b, a, b, b.copy(), b, edit]
+    assert flags_of(order, signal, grid) == [
+        0,
+        FrameFlag.FROZEN,
+        0,
+        0,
+        0,
+        FrameFlag.FROZEN,
+        FrameFlag.FROZEN,
+        0,
+    ]
 
 
-@pytest.mark.parametrize(("gain", "saturated"), [(8.0, False), (12.0, True)])
-def test_clipping_is_saturation_from_where_distances_are_wrong(phantom, gain, saturated):
+@pytest.mark.parametrize(("gain", "saturates"), [(8.0, False), (12.0, True)])
+def test_clipping_is_saturation_from_where_distances_are_wrong(phantom, gain, saturates):
     # Speckle of 350 counts in 14 bits: 0.3 and 4.8 % are clipped; the median patch's distance is 0 and 1.7 %
     # too long.
     frames, signal, grid = phantom
     spoilt = [counts(gain * frame) for frame in frames]
-    assert flags_of(spoilt, signal, grid) == [SATURATED if saturated else 0] * len(frames)
+    assert flags_of(spoilt, signal, grid) == [FrameFlag.SATURATED if saturates else 0] * len(frames)
 
 
 def test_a_frame_with_samples_that_are_not_finite_has_no_speckle(phantom):
     frames, signal, grid = phantom
-    mixed = [frame.astype(np.float32) for frame in frames]
-    mixed[2][5, 1700] = np.nan
-    assert flags_of(mixed, signal, grid) == [NO_SPECKLE if i == 2 else 0 for i in range(len(frames))]
+    mixture = [frame.astype(np.float32) for frame in frames]
+    mixture[2][5, 1700] = np.nan
+    assert flags_of(mixture, signal, grid) == [
+        FrameFlag.NO_SPECKLE if i == 2 else 0 for i in range(len(frames))
+    ]
 
 
 def test_bmode_of_good_frames_is_not_flagged(good):
@@ -158,9 +163,9 @@ def test_bmode_of_good_frames_is_not_flagged(good):
     # Black margins of a captured screen take no part, however wide.
     margin = 3 * grid.vectors
     wide = [np.pad(image, ((margin, margin), (0, 0))) for image in images]
-    found = inspected(wide, BMODE, replace(coarse[0], vectors=wide[0].shape[0]))
-    assert not flag_frames(found).any()
-    assert min(f.speckle_share for f in found) > 0.4
+    features = features_of(wide, BMODE, replace(coarse[0], vectors=wide[0].shape[0]))
+    assert not flag_frames(features).any()
+    assert min(f.speckle_share for f in features) > 0.4
 
 
 MOUSE = ImportSettings(centre_frequency_hz=20e6, bandwidth_hz=(12e6, 28e6), frame_rate_hz=10.0)
@@ -178,8 +183,8 @@ REAL = {
     "liver of a mouse, RF": ("rf/MouseLiverRF.mha", MOUSE, 0),
     "spine phantom, B-mode": ("plus/SpinePhantomFreehand.igs.mha", PLUS, 0),
     # No echo but ring-down to 14 mm, the same in all vectors, and noise below: the probe is in air.
-    "ring-down, I/Q": ("plus/UltrasonixLinearRfData.igs.mha", ULTRASONIX, LIFTED),
-    "wires in water, B-mode": ("plus/NwirePhantomFreehand.igs.nrrd", PLUS, NO_SPECKLE),
+    "ring-down, I/Q": ("plus/UltrasonixLinearRfData.igs.mha", ULTRASONIX, FrameFlag.LIFTED),
+    "wires in water, B-mode": ("plus/NwirePhantomFreehand.igs.nrrd", PLUS, FrameFlag.NO_SPECKLE),
 }
 
 
@@ -189,7 +194,7 @@ def test_real_recordings(realdata, name):
     path, settings, flag = REAL[name]
     sweep = load_sweep(realdata / path, settings)
     frames = [sweep.frames[i] for i in range(0, len(sweep), 1 + len(sweep) // 30)]
-    features = inspected(frames, sweep.signal, sweep.grid)
+    features = features_of(frames, sweep.signal, sweep.grid)
     assert flag_frames(features).tolist() == [int(flag)] * len(frames)
     # Measured: 0.93 or more of the liver's patches, 0.41 of the spine's hold speckle,
     # and at most 0.09 of the others'. The bounds lie midway to the threshold.
@@ -200,7 +205,7 @@ def test_real_recordings(realdata, name):
 def test_frames_are_judged_by_the_region_alone():
     """A shadow over most of the image is no frame without speckle where one looks beside it."""
     rng, grid = np.random.default_rng(3), ImageGrid(96, 420, GRID.vector_pitch_mm, GRID.sample_spacing_mm)
-    image = intensity(Speckle(rng).seen()).astype(np.float32)
+    image = intensity(Speckle(rng).image()).astype(np.float32)
     image[12:] = 1e-3 * image[12:].mean() * (1.0 + 0.01 * rng.random(image[12:].shape, np.float32))
     width = 12 * grid.vector_pitch_mm
     region = PatchSettings(region=f"rectangle 0,0 {width},{grid.depth_mm}")

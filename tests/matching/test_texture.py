@@ -32,13 +32,13 @@ def texture_of(sweep):
 
 
 @pytest.fixture(scope="module")
-def seen():
+def images():
     rng = np.random.default_rng(5)
-    return np.stack([speckle.intensity(speckle.Speckle(rng).seen()) for _ in range(2)])
+    return np.stack([speckle.intensity(speckle.Speckle(rng).image()) for _ in range(2)])
 
 
-def test_speckle_has_the_size_it_was_made_with(seen):
-    size = texture_of(grey_sweep(seen)).speckle_size()
+def test_speckle_has_the_size_it_was_made_with(images):
+    size = texture_of(grey_sweep(images)).speckle_size()
     # Some 16 patches a row; taking each one's own mean away makes speckle 6 % finer, in a phantom as here.
     np.testing.assert_allclose(size.lateral_mm, speckle.LATERAL_MM, rtol=0.13)
     np.testing.assert_allclose(size.axial_mm, speckle.AXIAL_MM, rtol=0.13)
@@ -77,7 +77,7 @@ def test_echoes_above_the_band_refute_the_sampling_rate(complex_too):
     assert doubt.suspect == "sampling rate or band"
 
 
-def attenuated(sign=1, middle_hz=6e6, rate_hz=8e6, noise=0.0):
+def attenuated_iq(sign=1, middle_hz=6e6, rate_hz=8e6, noise=0.0):
     """I/Q, demodulated at `middle_hz`, of echoes whose frequency falls from 6.2 to 5.2 MHz; `sign` of Q."""
     rng = np.random.default_rng(4)
     white = rng.normal(size=(3, 32, 1024)) + 1j * rng.normal(size=(3, 32, 1024))
@@ -100,24 +100,24 @@ def sign_of(sweep):
 
 @pytest.mark.parametrize("middle_hz", [6e6, 7e6])
 def test_the_other_sign_of_q_is_doubted(middle_hz):
-    assert sign_of(attenuated(1, middle_hz)) is None
-    doubt = sign_of(attenuated(-1, middle_hz))
+    assert sign_of(attenuated_iq(1, middle_hz)) is None
+    doubt = sign_of(attenuated_iq(-1, middle_hz))
     assert (doubt.suspect, doubt.refuted) == ("sign of Q", False)
 
 
-@pytest.mark.parametrize(("gain_db", "doubted"), [(-30.0, False), (-12.0, False), (0.0, True)])
-def test_images_cut_off_at_white_are_doubted(seen, gain_db, doubted):
-    decibel = 10 * np.log10(np.maximum(seen, 1e-9) / seen.mean()) + gain_db
+@pytest.mark.parametrize(("gain_db", "doubtful"), [(-30.0, False), (-12.0, False), (0.0, True)])
+def test_images_cut_off_at_white_are_doubted(images, gain_db, doubtful):
+    decibel = 10 * np.log10(np.maximum(images, 1e-9) / images.mean()) + gain_db
     grey = np.rint(255 * np.clip(1 + decibel / 60.0, 0, 1)).astype(np.uint8)
-    sweep = replace(grey_sweep(seen), frames=grey, signal=BModeSettings(60.0))
+    sweep = replace(grey_sweep(images), frames=grey, signal=BModeSettings(60.0))
     matcher = matcher_of(sweep)
     features = [matcher.ready(read_frame(sweep.frames, k)).features for k in range(2)]
-    assert (doubt_gain(features) is not None) == doubted
+    assert (doubt_gain(features) is not None) == doubtful
 
 
-def test_noise_and_grey_levels_tell_nothing_of_the_band(seen):
+def test_noise_and_grey_levels_tell_nothing_of_the_band(images):
     assert doubt_band(texture_of(echoes(4e6, 8e6, noise=30.0))) is None
-    assert doubt_band(texture_of(grey_sweep(seen))) is None
+    assert doubt_band(texture_of(grey_sweep(images))) is None
 
 
 # ---- standing echoes -------------------------------------------------------------------------------------

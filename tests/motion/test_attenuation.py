@@ -42,7 +42,7 @@ def _curves(attenuation=0.5):
     )
 
 
-def _found(curves, power):
+def _estimate(curves, power):
     return estimate_attenuation(curves, EchoSpectra(DEPTH, FREQUENCY, power))
 
 
@@ -53,30 +53,32 @@ def test_attenuation_in_spite_of_structure_and_noise(difference):
         rng = np.random.default_rng(seed)
         exponent = np.where(rng.random(DEPTH.size) < 0.5, rng.exponential(0.7, DEPTH.size), 0.0)
         noise = 0.2 * (DEPTH / DEPTH[-1]) ** 4
-        found = _found(curves, _power(0.5 + difference, rng, exponent, noise))
-        errors.append(found.difference_db_cm_mhz - difference)
-        claims.append(found.sigma_db_cm_mhz)
+        estimate = _estimate(curves, _power(0.5 + difference, rng, exponent, noise))
+        errors.append(estimate.difference_db_cm_mhz - difference)
+        claims.append(estimate.sigma_db_cm_mhz)
     assert np.sqrt(np.mean(np.square(errors))) < 0.02
     assert np.abs(np.divide(errors, claims)).max() < 2.0
 
 
 @pytest.mark.parametrize("difference", [-0.2, 0.3])
 def test_curves_stretch_as_the_beam_widens(difference):
-    there, given = _curves(0.5 + difference), _curves(0.5)
-    stretched = _found(given, _power(0.5 + difference)).applied(given)
-    half = [curve_widths(DISTANCE, each.correlation) for each in (stretched, there, given)]
+    expected, phantom = _curves(0.5 + difference), _curves(0.5)
+    stretch = _estimate(phantom, _power(0.5 + difference)).applied(phantom)
+    half = [curve_widths(DISTANCE, c.correlation) for c in (stretch, expected, phantom)]
     # Length depends on the mean over depth; one power of wavelength for all depths is off by 2 % at some.
     assert abs((half[0] / half[1]).mean() - 1.0) < 0.012
     assert np.abs(half[0] / half[1] - 1.0).max() < 0.025
     assert np.abs(half[2] / half[1] - 1.0).max() > 0.05
     # Curves that have been stretched belong to the tissue, and are not stretched again.
-    assert abs(_found(stretched, _power(0.5 + difference)).difference_db_cm_mhz) < 0.01
+    assert abs(_estimate(stretch, _power(0.5 + difference)).difference_db_cm_mhz) < 0.01
 
 
 @pytest.mark.parametrize("shift_hz", [-0.5e6, 0.5e6])
 def test_another_transmit_band_is_told_and_not_taken_for_attenuation(shift_hz):
     band = (BAND[0] + shift_hz, BAND[1] + shift_hz)
-    found = _found(_curves(), _power(0.5, np.random.default_rng(1), band=band))
-    assert found.difference_db_cm_mhz == 0.0
-    assert found.sigma_db_cm_mhz == UNKNOWN_SIGMA
-    assert [each.suspect for each in found.doubts] == ["another transmit band or filter than the phantom's"]
+    estimate = _estimate(_curves(), _power(0.5, np.random.default_rng(1), band=band))
+    assert estimate.difference_db_cm_mhz == 0.0
+    assert estimate.sigma_db_cm_mhz == UNKNOWN_SIGMA
+    assert [doubt.suspect for doubt in estimate.doubts] == [
+        "another transmit band or filter than the phantom's"
+    ]

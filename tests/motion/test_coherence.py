@@ -54,9 +54,9 @@ def correlations(echo, first, second, correlate):
         cross = np.abs((echo[first].conj() * echo[second]).sum(axis=1)) ** 2
         power = (np.abs(echo) ** 2).sum(axis=1)
         return cross / (power[first] * power[second])
-    seen = np.abs(echo) ** 2
-    seen = (seen - seen.mean(axis=1, keepdims=True)) / seen.std(axis=1, keepdims=True)
-    return (seen[first] * seen[second]).mean(axis=1)
+    intensity = np.abs(echo) ** 2
+    intensity = (intensity - intensity.mean(axis=1, keepdims=True)) / intensity.std(axis=1, keepdims=True)
+    return (intensity[first] * intensity[second]).mean(axis=1)
 
 
 def sweep_table(path, share, noise, correlate, seed=0, steps=(1, 2, 3, 4, 6, 9, 12)):
@@ -76,7 +76,7 @@ def sweep_table(path, share, noise, correlate, seed=0, steps=(1, 2, 3, 4, 6, 9, 
     return table_of(np.array(rho).T, first=first, second=second)
 
 
-def estimated(path, table, correlate="echo"):
+def coherence_of(path, table, correlate="echo"):
     problem = problem_of(phantom_curves(correlate), PATCHES, GRID, len(path))
     return estimate_coherence(problem, table, np.ones(len(table), bool), path)
 
@@ -93,11 +93,11 @@ def estimate(share=0.0, noise=0.0, start=1.0, seed=0, correlate="echo", yaw_rad=
     path = made_path(yaw_rad=yaw_rad)
     share, noise = (np.broadcast_to(values, len(PATCHES)) for values in (share, noise))
     table = sweep_table(path, share, noise, correlate, seed)
-    coherence = estimated(start * path, table, correlate)
+    coherence = coherence_of(start * path, table, correlate)
     return coherence, start * coherence.scale
 
 
-def some(values, seed=1):
+def choice(values, seed=1):
     return np.random.default_rng(seed).choice(values, len(PATCHES))
 
 
@@ -109,19 +109,19 @@ def test_phantom_speckle_keeps_its_length_whatever_the_start(start):
 
 
 def test_intensity_claims_what_its_missing_phase_leaves_open():
-    coherence, ratio = estimate(some([0.0, 0.3]), start=0.7, correlate="intensity")
+    coherence, ratio = estimate(choice([0.0, 0.3]), start=0.7, correlate="intensity")
     assert abs(np.log(ratio)) < 2.0 * coherence.scale_sigma
     assert coherence.scale_sigma < 0.12
 
 
 @pytest.mark.parametrize("share", [0.15, 0.3])
 def test_structure_in_half_of_the_patches_does_not_shorten_the_sweep(share):
-    made = some([0.0, share])
-    coherence, ratio = estimate(made, start=0.7)
+    shares = choice([0.0, share])
+    coherence, ratio = estimate(shares, start=0.7)
     # A phantom's curve alone reads 12 and 25 % short.
     assert ratio == pytest.approx(1.0, abs=0.03)
-    assert coherence.share[0, made > 0].mean() > 0.4 * share
-    assert coherence.share[0, made == 0].mean() < 0.25 * share
+    assert coherence.share[0, shares > 0].mean() > 0.4 * share
+    assert coherence.share[0, shares == 0].mean() < 0.25 * share
 
 
 def test_noise_is_a_gain_and_no_distance():
@@ -133,7 +133,7 @@ def test_noise_is_a_gain_and_no_distance():
 def test_claims_of_the_scale_hold():
     off = []
     for seed in range(8):
-        coherence, ratio = estimate(some([0.0, 0.1, 0.25], seed), seed=seed)
+        coherence, ratio = estimate(choice([0.0, 0.1, 0.25], seed), seed=seed)
         off.append(np.log(ratio) / coherence.scale_sigma)
     assert np.abs(off).max() < 3.0
     assert np.sqrt(np.mean(np.square(off))) < 1.5
@@ -141,8 +141,8 @@ def test_claims_of_the_scale_hold():
 
 def test_a_long_sweep_is_fitted_in_pieces():
     path = np.column_stack([np.linspace(0.0, 25.0, 251), np.zeros(251)])
-    table = sweep_table(path[:251], some([0.0, 0.3]), np.zeros(len(PATCHES)), "echo", steps=(1, 2, 4, 8))
-    coherence = estimated(path, table)
+    table = sweep_table(path[:251], choice([0.0, 0.3]), np.zeros(len(PATCHES)), "echo", steps=(1, 2, 4, 8))
+    coherence = coherence_of(path, table)
     assert coherence.frame.size == len(coherence.share) == 2
     models = coherence.models(np.array([0, 250]))
     np.testing.assert_array_equal(models.share, coherence.share)
@@ -152,8 +152,8 @@ def test_a_long_sweep_is_fitted_in_pieces():
 
 def test_two_frames_keep_the_phantoms_curves_and_claim_what_tissue_may_do():
     path = made_path(2)
-    table = sweep_table(path, some([0.0, 0.3]), np.zeros(len(PATCHES)), "echo", steps=(1,))
-    coherence = estimated(path, table)
+    table = sweep_table(path, choice([0.0, 0.3]), np.zeros(len(PATCHES)), "echo", steps=(1,))
+    coherence = coherence_of(path, table)
     assert coherence.scale == 1.0
     assert coherence.rows is None
     assert 0.1 < coherence.scale_sigma < 0.2

@@ -9,7 +9,7 @@ DEPTHS_MM = (8.0, 16.0, 24.0)
 WIDTHS_MM = (0.33, 0.5, 0.42)
 
 
-def seen_off_focus(d, sigma_mm):
+def off_focus(d, sigma_mm):
     """A curve that starts steeper than a Gaussian and ends flatter, as two widths mixed do."""
     narrow, wide = (
         speckle.gaussian_correlation(d, 0.8 * sigma_mm),
@@ -18,7 +18,7 @@ def seen_off_focus(d, sigma_mm):
     return (0.6 * np.sqrt(narrow) + 0.4 * np.sqrt(wide)) ** 2
 
 
-LAWS = [speckle.gaussian_correlation, speckle.triangle_correlation, seen_off_focus]
+LAWS = [speckle.gaussian_correlation, speckle.triangle_correlation, off_focus]
 
 
 def samples(law, distances, noise_floor=1.0, cells=np.inf, repeats=1, seed=0, depths=DEPTHS_MM):
@@ -43,27 +43,27 @@ def read_distance(curves, correlation, depths=DEPTHS_MM):
     )
 
 
-STEPPED = np.arange(0.0, 2.5, 0.1)
+REGULAR = np.arange(0.0, 2.5, 0.1)
 FREEHAND = np.sort(np.random.default_rng(3).uniform(0.0, 2.5, 400))
 
 
 @pytest.mark.parametrize("law", LAWS)
-@pytest.mark.parametrize("distances", [STEPPED, FREEHAND], ids=["stepped", "freehand"])
+@pytest.mark.parametrize("distances", [REGULAR, FREEHAND], ids=["stepped", "freehand"])
 def test_exact_samples_of_any_curve_give_its_distances_back(law, distances):
     curves = fit_curves(speckle.KEY, [samples(law, distances)])
     d = np.linspace(0.0, 2.5, 1001)
     for depth, width in enumerate(WIDTHS_MM):
         rho = law(d, width)
         useful = (rho < 0.9) & (rho > 0.15) & (d < d[np.argmin(rho > 0.1)])
-        asked = np.broadcast_to(rho[useful], (len(DEPTHS_MM), useful.sum()))
-        found = read_distance(curves, asked)[depth]
-        assert np.abs(found / d[useful] - 1).max() < 0.02
+        correlations = np.broadcast_to(rho[useful], (len(DEPTHS_MM), useful.sum()))
+        distance = read_distance(curves, correlations)[depth]
+        assert np.abs(distance / d[useful] - 1).max() < 0.02
 
 
 @pytest.mark.parametrize("cells", [25, 100])
 def test_cells_are_those_that_explain_the_scatter(cells):
     curves = fit_curves(
-        speckle.KEY, [samples(speckle.gaussian_correlation, STEPPED[1:], cells=cells, repeats=100)]
+        speckle.KEY, [samples(speckle.gaussian_correlation, REGULAR[1:], cells=cells, repeats=100)]
     )
     # From the median of some 1000 deviations, itself known to 4 %, and squared; what is cut at the curve's
     # end adds as much again.
@@ -91,5 +91,5 @@ def test_curves_end_where_the_phantom_did():
         speckle.gaussian_correlation(curves.distance_mm[-1], np.array(WIDTHS_MM)),
         atol=5e-3,
     )
-    whole = fit_curves(speckle.KEY, [samples(speckle.gaussian_correlation, STEPPED)])
+    whole = fit_curves(speckle.KEY, [samples(speckle.gaussian_correlation, REGULAR)])
     assert whole.distance_mm[-1] == pytest.approx(CurveSettings().largest_mm)

@@ -15,28 +15,29 @@ def widths(curves, depth_mm):
 
 
 def test_calculated_curves_are_those_measured_on_a_phantom(sweep, curves):
-    found = data_sheet_curves(other(SHEET, attenuation_db_cm_mhz=0.3), sweep)
-    ratio = widths(found, found.depth_mm) / widths(curves, found.depth_mm)
+    theory = data_sheet_curves(variant(SHEET, attenuation_db_cm_mhz=0.3), sweep)
+    ratio = widths(theory, theory.depth_mm) / widths(curves, theory.depth_mm)
     # Measured: 0.97 to 1.00; the phantom's own curves are known to 0.012.
     assert np.abs(ratio - 1).max() < 0.06
     assert abs(ratio.mean() - 1) < 0.03
-    pivot = curves.at(found.depth_mm).tilt.pivot_mm
+    pivot = curves.at(theory.depth_mm).tilt.pivot_mm
     # Beyond the focus speckle turned by hand seems to turn about a nearer point than the field has it.
-    assert np.abs(found.tilt.pivot_mm - pivot).max() < 5.0
-    assert np.median(np.abs(found.tilt.pivot_mm - pivot)) < 1.5
-    assert np.abs(np.log(found.cells / np.interp(found.depth_mm, curves.depth_mm, curves.cells))).max() < 0.4
-    assert (found.origin, found.key) == ("data sheet", curves.key)
-    assert 0.03 < found.scale_sigma < 0.12
+    assert np.abs(theory.tilt.pivot_mm - pivot).max() < 5.0
+    assert np.median(np.abs(theory.tilt.pivot_mm - pivot)) < 1.5
+    ratio = theory.cells / np.interp(theory.depth_mm, curves.depth_mm, curves.cells)
+    assert np.abs(np.log(ratio)).max() < 0.4
+    assert (theory.origin, theory.key) == ("data sheet", curves.key)
+    assert 0.03 < theory.scale_sigma < 0.12
 
 
-def other(sheet, **changes):
+def variant(sheet, **changes):
     return ProbeSheet.model_validate(sheet.model_dump() | changes)
 
 
 def test_without_a_sweep_the_sheet_alone_is_as_far_off_as_it_says(curves):
-    sampled = {"sampling_rate_mhz": 200 / 3, "vector_pitch_mm": 0.3, "attenuation_db_cm_mhz": 0.3}
-    found = data_sheet_curves(other(SHEET, **sampled))
-    off = np.log(widths(found, curves.depth_mm) / widths(curves, curves.depth_mm)).mean()
-    assert abs(off) < 2 * found.scale_sigma
+    fields = {"sampling_rate_mhz": 200 / 3, "vector_pitch_mm": 0.3, "attenuation_db_cm_mhz": 0.3}
+    theory = data_sheet_curves(variant(SHEET, **fields))
+    off = np.log(widths(theory, curves.depth_mm) / widths(curves, curves.depth_mm)).mean()
+    assert abs(off) < 2 * theory.scale_sigma
     with pytest.raises(InvalidInputError, match="vector_pitch_mm: expected"):
         data_sheet_curves(SHEET)

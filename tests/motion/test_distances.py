@@ -16,14 +16,14 @@ SIGMA_MM, CELLS = 0.45, 45.0
 
 
 def problem(cells=CELLS, of="echo", **curves):
-    made = speckle.curves(**{"sigma_mm": SIGMA_MM, "cells": cells} | curves)
-    return problem_of(replace(made, key=replace(made.key, correlation_of=of)), PATCHES, speckle.GRID)
+    phantom = speckle.curves(**{"sigma_mm": SIGMA_MM, "cells": cells} | curves)
+    return problem_of(replace(phantom, key=replace(phantom.key, correlation_of=of)), PATCHES, speckle.GRID)
 
 
-def read(given, rho, share=0.0, gain=1.0):
+def read(problem, rho, share=0.0, gain=1.0):
     rho = np.full((1, len(PATCHES)), rho) if np.ndim(rho) == 0 else np.atleast_2d(rho)
     models = EchoModels(*(np.full((1, len(PATCHES)), value) for value in (share, gain)))
-    return patch_distances(given, rho, models)
+    return patch_distances(problem, rho, models)
 
 
 @pytest.mark.parametrize(("share", "gain"), [(0.0, 1.0), (0.5, 0.8)])
@@ -36,8 +36,8 @@ def test_distance_is_the_inverse_of_the_echo_model(share, gain):
 
 
 def test_without_correlation_below_what_stays_or_beyond_the_curves_there_is_no_distance():
-    for given, rho, share in ((problem(), np.nan, 0.0), (problem(), 0.01, 0.0), (problem(), 0.24, 0.5)):
-        assert np.isnan(read(given, rho, share)).all()
+    for full, rho, share in ((problem(), np.nan, 0.0), (problem(), 0.01, 0.0), (problem(), 0.24, 0.5)):
+        assert np.isnan(read(full, rho, share)).all()
     short = problem(largest_mm=SIGMA_MM)
     assert np.isnan(read(short, speckle.gaussian_correlation(1.1 * SIGMA_MM, SIGMA_MM))[0]).all()
     assert (short.typical_correlation(np.array([0.9])) == 0.0).all()

@@ -28,7 +28,7 @@ def phantom():
     rng = np.random.default_rng(2)
     z = 0.08 * np.arange(FRAMES) * (1 + 0.3 * np.sin(np.arange(FRAMES) / 9))
     planes = np.arange(z.min() - 3 * SIGMA_MM, z.max() + 3 * SIGMA_MM, SIGMA_MM / 2)
-    fields = np.array([speckle.Speckle(rng, grid=GRID, margin_mm=2.0).seen() for _ in planes])
+    fields = np.array([speckle.Speckle(rng, grid=GRID, margin_mm=2.0).image() for _ in planes])
     blend = np.exp(-((z[:, None] - planes) ** 2) / (2 * SIGMA_MM**2))
     levels = np.abs(np.einsum("fp,pvs->fvs", blend, fields)) ** 2
     grey = 255 + 255 / 8 * np.log10(np.maximum(levels / levels.max(), 1e-8))
@@ -52,10 +52,10 @@ def samples_of(sweep, settings, progress=None):
 
 
 def test_the_curve_comes_back(phantom):
-    done = []
-    samples = samples_of(phantom, SETTINGS, lambda n, of: done.append((n, of)))
+    progress = []
+    samples = samples_of(phantom, SETTINGS, lambda n, of: progress.append((n, of)))
     curves = fit_curves(speckle.KEY, [samples], SETTINGS)
-    assert done == [(n + 1, FRAMES) for n in range(FRAMES)]
+    assert progress == [(n + 1, FRAMES) for n in range(FRAMES)]
     d = curves.distance_mm
     widths = [np.interp(-0.6, -row, d) / np.sqrt(-2 * np.log(0.6)) for row in curves.correlation]
     # Some eight independent separations, four patches to a row: 4 % of the width in a row, 2 % in the mean.
@@ -63,7 +63,7 @@ def test_the_curve_comes_back(phantom):
     assert np.abs(np.array(widths) / SIGMA_MM - 1).max() < 0.15
 
 
-def stepped_and_tipped(phantom, step_mm, tilt):
+def frame_pair(phantom, step_mm, tilt):
     """The phantom's first two frames, the second moved and turned about the middle of its depth."""
     about = RigidTransform.from_translation(GRID.centre_mm)
     turn = about * RigidTransform.from_rotation(Rotation.from_rotvec([[0, 0, 0], [tilt, 0, 0]])) * about.inv()
@@ -76,8 +76,8 @@ def stepped_and_tipped(phantom, step_mm, tilt):
 @pytest.mark.parametrize("step_mm", [0.3, -0.3, 0.0])
 @pytest.mark.parametrize("tilt", [0.01, -0.01])
 def test_offsets_and_tilt_are_signed_and_those_of_the_patches(phantom, step_mm, tilt):
-    two = stepped_and_tipped(phantom, step_mm, tilt)
-    samples = samples_of(two, SETTINGS)
+    pair = frame_pair(phantom, step_mm, tilt)
+    samples = samples_of(pair, SETTINGS)
     expected = step_mm + np.sin(tilt) * (samples.depth_mm - GRID.centre_mm[1])
     np.testing.assert_allclose(samples.offset_mm, expected, atol=1e-3)
     np.testing.assert_allclose(samples.tilt_rad, np.sin(tilt), atol=1e-9)

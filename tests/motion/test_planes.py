@@ -24,9 +24,9 @@ PARALLEL = [(0.02, 0.0, 0.0), (0.1, 0.0, 0.0), (0.3, 0.006, 0.0), (0.3, 0.015, 0
 
 
 def problem(of="echo", tilt=TILT, bias_mm=0.02, **curves):
-    made = speckle.curves(sigma_mm=SIGMA_MM, cells=CELLS, **curves)
-    made = replace(made, key=replace(made.key, correlation_of=of), tilt=tilt)
-    return problem_of(made, PATCHES, GRID, bias_mm=bias_mm)
+    phantom = speckle.curves(sigma_mm=SIGMA_MM, cells=CELLS, **curves)
+    phantom = replace(phantom, key=replace(phantom.key, correlation_of=of), tilt=tilt)
+    return problem_of(phantom, PATCHES, GRID, bias_mm=bias_mm)
 
 
 def distances(plane, tilt=TILT, at=AT):
@@ -43,7 +43,7 @@ def correlations(plane, tilt=TILT):
     return speckle.gaussian_correlation(distances(plane, tilt), SIGMA_MM)
 
 
-def drawn(rho, rng, law="gaussian", of_echo=True):
+def draw(rho, rng, law="gaussian", of_echo=True):
     """Correlations with the variance of `CELLS` cells: Gaussian, or speckle's own."""
     deviation = np.sqrt(correlation_variance(rho, CELLS, of_echo))
     if law == "gaussian":
@@ -55,13 +55,13 @@ def drawn(rho, rng, law="gaussian", of_echo=True):
     return np.abs((a * b.conj()).sum(axis=-1)) ** 2 / power - (1.0 - rho) ** 2 / CELLS
 
 
-def fits(given, plane, draws, law="gaussian", spoilt=0.0):
+def fits(problem_, plane, draws, law="gaussian", spoilt=0.0):
     """Coefficients and deviations of many draws; a share of the patches holds chance alone."""
-    rng, of_echo = np.random.default_rng(1), given.at_patches.of_echo
-    rho = drawn(np.tile(correlations(plane), (draws, 1)), rng, law, of_echo)
+    rng, of_echo = np.random.default_rng(1), problem_.at_patches.of_echo
+    rho = draw(np.tile(correlations(plane), (draws, 1)), rng, law, of_echo)
     rho = np.where(rng.random(rho.shape) < spoilt, rng.random(rho.shape), rho)
-    planes, determined = fit_many(given, rho)
-    assert determined.all()
+    planes, is_determined = fit_many(problem_, rho)
+    assert is_determined.all()
     return planes.coefficients, np.sqrt(np.diagonal(planes.covariance, axis1=1, axis2=2))
 
 
@@ -72,22 +72,22 @@ def crossing(coefficients):
 
 @pytest.mark.parametrize("plane", PLANES)
 def test_correlations_of_a_plane_give_it_back(plane):
-    found = fit(problem(), correlations(plane))
-    np.testing.assert_allclose(found.coefficients, plane, atol=2e-4)
-    assert found.used.all()
+    estimate = fit(problem(), correlations(plane))
+    np.testing.assert_allclose(estimate.coefficients, plane, atol=2e-4)
+    assert estimate.used.all()
 
 
 def test_in_plane_motion_shifts_the_patches_with_the_second_frame():
-    moved, plane = np.array([1.5, -0.8]), (0.3, 0.008, 0.006)
-    rho = speckle.gaussian_correlation(distances(plane, at=AT - moved), SIGMA_MM)
-    np.testing.assert_allclose(fit(problem(), rho, moved).coefficients, plane, atol=2e-4)
+    shift, plane = np.array([1.5, -0.8]), (0.3, 0.008, 0.006)
+    rho = speckle.gaussian_correlation(distances(plane, at=AT - shift), SIGMA_MM)
+    np.testing.assert_allclose(fit(problem(), rho, shift).coefficients, plane, atol=2e-4)
     assert abs(fit(problem(), rho).offset_mm - plane[0]) > 0.005
 
 
 def test_curves_that_know_nothing_of_tilt_say_nothing_of_it():
-    found = fit(problem(tilt=None), correlations((0.3, 0.006, 0.0), None))
-    np.testing.assert_allclose(found.coefficients, (0.3, 0.006, 0.0), atol=2e-4)
-    assert np.sqrt(found.covariance[2, 2]) > 0.04
+    estimate = fit(problem(tilt=None), correlations((0.3, 0.006, 0.0), None))
+    np.testing.assert_allclose(estimate.coefficients, (0.3, 0.006, 0.0), atol=2e-4)
+    assert np.sqrt(estimate.covariance[2, 2]) > 0.04
     assert np.sqrt(fit(problem(), correlations(PLANES[0])).covariance[2, 2]) < 0.002
 
 
@@ -95,12 +95,12 @@ def test_curves_that_know_nothing_of_tilt_say_nothing_of_it():
 @pytest.mark.parametrize("plane", [(0.1, 0.0, 0.0), PLANES[2], (0.6, 0.002, 0.0), (0.9, 0.0, 0.0)])
 def test_planes_are_unbiased_and_their_covariance_covers_the_truth(plane, of):
     """The last at two widths of the curve, where an eighth of the correlation is left."""
-    found, deviation = fits(problem(of, bias_mm=0.0), plane, 200)
+    coefficients, deviation = fits(problem(of, bias_mm=0.0), plane, 200)
     # One draw is off by 2 to 4 %: 0.3 % after 200. The curve's bend leaves a few thousandths more.
-    assert abs(found[:, 0].mean() / plane[0] - 1) < 0.01
+    assert abs(coefficients[:, 0].mean() / plane[0] - 1) < 0.01
     # 200 draws know 68 % to 3.3 points; robust weights and the floor under interpolation widen claims, the
     # curve's bend near no distance and far out narrows them.
-    inside = (np.abs(found - plane) < deviation).mean(axis=0)
+    inside = (np.abs(coefficients - plane) < deviation).mean(axis=0)
     assert ((inside > (0.6 if 0.2 < plane[0] < 0.8 else 0.5)) & (inside < 0.85)).all(), inside
 
 
@@ -117,13 +117,13 @@ def test_outliers_do_not_move_the_plane():
 def test_patches_without_correlation_outside_the_subset_or_beyond_the_curves_take_no_part():
     rho, subset = correlations(PLANES[1]), AT[:, 0] < 5.0
     rho[~subset], rho[:3] = 0.1, np.nan
-    found = fit(problem(), rho, subset=subset)
-    np.testing.assert_allclose(found.coefficients, PLANES[1], atol=2e-4)
-    np.testing.assert_array_equal(found.used, subset & np.isfinite(rho))
+    estimate = fit(problem(), rho, subset=subset)
+    np.testing.assert_allclose(estimate.coefficients, PLANES[1], atol=2e-4)
+    np.testing.assert_array_equal(estimate.used, subset & np.isfinite(rho))
     short, plane = problem(tilt=None, largest_mm=0.5), (0.45, 0.02, 0.0)
-    found = fit(short, correlations(plane, None))
-    np.testing.assert_array_equal(found.used, distances(plane, None) <= 0.5)
-    np.testing.assert_allclose(found.coefficients, plane, atol=5e-3)
+    estimate = fit(short, correlations(plane, None))
+    np.testing.assert_array_equal(estimate.used, distances(plane, None) <= 0.5)
+    np.testing.assert_allclose(estimate.coefficients, plane, atol=5e-3)
     assert fit(short, correlations((0.9, 0.0, 0.0), None)) is None
 
 
@@ -139,8 +139,8 @@ def test_what_stays_is_allowed_for():
     """Half the patches hold a coherent share, all of them noise."""
     share, gain = np.where(np.arange(len(AT)) % 2 == 0, 0.4, 0.0), np.full(len(AT), 0.95)
     rho = 0.95 * (share + (1.0 - share) * np.sqrt(correlations(PLANES[1]))) ** 2
-    found = fit(problem(), rho, share=share, gain=gain)
-    np.testing.assert_allclose(found.coefficients, PLANES[1], atol=5e-4)
+    estimate = fit(problem(), rho, share=share, gain=gain)
+    np.testing.assert_allclose(estimate.coefficients, PLANES[1], atol=5e-4)
     assert np.abs(fit(problem(), rho).coefficients - PLANES[1])[1:].max() > 1.5e-3
 
 
@@ -148,11 +148,11 @@ def test_what_stays_is_allowed_for():
 def test_frames_that_cross_are_told_by_their_v_of_distances(plane):
     """Even where a few patches on the line have lost their correlation."""
     for spoilt in (0.0, 0.08):
-        found, _ = fits(problem(), plane, 40, spoilt=spoilt)
-        assert crossing(found).all()
-        found *= np.sign(found[:, 1:2] * plane[1])
+        coefficients, _ = fits(problem(), plane, 40, spoilt=spoilt)
+        assert crossing(coefficients).all()
+        coefficients *= np.sign(coefficients[:, 1:2] * plane[1])
         # A deviation is 0.006 mm, and a tenth of that per millimetre aside; more where patches are lost.
-        off = np.abs(found[:, :2] - plane[:2]).max(axis=0)
+        off = np.abs(coefficients[:, :2] - plane[:2]).max(axis=0)
         assert (off < np.array([0.04, 0.004]) * (2.0 if spoilt else 1.0)).all()
 
 
@@ -166,7 +166,7 @@ def test_frames_that_do_not_cross_are_not_taken_to(plane):
 
 @pytest.mark.parametrize("plane", [(-0.1, 0.03, 0.0), (0.1, 0.02, 0.02), (-0.3, 0.01, 0.01)])
 def test_known_slopes_are_kept_and_tell_the_side(plane):
-    rho = drawn(np.tile(correlations(plane), (40, 1)), np.random.default_rng(5))
+    rho = draw(np.tile(correlations(plane), (40, 1)), np.random.default_rng(5))
     planes, _ = fit_many(problem(), rho, slopes=np.tile(plane[1:], (40, 1)))
     assert np.abs(planes.offset_mm - plane[0]).max() < 0.01
     # The sensor is trusted to 5e-4, the images tell slopes of frames so near to 2 to 6e-4.
@@ -177,7 +177,7 @@ def test_known_slopes_are_kept_and_tell_the_side(plane):
 def test_a_wrong_guess_of_the_distance_does_no_harm(start_mm):
     """A path may have frames together that are apart: from nothing, a tilt would explain it, too."""
     for plane in (*PLANES, *PARALLEL):
-        rho = drawn(np.tile(correlations(plane), (5, 1)), np.random.default_rng(2))
-        one, other = (fit_many(problem(), rho, start_mm=s)[0] for s in (None, np.full(5, start_mm)))
-        assert np.abs(one.offset_mm - other.offset_mm).max() < 0.015 * plane[0] + 1e-3
-        assert not crossing(other.coefficients).any()
+        rho = draw(np.tile(correlations(plane), (5, 1)), np.random.default_rng(2))
+        free, guided = (fit_many(problem(), rho, start_mm=s)[0] for s in (None, np.full(5, start_mm)))
+        assert np.abs(free.offset_mm - guided.offset_mm).max() < 0.015 * plane[0] + 1e-3
+        assert not crossing(guided.coefficients).any()

@@ -14,25 +14,25 @@ def slow(rng, frames, duration_s, highest_hz):
     return wave.sum(axis=2) / np.sqrt(6)
 
 
-def told(count, frames, duration_s, highest_hz, common, own):
-    """What is told of records that share turns of size `common`, and each have some of their own."""
-    found = []
+def signs(count, frames, duration_s, highest_hz, common, drift_size):
+    """Signs by records that share turns of size `common`, the second with a drift of its own besides."""
+    votes = []
     for seed in range(count):
         rng = np.random.default_rng(seed)
         hand, drift, noise = (slow(rng, frames, duration_s, highest_hz) for _ in range(3))
-        found.append(same_turns(hand + 0.1 * noise, common * hand + own * drift))
-    return found
+        votes.append(same_turns(hand + 0.1 * noise, common * hand + drift_size * drift))
+    return votes
 
 
 @pytest.mark.parametrize(("frames", "duration_s", "hz"), [(64, 2.6, 1.0), (160, 6.4, 0.3), (300, 12.0, 0.3)])
 def test_records_with_nothing_in_common_tell_nothing(frames, duration_s, hz):
-    found = told(300, frames, duration_s, hz, 0.0, 1.0)
+    votes = signs(300, frames, duration_s, hz, 0.0, 1.0)
     # 1.2 % by normal chance at 2.5 deviations, twice that for variances that are estimated, and counting.
-    assert found.count(None) >= 288
+    assert votes.count(None) >= 288
 
 
 @pytest.mark.parametrize(("frames", "duration_s", "hz"), [(64, 2.6, 0.3), (160, 6.4, 0.3), (160, 6.4, 1.0)])
 def test_the_same_motion_is_recognised(frames, duration_s, hz):
-    found = told(200, frames, duration_s, hz, 1.0, 0.2)
-    assert found.count(-1) == 0
-    assert found.count(1) >= 160
+    votes = signs(200, frames, duration_s, hz, 1.0, 0.2)
+    assert votes.count(-1) == 0
+    assert votes.count(1) >= 160

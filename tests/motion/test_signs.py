@@ -6,16 +6,18 @@ import pytest
 
 from speckle3d.motion.signs import Strangers, likeliest_path, on_path
 
-REACH_MM, KEY_MM, TURNED_MM = 0.85, 0.2, 8.0
+REACH_MM, KEY_MM, TURN_MM = 0.85, 0.2, 8.0
 """Pairs share speckle up to the first; the second apart, a key frame is kept; a slope's worth in travel."""
-NONE = Strangers(np.zeros(0, int), np.zeros(0, int), 0.0)
+NO_STRANGERS = Strangers(np.zeros(0, int), np.zeros(0, int), 0.0)
 
 
-def planes_of(first, second, moved, covariance):
+def planes_of(first, second, steps, covariance):
     """Planes of pairs whose slope along y is nothing."""
-    known = np.tile(np.eye(3), (len(moved), 1, 1))
-    known[:, :2, :2] = covariance
-    return pair_planes.made(first, second, np.column_stack([moved, np.zeros(len(moved))]), known)
+    full_covariance = np.tile(np.eye(3), (len(steps), 1, 1))
+    full_covariance[:, :2, :2] = covariance
+    return pair_planes.from_coefficients(
+        first, second, np.column_stack([steps, np.zeros(len(steps))]), full_covariance
+    )
 
 
 def uneven(frames, length_mm, seed=0):
@@ -69,7 +71,7 @@ class Sweep:
         self.wrong, self.relative, self.slope_noise = wrong, relative, slope_noise
         self.rng = np.random.default_rng(seed)
         self.first, self.second, self.is_wrong = [], [], []
-        self.moved, self.covariance = [], []
+        self.steps, self.covariance = [], []
         self._pair_up()
 
     def _pair_up(self):
@@ -85,40 +87,40 @@ class Sweep:
                 keys.append(frame)
 
     def _apart(self, i, j):
-        return abs(self.z[j] - self.z[i]) + TURNED_MM * abs(self.b[j] - self.b[i])
+        return abs(self.z[j] - self.z[i]) + TURN_MM * abs(self.b[j] - self.b[i])
 
     def _measure(self, i, j):
         z = self.z[j] - self.z[i]
         a = z + self.rng.normal() * np.hypot(self.relative * z, 0.004)
         b = self.b[j] - self.b[i] + self.slope_noise * self.rng.normal()
         # Never most of a frame's pairs: those would place it wrongly, and rightly so.
-        false = bool(self.rng.uniform() < self.wrong and self._left > 0)
-        if false:
+        is_false = bool(self.rng.uniform() < self.wrong and self._left > 0)
+        if is_false:
             self._left -= 1
             a, b = self.rng.uniform(-0.8, 0.8), 0.01 * self.rng.normal()
         side = 1.0 if a >= 0 else -1.0
         variance = [(self.relative * a) ** 2 + 0.02**2, self.slope_noise**2]
         self.first.append(i)
         self.second.append(j)
-        self.is_wrong.append(false)
-        self.moved.append([side * a, side * b])
+        self.is_wrong.append(is_false)
+        self.steps.append([side * a, side * b])
         self.covariance.append(np.diag(variance))
 
     @property
     def planes(self):
-        return planes_of(*(np.array(x) for x in (self.first, self.second, self.moved, self.covariance)))
+        return planes_of(*(np.array(x) for x in (self.first, self.second, self.steps, self.covariance)))
 
     def resolve(self):
-        return likeliest_path(self.planes, len(self.z), NONE)
+        return likeliest_path(self.planes, len(self.z), NO_STRANGERS)
 
     def wrong_signs(self, path, clear_mm=0.07, after=0):
         """Pairs with a clear sign that got the other, up to the mirror image of the whole."""
         first, second = np.array(self.first), np.array(self.second)
         z, b = self.z[second] - self.z[first], self.b[second] - self.b[first]
-        moved = on_path(self.planes, path).coefficients[:, :2]
+        steps = on_path(self.planes, path).coefficients[:, :2]
         # Below three deviations either sign is as good.
         by_offset, by_slope = np.abs(z) > clear_mm, np.abs(b) > 0.006
-        truth = np.where(by_offset, z * moved[:, 0], b * moved[:, 1])
+        truth = np.where(by_offset, z * steps[:, 0], b * steps[:, 1])
         clear = (by_offset | (by_slope & (np.abs(z) < 0.02))) & ~np.array(self.is_wrong)
         # The first pair alone places its frame; a slope three deviations off, one in 370, mirrors it.
         clear &= (second > 1) & (first >= after)
@@ -131,8 +133,8 @@ def failures(sweep, seeds=12, clear_mm=0.07, after=0, **noise):
     """Seeds of which any sign is wrong."""
     bad = []
     for seed in range(seeds):
-        made = Sweep(*sweep(np.random.default_rng(100 + seed), seed), seed, **noise)
-        if made.wrong_signs(made.resolve(), clear_mm, after):
+        example = Sweep(*sweep(np.random.default_rng(100 + seed), seed), seed, **noise)
+        if example.wrong_signs(example.resolve(), clear_mm, after):
             bad.append(seed)
     return bad
 
@@ -147,7 +149,7 @@ def test_signs_hold_where_a_tenth_of_the_pairs_is_wrong(sweep):
     assert failures(sweep, wrong=0.1) == []
 
 
-def wobbled(seed, told):
+def wobble_errors(seed, with_strangers):
     """Clear steps of a wobble, which are as long as speckle lasts, that get the wrong sign."""
     rng = np.random.default_rng(seed)
     time_s = np.arange(60) / 25.0
@@ -162,10 +164,10 @@ def wobbled(seed, told):
         pairs += [(i, frame, d) for i, d in zip(near, read, strict=True)]
         strangers += [(i, frame) for i in before[apart > 0.6]]
     first, second, read = np.array(pairs).T
-    moved = np.column_stack([read, np.zeros(read.size)])
-    known = np.tile(np.diag([0.03**2, 1e-8]), (read.size, 1, 1))
-    unlike = Strangers(*np.array(strangers).T, 0.3) if told else NONE
-    planes = planes_of(first.astype(int), second.astype(int), moved, known)
+    steps = np.column_stack([read, np.zeros(read.size)])
+    covariance = np.tile(np.diag([0.03**2, 1e-8]), (read.size, 1, 1))
+    unlike = Strangers(*np.array(strangers).T, 0.3) if with_strangers else NO_STRANGERS
+    planes = planes_of(first.astype(int), second.astype(int), steps, covariance)
     path = likeliest_path(planes, z.size, unlike)
     step, true = np.diff(path[:, 0]), np.diff(z)
     return int(((np.sign(step) != np.sign(true)) & (np.abs(true) > 0.05)).sum())
@@ -173,5 +175,5 @@ def wobbled(seed, told):
 
 def test_frames_that_do_not_resemble_each_other_are_apart():
     seeds = (2, 3, 4)
-    assert sum(wobbled(seed, told=True) for seed in seeds) == 0
-    assert sum(wobbled(seed, told=False) for seed in seeds) > 10
+    assert sum(wobble_errors(seed, with_strangers=True) for seed in seeds) == 0
+    assert sum(wobble_errors(seed, with_strangers=False) for seed in seeds) > 10

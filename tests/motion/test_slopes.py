@@ -27,14 +27,14 @@ DELIBERATE = float(np.deg2rad(5.0) / 20.0)
 LEVER_MM = AT[:, 0].std()
 
 
-def fitted(yaw_per_mm=0.0, short=0.0, pairs=60, tilt=TILT):
+def fit_planes(yaw_per_mm=0.0, short=0.0, pairs=60, tilt=TILT):
     """Planes of pairs that yaw as they travel, read with distances wrong by a share of each patch's own."""
-    rng, made = np.random.default_rng(0), speckle.curves(sigma_mm=SIGMA_MM, cells=CELLS)
-    made = replace(made, key=replace(made.key, correlation_of="echo"), tilt=tilt)
+    rng, curves = np.random.default_rng(0), speckle.curves(sigma_mm=SIGMA_MM, cells=CELLS)
+    curves = replace(curves, key=replace(curves.key, correlation_of="echo"), tilt=tilt)
     offset = rng.uniform(0.1, 0.5, (pairs, 1))
     rho = speckle.gaussian_correlation(offset * (1 + yaw_per_mm * AT[:, 0]) * (1 + short), SIGMA_MM)
     rho = rho + np.sqrt(correlation_variance(rho, CELLS, True)) * rng.normal(size=rho.shape)
-    return pair_planes.fit_many(pair_planes.problem_of(made, PATCHES, GRID), rho)[0]
+    return pair_planes.fit_many(pair_planes.problem_of(curves, PATCHES, GRID), rho)[0]
 
 
 def rates(planes):
@@ -43,25 +43,25 @@ def rates(planes):
     return (p[:, 1:] * p[:, :1]).sum(axis=0) / (p[:, 0] ** 2).sum()
 
 
-def made(offset, slope_x, slope_y=0.0, covariance=None):
+def planes_with(offset, slope_x, slope_y=0.0, covariance=None):
     """Planes of one or several offsets and slopes, as even weights over the image know them."""
     if covariance is None:
         covariance = np.diag([1e-5 + SETTINGS.bias_mm**2, *(1e-5 / AT.var(axis=0))])
     coefficients = np.column_stack(np.broadcast_arrays(np.atleast_1d(offset), slope_x, slope_y))
-    return pair_planes.made(0, 1, coefficients, covariance)
+    return pair_planes.from_coefficients(0, 1, coefficients, covariance)
 
 
 def test_a_false_turn_within_the_scales_error_is_left_out():
     """Distances read 4 % long on one side and short on the other, where the scale is sure to 4 %."""
-    planes = fitted(short=0.022 * AT[:, 0] / LEVER_MM)
+    planes = fit_planes(short=0.022 * AT[:, 0] / LEVER_MM)
     weights = weigh_slopes(planes, TISSUE, SETTINGS)
-    seen, left = abs(rates(planes)[0]), abs(rates(weights.applied(planes))[0])
-    assert seen > 2.0 * EXPECTED
-    assert left < min(0.25 * seen, 1.5 * EXPECTED, 3 * weights.deviation_per_mm[0])
+    rate, weighed_rate = abs(rates(planes)[0]), abs(rates(weights.applied(planes))[0])
+    assert rate > 2.0 * EXPECTED
+    assert weighed_rate < min(0.25 * rate, 1.5 * EXPECTED, 3 * weights.deviation_per_mm[0])
 
 
 def test_a_turn_of_five_degrees_over_twenty_millimetres_is_believed():
-    planes = fitted(DELIBERATE)
+    planes = fit_planes(DELIBERATE)
     weights = weigh_slopes(planes, PHANTOM, SETTINGS)
     assert weights.share[0] > 0.98
     assert abs(rates(weights.applied(planes))[0] / DELIBERATE - 1) < 0.04
@@ -75,13 +75,13 @@ def test_a_turn_of_five_degrees_over_twenty_millimetres_is_believed():
 def test_deviations_are_those_of_turns_as_expected_and_feigned(sigma):
     """Over many sweeps whose true and false rates are drawn, kept rates miss the true by what is claimed."""
     rng, offset = np.random.default_rng(1), np.array([0.2, 0.3, 0.4])
-    feigned = UNEVENNESS * sigma / LEVER_MM
-    off, claimed = [], []
-    for true, false in rng.normal(size=(600, 2)) * [EXPECTED, feigned]:
-        planes = made(offset, offset * (true + false))
+    feint = UNEVENNESS * sigma / LEVER_MM
+    off, deviations = [], []
+    for true, false in rng.normal(size=(600, 2)) * [EXPECTED, feint]:
+        planes = planes_with(offset, offset * (true + false))
         weights = weigh_slopes(planes, sigma, SETTINGS)
         off.append(rates(weights.applied(planes))[0] - true)
-        claimed.append(weights.deviation_per_mm[0])
+        deviations.append(weights.deviation_per_mm[0])
     # 600 draws know a deviation to 3 %; believing what stands out costs some at the tails.
-    assert 0.85 < np.std(off) / np.sqrt(np.mean(np.square(claimed))) < 1.15
-    assert np.std(off) < 1.1 * min(feigned, EXPECTED)
+    assert 0.85 < np.std(off) / np.sqrt(np.mean(np.square(deviations))) < 1.15
+    assert np.std(off) < 1.1 * min(feint, EXPECTED)

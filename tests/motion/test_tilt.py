@@ -44,7 +44,7 @@ def noisy(rho, rng):
     return rho + np.sqrt(correlation_variance(rho, CELLS, True)) * rng.normal(size=rho.shape)
 
 
-def stepped(frames=40, step_mm=0.06, tilt_deg=0.0, wander_deg=0.0, seed=0, law=correlation):
+def phantom_pairs(frames=40, step_mm=0.06, tilt_deg=0.0, wander_deg=0.0, seed=0, law=correlation):
     """Pairs of one phantom sweep whose frames turn, steadily or as a hand does, as they move."""
     rng = np.random.default_rng(seed)
     z = step_mm * np.arange(frames)
@@ -71,10 +71,10 @@ def learn(samples, key=ECHO):
 
 
 @pytest.fixture(scope="module")
-def learnt():
+def hand_curves():
     """Curves from two sweeps that do not turn and three of hands that do."""
-    still = [stepped(seed=seed) for seed in range(2)]
-    return learn([*still, *(stepped(wander_deg=1.0, seed=seed) for seed in (2, 3, 4))])
+    still = [phantom_pairs(seed=seed) for seed in range(2)]
+    return learn([*still, *(phantom_pairs(wander_deg=1.0, seed=seed) for seed in (2, 3, 4))])
 
 
 # ---- the law ----------------------------------------------------------------------------------------------
@@ -83,9 +83,9 @@ def learnt():
 # ---- fitting ----------------------------------------------------------------------------------------------
 
 
-def test_the_pivot_of_a_made_law_is_recovered(learnt):
-    assert learnt.tilt is not None
-    np.testing.assert_allclose(learnt.tilt.pivot_mm, pivots(DEPTHS_MM), atol=1.0)
+def test_the_pivot_of_a_made_law_is_recovered(hand_curves):
+    assert hand_curves.tilt is not None
+    np.testing.assert_allclose(hand_curves.tilt.pivot_mm, pivots(DEPTHS_MM), atol=1.0)
 
 
 # ---- what it is worth -------------------------------------------------------------------------------------
@@ -103,22 +103,22 @@ def tilt_sweep(tilt_deg, step_mm=0.1, seed=0):
     return noisy(correlation(depth, step_mm + tilt * AT[:, 1], tilt), rng)
 
 
-def read_lengths(learnt, tilt_deg, step_mm):
+def read_lengths(hand_curves, tilt_deg, step_mm):
     """Relative error of length without the response, with it, and with it and a sensed orientation."""
     depth = (5.0, 15.0, 35.0)
     still = replace(speckle.curves(sigma_mm=widths(depth), depth_mm=depth, cells=CELLS), key=ECHO)
     pairs = np.array([tilt_sweep(tilt_deg, step_mm, seed) for seed in range(40)], np.float32)
     slopes = np.tile([0.0, np.deg2rad(tilt_deg)], (40, 1))
-    without, with_it = (problem_of(made, PATCHES, GRID) for made in (still, learnt))
-    read = (fit_many(without, pairs), fit_many(with_it, pairs), fit_many(with_it, pairs, slopes=slopes))
+    plain, full = (problem_of(curves, PATCHES, GRID) for curves in (still, hand_curves))
+    read = (fit_many(plain, pairs), fit_many(full, pairs), fit_many(full, pairs, slopes=slopes))
     return np.array([planes.offset_mm.mean() for planes, _ in read]) / step_mm - 1
 
 
 @pytest.mark.parametrize("step_mm", [0.2, 0.3])
-def test_a_degree_of_tilt_per_pair_no_longer_lengthens_the_sweep(learnt, step_mm):
+def test_a_degree_of_tilt_per_pair_no_longer_lengthens_the_sweep(hand_curves, step_mm):
     """More than a fifth too long without, less than a twentieth off with the response."""
-    without, with_it, sensed = read_lengths(learnt, 1.0, step_mm)
+    without, with_response, with_sensor = read_lengths(hand_curves, 1.0, step_mm)
     assert without > 0.2
-    assert abs(sensed) < 0.05
+    assert abs(with_sensor) < 0.05
     # Images alone see little of the tilt itself, and the length is better for it all the same.
-    assert abs(with_it) < 0.06
+    assert abs(with_response) < 0.06

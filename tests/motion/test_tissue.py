@@ -23,8 +23,8 @@ SHEET = ProbeSheet(elevation_aperture_mm=5.0, elevation_focus_mm=20.0, band_mhz=
 
 def b_mode(sweep):
     """Grey levels of a sweep of echoes, in memory."""
-    made = received(sweep, dynamic_range_db=60.0)
-    return replace(made, frames=np.stack([made.frames[k] for k in range(len(made))]))
+    images = received(sweep, dynamic_range_db=60.0)
+    return replace(images, frames=np.stack([images.frames[k] for k in range(len(images))]))
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +33,7 @@ def grey(sweep):
     return b_mode(sweep.part(0, 64))
 
 
-def averaged(sweep, count):
+def frame_means(sweep, count):
     """Each frame the mean of some, as scanners in persistence show them."""
     sums = np.cumsum(sweep.frames.astype(float), axis=0)
     means = (sums[count:] - sums[:-count]) / count
@@ -48,31 +48,31 @@ def averaged(sweep, count):
     )
 
 
-def matched(sweep):
+def matches_of(sweep):
     c, curves = Config(), data_sheet_curves(SHEET, sweep)
     return match_sweep(sweep, FrameMatcher(sweep, c, curves), PairSchedule(c.trajectory))
 
 
 def test_frames_of_one_moment_each_are_not_doubted(grey):
-    matches = matched(grey)
+    matches = matches_of(grey)
     assert averaging_loss(matches.table, matches.features) == 0.0
     assert structure_openness(matches.texture) == 0.0
 
 
 @pytest.mark.skipif(not INDEPENDENT.is_dir(), reason="no sweeps of another physics at hand")
 def test_an_even_hand_over_tissue_is_not_doubted():
-    matches = matched(b_mode(load_sweep(INDEPENDENT / "tissue_reverse.h5")))
+    matches = matches_of(b_mode(load_sweep(INDEPENDENT / "tissue_reverse.h5")))
     assert averaging_loss(matches.table, matches.features) == 0.0
 
 
 def test_images_black_for_the_most_part_leave_lengths_open(grey):
     dark = np.maximum(grey.frames - np.quantile(grey.frames, 0.8), 0.0).astype(np.uint8)
-    assert 0.0 < structure_openness(matched(replace(grey, frames=dark)).texture) < np.inf
+    assert 0.0 < structure_openness(matches_of(replace(grey, frames=dark)).texture) < np.inf
 
 
 @pytest.mark.parametrize("count", [2, 3])
 def test_means_of_frames_are_refused(grey, count):
-    sweep = averaged(grey, count)
+    sweep = frame_means(grey, count)
     with pytest.raises(InsufficientDataError):
         track(sweep, data_sheet_curves(SHEET, sweep))
 
@@ -80,13 +80,13 @@ def test_means_of_frames_are_refused(grey, count):
 def test_a_range_that_curves_state_is_taken_for_an_estimated_one(grey):
     short = grey.part(0, 24)
     curves = data_sheet_curves(SHEET, short)
-    estimated = replace(short.signal, dynamic_range_db=70.0, dynamic_range_sigma_db=8.0)
-    expected, found = (track(sweep, curves) for sweep in (short, replace(short, signal=estimated)))
-    np.testing.assert_array_equal(found.covariance, expected.covariance)
+    range_estimate = replace(short.signal, dynamic_range_db=70.0, dynamic_range_sigma_db=8.0)
+    expected, tracking = (track(sweep, curves) for sweep in (short, replace(short, signal=range_estimate)))
+    np.testing.assert_array_equal(tracking.covariance, expected.covariance)
 
 
 def test_grey_levels_cut_off_at_white_are_doubted(grey):
     short, bright = grey.part(0, 8), np.minimum(grey.frames[:8].astype(int) + 90, 255).astype(np.uint8)
-    assert examine_echoes(matched(short)) == ()
-    (doubt,) = examine_echoes(matched(replace(short, frames=bright)))
+    assert examine_echoes(matches_of(short)) == ()
+    (doubt,) = examine_echoes(matches_of(replace(short, frames=bright)))
     assert (doubt.suspect, doubt.refuted) == ("gain", False)

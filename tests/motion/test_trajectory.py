@@ -21,12 +21,12 @@ def read_as(first, second, motions, planes):
     """A table of pairs' in-plane motions, and their planes from (coefficients, covariance) of each."""
     coefficients, covariance = zip(*planes, strict=True)
     first, second, pairs = np.array(first), np.array(second), len(motions)
-    moved, errors = (np.array(part) for part in zip(*motions, strict=True))
-    table = CorrelationTable(first, second, np.ones((pairs, 1), np.float32), moved, errors)
-    return table, pair_planes.made(first, second, coefficients, np.array(covariance))
+    motion, errors = (np.array(part) for part in zip(*motions, strict=True))
+    table = CorrelationTable(first, second, np.ones((pairs, 1), np.float32), motion, errors)
+    return table, pair_planes.from_coefficients(first, second, coefficients, np.array(covariance))
 
 
-def solved(pairs, frames, centre_mm=CENTRE_MM, huber=2.0):
+def solve(pairs, frames, centre_mm=CENTRE_MM, huber=2.0):
     return solve_trajectory(pairs, frames, np.asarray(centre_mm), huber).poses
 
 
@@ -77,20 +77,20 @@ def graph_of(rows):
     return RelativePoses(np.array(first), np.array(second), poses, np.array(covariance))
 
 
-def kept(pairs, which):
+def subset(pairs, index):
     """Some of the edges."""
-    return RelativePoses(pairs.first[which], pairs.second[which], pairs.poses[which], pairs.covariance[which])
+    return RelativePoses(pairs.first[index], pairs.second[index], pairs.poses[index], pairs.covariance[index])
 
 
 def neighbours(frames=40, reach=3):
     """Pairs of near frames of a hand that travels 0.1 mm a frame, with errors as claimed; and its poses."""
     rng, t = np.random.default_rng(1), np.arange(frames)
     turns = 0.007 * np.column_stack([np.sin(t / 9), np.cos(t / 7), np.sin(t / 5)])
-    moved = np.column_stack([0.3 * np.sin(t / 8), 0.3 * np.cos(t / 6), 0.1 * t])
-    truth = RigidTransform.from_components(moved, Rotation.from_euler("xyz", turns))
-    known = np.diag([3e-3, 1e-3, 8e-3, 2e-4, 2e-4, 1e-4]) ** 2
+    position = np.column_stack([0.3 * np.sin(t / 8), 0.3 * np.cos(t / 6), 0.1 * t])
+    truth = RigidTransform.from_components(position, Rotation.from_euler("xyz", turns))
+    sigma2 = np.diag([3e-3, 1e-3, 8e-3, 2e-4, 2e-4, 1e-4]) ** 2
     rows = [
-        (i, j, truth[i].inv() * truth[j] * pose_of(*rng.multivariate_normal(np.zeros(6), known)), known)
+        (i, j, truth[i].inv() * truth[j] * pose_of(*rng.multivariate_normal(np.zeros(6), sigma2)), sigma2)
         for j in range(1, frames)
         for i in range(max(0, j - reach), j)
     ]
@@ -100,7 +100,7 @@ def neighbours(frames=40, reach=3):
 def test_poses_of_a_sweep_are_recovered_about_any_centre():
     pairs, truth = neighbours()
     centre = RigidTransform.from_translation(CENTRE_MM)
-    off = solved(pairs, len(truth)).inv() * (centre * truth * centre.inv())
+    off = solve(pairs, len(truth)).inv() * (centre * truth * centre.inv())
     # Some 40 steps of 0.004 mm and 1e-4 rad, in a random walk.
     assert np.abs(off.apply(CENTRE_MM) - CENTRE_MM).max() < 0.08
     assert off.rotation.magnitude().max() < 0.003
@@ -111,7 +111,7 @@ def test_one_false_pair_among_many_is_overruled():
     wrong = (pairs.first == 17) & (pairs.second == 19)
     false = RigidTransform.from_translation(np.outer(wrong, [0, 0, 1.0])) * pairs.poses
     clean, robust, plain = (
-        elevation(solved(p, len(truth), huber=h))[-1]
+        elevation(solve(p, len(truth), huber=h))[-1]
         for p, h in ((pairs, 2.0), (replace(pairs, poses=false), 2.0), (replace(pairs, poses=false), PLAIN))
     )
     assert abs(robust - clean) < 0.25 * abs(plain - clean)
@@ -127,12 +127,12 @@ def test_a_chain_of_equal_steps_is_a_random_walk():
     first = np.arange(frames - 1)
     still = RigidTransform.from_translation(np.zeros((frames - 1, 3)))
     pairs = RelativePoses(first, first + 1, still, np.tile(step, (frames - 1, 1, 1)))
-    found = solve_trajectory(pairs, frames, CENTRE_MM, with_covariance=True)
-    assert found.covariance.shape == (frames, 6, 6)
+    walk = solve_trajectory(pairs, frames, CENTRE_MM, with_covariance=True)
+    assert walk.covariance.shape == (frames, 6, 6)
     np.testing.assert_allclose(
-        found.covariance, np.arange(frames)[:, None, None] * step, rtol=1e-3, atol=1e-12
+        walk.covariance, np.arange(frames)[:, None, None] * step, rtol=1e-3, atol=1e-12
     )
-    np.testing.assert_allclose(found.covariance, found.covariance.transpose(0, 2, 1))
+    np.testing.assert_allclose(walk.covariance, walk.covariance.transpose(0, 2, 1))
 
 
 # ---- frames that no pair places ----------------------------------------------------------------------------
@@ -140,13 +140,13 @@ def test_a_chain_of_equal_steps_is_a_random_walk():
 
 def test_a_frame_that_is_held_alone_lies_between_its_neighbours_and_is_not_trusted():
     (pairs, truth), lone = neighbours(), 17
-    measured = kept(pairs, (pairs.first != lone) & (pairs.second != lone))
-    found, full = (solve_trajectory(p, len(truth), CENTRE_MM, 2.0, True) for p in (measured, pairs))
-    before, at, after = elevation(found.poses)[lone - 1 : lone + 2]
+    without_lone = subset(pairs, (pairs.first != lone) & (pairs.second != lone))
+    estimate, full = (solve_trajectory(p, len(truth), CENTRE_MM, 2.0, True) for p in (without_lone, pairs))
+    before, at, after = elevation(estimate.poses)[lone - 1 : lone + 2]
     assert abs(at - (before + after) / 2) < 1e-3
-    others = np.delete(np.arange(len(truth)), lone)
-    assert np.abs(elevation(found.poses) - elevation(full.poses))[others].max() < 0.03
-    deviation = np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2))
+    rest = np.delete(np.arange(len(truth)), lone)
+    assert np.abs(elevation(estimate.poses) - elevation(full.poses))[rest].max() < 0.03
+    deviation = np.sqrt(np.diagonal(estimate.covariance, axis1=1, axis2=2))
     # Two edges of 1 mm and 0.05 rad side by side.
     np.testing.assert_allclose(deviation[lone], np.repeat([1.0, 0.05], 3) / np.sqrt(2), rtol=0.05)
-    assert (deviation[lone] > 4 * deviation[others].max(axis=0)).all()
+    assert (deviation[lone] > 4 * deviation[rest].max(axis=0)).all()

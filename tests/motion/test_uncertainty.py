@@ -42,10 +42,10 @@ def test_a_false_turn_bends_the_sweep():
 
 def test_structure_that_stays_makes_lateral_motion_and_roll_uncertain():
     plain, tissue = covariance(independent=1e-4), covariance(share=0.1, independent=1e-4)
-    grown = np.diagonal(tissue[10]) / np.diagonal(plain[10])
-    assert grown[X] > 2
-    assert grown[ROLL] > 2
-    np.testing.assert_allclose(grown[[Y, Z, TILT, YAW]], 1.0)
+    growth = np.diagonal(tissue[10]) / np.diagonal(plain[10])
+    assert growth[X] > 2
+    assert growth[ROLL] > 2
+    np.testing.assert_allclose(growth[[Y, Z, TILT, YAW]], 1.0)
 
 
 # ---- all frames together ----------------------------------------------------------------------------------
@@ -54,7 +54,7 @@ CLAIMS = SharedErrors(0.02, 0.03, np.array([1e-3, 2e-3]))
 ONE_WAY = POSES[:51]
 
 
-def grown(poses):
+def growing(poses):
     """Covariance that grows with the way, in lines and in angles, which have some of it in common."""
     root = np.diag([0.01, 0.01, 0.02, 5e-4, 5e-4, 3e-4]) @ (np.eye(6) + 0.3)
     return np.linspace(0.0, 1.0, len(poses))[:, None, None] * (root @ root.T)
@@ -63,29 +63,29 @@ def grown(poses):
 @pytest.mark.parametrize("frames", [1, 2, 51, 101])
 def test_each_frame_has_the_covariance_that_was_claimed(frames):
     poses = POSES[:frames]
-    claimed = grown(poses) + shared_covariance(poses, CENTRE_MM, CLAIMS)
-    for shared in (CLAIMS, None):
-        found = joint_errors(claimed, poses, CENTRE_MM, shared).covariance()
-        np.testing.assert_allclose(found, claimed, rtol=1e-6, atol=1e-12)
+    claims = growing(poses) + shared_covariance(poses, CENTRE_MM, CLAIMS)
+    for common in (CLAIMS, None):
+        joint = joint_errors(claims, poses, CENTRE_MM, common).covariance()
+        np.testing.assert_allclose(joint, claims, rtol=1e-6, atol=1e-12)
 
 
 def test_what_is_shared_stretches_and_what_has_grown_is_a_random_walk():
-    claimed = grown(ONE_WAY) + shared_covariance(ONE_WAY, CENTRE_MM, CLAIMS)
-    errors = joint_errors(claimed, ONE_WAY, CENTRE_MM, CLAIMS)
-    own = grown(ONE_WAY)[-1, Z, Z] / 10.0 + SCALE_CHANGE_MM * 0.02**2
+    claims = growing(ONE_WAY) + shared_covariance(ONE_WAY, CENTRE_MM, CLAIMS)
+    errors = joint_errors(claims, ONE_WAY, CENTRE_MM, CLAIMS)
+    walk = growing(ONE_WAY)[-1, Z, Z] / 10.0 + SCALE_CHANGE_MM * 0.02**2
     for i, j in ((0, 50), (10, 40), (20, 25)):
         apart = errors.factors[:, j, Z] - errors.factors[:, i, Z]
         away = (j - i) / 5.0
-        expected = np.hypot(0.02, 0.03) ** 2 * away**2 + own * away
+        expected = np.hypot(0.02, 0.03) ** 2 * away**2 + walk * away
         assert apart @ apart == pytest.approx(expected, rel=0.02)
 
 
 def test_the_claim_of_two_frames_does_not_hang_on_rounding():
     """A direction that is as good as certain stays so, however the covariance is rounded."""
-    claimed = grown(ONE_WAY)
-    claimed[:, :, YAW] = claimed[:, YAW, :] = 0.0
-    claimed[:, YAW, YAW] = 1e-20
-    rounded = claimed * (1.0 + 1e-15 * np.random.default_rng(1).normal(size=claimed.shape))
-    factors = [joint_errors(c, ONE_WAY, CENTRE_MM).factors for c in (claimed, rounded)]
-    one, other = (f[:, 10].T @ f[:, 40] for f in factors)
-    np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-15)
+    claims = growing(ONE_WAY)
+    claims[:, :, YAW] = claims[:, YAW, :] = 0.0
+    claims[:, YAW, YAW] = 1e-20
+    noisy_claims = claims * (1.0 + 1e-15 * np.random.default_rng(1).normal(size=claims.shape))
+    factors = [joint_errors(c, ONE_WAY, CENTRE_MM).factors for c in (claims, noisy_claims)]
+    exact, rough = (f[:, 10].T @ f[:, 40] for f in factors)
+    np.testing.assert_allclose(exact, rough, rtol=1e-9, atol=1e-15)
