@@ -10,7 +10,7 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
-from crossing_tissue import GRID, PairCase, made_pair
+from crossing_tissue import GRID, PairCase, tissue_pair
 
 from speckle3d.config import Config
 from speckle3d.core.streams import TimedPoses, TimedRotations
@@ -29,7 +29,7 @@ from speckle3d.simulation.receiver import received
 from speckle3d.tracking import track
 
 TABLE = Path(__file__).parent / "accuracy" / "table.toml"
-KEPT = os.environ.get("SPECKLE3D_ACCURACY_SWEEPS")
+SWEEPS_FOLDER = os.environ.get("SPECKLE3D_ACCURACY_SWEEPS")
 """Folder that `simulate_set` has filled, for those who run the tests again and again."""
 INDEPENDENT = Path(__file__).resolve().parents[2] / "shared" / "independent"
 SHORT_FRAMES = 28
@@ -59,7 +59,7 @@ class Errors:
 def simulate_set(folder, data_folder):
     """Write all sweeps that are simulated to `folder`: a minute."""
 
-    def made(name, attenuation=None, vectors=48, **settings):
+    def write(name, attenuation=None, vectors=48, **settings):
         sweep = simulate(SimulationSettings(vectors=vectors, **settings))[0].sweep
         if attenuation is not None:
             medium = replace(sweep.frames.medium, attenuation_db_cm_mhz=attenuation)
@@ -68,18 +68,18 @@ def simulate_set(folder, data_folder):
         write_sweep(folder / f"{name}.h5", sweep)
         return sweep
 
-    simulated = made("tissue", preset="tissue", length_mm=8.0, seed=4)
-    made("tissue-0.15", 0.15, preset="tissue", length_mm=5.0, seed=11)
-    made("tissue-0.7", 0.7, preset="tissue", length_mm=5.0, seed=21)
-    made("reversal", vectors=40, preset="reversal", length_mm=6.0, seed=22)
-    made("rotation", preset="rotation", length_mm=6.0, seed=6)
+    simulation = write("tissue", preset="tissue", length_mm=8.0, seed=4)
+    write("tissue-0.15", 0.15, preset="tissue", length_mm=5.0, seed=11)
+    write("tissue-0.7", 0.7, preset="tissue", length_mm=5.0, seed=21)
+    write("reversal", vectors=40, preset="reversal", length_mm=6.0, seed=22)
+    write("rotation", preset="rotation", length_mm=6.0, seed=6)
     tissue = load_sweep(folder / "tissue.h5")
-    noise = replace(simulated.frames, medium=Nothing(), snr_db=20.0)
-    write_sweep(folder / "noise.h5", replace(tissue, frames=Added(tissue.frames, noise)))
+    noise = replace(simulation.frames, medium=Nothing(), snr_db=20.0)
+    write_sweep(folder / "noise.h5", replace(tissue, frames=Sum(tissue.frames, noise)))
     depth = np.arange(tissue.grid.samples) * tissue.grid.sample_spacing_mm
     still = CLUTTER * np.exp(-depth / CLUTTER_MM) * load_sweep(data_folder / "phantom.h5").frames[0]
     still = np.broadcast_to(np.rint(still).astype(np.int16), tissue.frames.shape)
-    write_sweep(folder / "clutter.h5", replace(tissue, frames=Added(tissue.frames, still)))
+    write_sweep(folder / "clutter.h5", replace(tissue, frames=Sum(tissue.frames, still)))
 
 
 class Nothing:
@@ -91,15 +91,15 @@ class Nothing:
         return []
 
 
-class Added:
-    """Frames to which other frames are added."""
+class Sum:
+    """Sample by sample, of two sets of frames."""
 
-    def __init__(self, frames, others):
-        self._frames, self._others = frames, others
+    def __init__(self, frames, addend):
+        self._frames, self._addend = frames, addend
         self.shape, self.dtype = frames.shape, frames.dtype
 
     def __getitem__(self, index):
-        return self._frames[index] + self._others[index]
+        return self._frames[index] + self._addend[index]
 
 
 def short(sweep):
@@ -130,7 +130,7 @@ def grey(sweep):
     return received(sweep, 60.0)
 
 
-def untracked(sweep):
+def without_tracker(sweep):
     return replace(sweep, tracker=None)
 
 
@@ -146,7 +146,7 @@ CASES = {
     "tissue, 0.15 dB/cm/MHz": ("tissue-0.15",),
     "tissue, 0.7 dB/cm/MHz": ("tissue-0.7",),
     "tissue, there and back": ("reversal",),
-    "tissue, there and back, no tracker": ("reversal", untracked),
+    "tissue, there and back, no tracker": ("reversal", without_tracker),
     "tissue, B-mode": ("tissue", grey, "grey"),
     "tissue, noise at 20 dB": ("noise",),
     "tissue, clutter": ("clutter",),
@@ -181,10 +181,10 @@ class AccuracySet:
         if kind == "sheet":
             return data_sheet_curves(SHEET, self.sweep(name), self.config)
         if kind == "wrong sheet":
-            other = SHEET.model_copy(update={"elevation_focus_mm": 17.0})
-            return data_sheet_curves(other, self.sweep(name), self.config)
+            sheet = SHEET.model_copy(update={"elevation_focus_mm": 17.0})
+            return data_sheet_curves(sheet, self.sweep(name), self.config)
         if kind == "grey":
-            phantoms = [grey(self.sweep(each)) for each in ("phantom", "phantom, turned")]
+            phantoms = [grey(self.sweep(name)) for name in ("phantom", "phantom, turned")]
             return calibrate_curves(phantoms, self.config)
         if kind == "independent":
             steps = sorted(INDEPENDENT.glob("phantom_steps_*.h5"))
@@ -194,20 +194,20 @@ class AccuracySet:
     def _errors(self, name):
         """Errors by mode."""
         if name.startswith("crossing"):
-            pair = made_pair(PairCase(seed=2))
+            pair = tissue_pair(PairCase(seed=2))
             first = crossed(pair.first, pair.second).first
-            return _scored({"crossed": first}, pair.truth[0], GRID.centre_mm)
+            return _score({"crossed": first}, pair.truth[0], GRID.centre_mm)
         sweep = self.sweep(name)
         kind = (*CASES[name], None, None)[2]
         curves = self.curves(kind, name if kind and "sheet" in kind else None)
         tracking = track(sweep, curves, self.config)
         modes = ["orientation", "fused", *(["pose"] if sweep.tracker else [])]
         modes = correct(tracking, sweep, modes, self.config)
-        return _scored({"image": tracking, **modes}, sweep.truth, sweep.grid.centre_mm)
+        return _score({"image": tracking, **modes}, sweep.truth, sweep.grid.centre_mm)
 
 
-def _scored(modes, truth, centre_mm):
-    poses = {mode: each.image if mode == "image" else each.poses for mode, each in modes.items()}
+def _score(modes, truth, centre_mm):
+    poses = {mode: m.image if mode == "image" else m.poses for mode, m in modes.items()}
     rows = compare_modes(poses, truth, centre_mm, end_frames=1)
     errors = {}
     for mode, result in modes.items():

@@ -30,25 +30,26 @@ def trials_in(folder):
 
 def read_trial(folder, name):
     """The log, the optical orientation (NaN where unseen), and where the sensor moved."""
-    held = scipy.io.loadmat(folder / f"{name}.mat")
-    vectors = [np.ascontiguousarray(held[key], dtype=float) for key in ("imu_acc", "imu_gyr", "imu_mag")]
-    time_s = np.arange(len(vectors[0])) / float(held["sampling_rate"].squeeze())
-    return ImuLog(time_s, *vectors, source=name), held["opt_quat"], held["movement"].squeeze().astype(bool)
+    trial = scipy.io.loadmat(folder / f"{name}.mat")
+    vectors = [np.ascontiguousarray(trial[key], dtype=float) for key in ("imu_acc", "imu_gyr", "imu_mag")]
+    time_s = np.arange(len(vectors[0])) / float(trial["sampling_rate"].squeeze())
+    moving = trial["movement"].squeeze().astype(bool)
+    return ImuLog(time_s, *vectors, source=name), trial["opt_quat"], moving
 
 
 def estimate(log, method, settings=None):
     """Orientation by a method of `ONLINE` or `OFFLINE`, or any that `orient` knows."""
     if method.startswith("VQF"):
         return Estimate(by_vqf(log, method), np.full((len(log), 3), np.nan))
-    found = orient(log, settings, method)
-    north, west, up = found.standard_deviation_rad.T
-    return Estimate(east_first(found.rotations.world_from_sensor), np.column_stack([west, north, up]))
+    orientation = orient(log, settings, method)
+    north, west, up = orientation.standard_deviation_rad.T
+    return Estimate(east_first(orientation.rotations.world_from_sensor), np.column_stack([west, north, up]))
 
 
 def by_vqf(log, method):
     """Quaternions of VQF with its default parameters; it leaves a field of zeros out."""
     field = np.where(np.isfinite(log.magnetometer_au), log.magnetometer_au, 0.0)
-    readings = [np.ascontiguousarray(each) for each in (log.gyroscope_rad_s, log.accelerometer_m_s2, field)]
+    readings = [np.ascontiguousarray(v) for v in (log.gyroscope_rad_s, log.accelerometer_m_s2, field)]
     if method == "VQF on-line":
         return VQF(1.0 / log.rate_hz).updateBatch(*readings)["quat9D"]
     return offlineVQF(*readings, 1.0 / log.rate_hz)["quat9D"]
@@ -73,12 +74,12 @@ def errors_rad(found_wxyz, true_wxyz, counts, steady=False):
     BROAD leaves nothing out. Its cameras' north and a magnetometer's in one corner of the room need not be
     the same, so the error without a constant heading tells more of the motion.
     """
-    found, true = (Rotation.from_quat(q[counts], scalar_first=True) for q in (found_wxyz, true_wxyz))
+    rotation, true = (Rotation.from_quat(q[counts], scalar_first=True) for q in (found_wxyz, true_wxyz))
     if steady:
-        between = (found * true.inv()).as_quat(scalar_first=True)
+        between = (rotation * true.inv()).as_quat(scalar_first=True)
         offset = np.angle(np.exp(2j * np.arctan2(between[:, 3], between[:, 0])).mean())
-        found = Rotation.from_rotvec([0.0, 0.0, -offset]) * found
-    between = found * true.inv()
+        rotation = Rotation.from_rotvec([0.0, 0.0, -offset]) * rotation
+    between = rotation * true.inv()
     w, _, _, z = between.as_quat(scalar_first=True, canonical=True).T
     heading = 2 * np.arctan2(z, w)
     # The turn about a horizontal axis that is left when the turn about up is taken away.
@@ -97,9 +98,9 @@ def rms_deg(values_rad):
 
 def errors_deg(found_wxyz, true_wxyz, moving, steady=False):
     """RMS of total, heading and inclination error; `steady` leaves out a constant heading."""
-    found = errors_rad(found_wxyz, true_wxyz, counting(true_wxyz, moving), steady)
-    inclination = np.linalg.norm(found.inclination_xy, axis=1)
-    return np.array([rms_deg(each) for each in (found.total, found.heading, inclination)])
+    errors = errors_rad(found_wxyz, true_wxyz, counting(true_wxyz, moving), steady)
+    inclination = np.linalg.norm(errors.inclination_xy, axis=1)
+    return np.array([rms_deg(e) for e in (errors.total, errors.heading, inclination)])
 
 
 class Coverage(NamedTuple):
@@ -111,11 +112,11 @@ class Coverage(NamedTuple):
     inclination_ratio: float
 
 
-def coverage(found, true_wxyz, moving, steady=False):
+def coverage(orientation, true_wxyz, moving, steady=False):
     """How the claimed sigma fits the errors; of inclination, about x and y each with its own."""
     counts = counting(true_wxyz, moving)
-    errors, sigma = errors_rad(found.wxyz, true_wxyz, counts, steady), found.sigma_rad[counts]
+    errors, sigmas = errors_rad(orientation.wxyz, true_wxyz, counts, steady), orientation.sigma_rad[counts]
     parts = []
-    for error, claimed in ((errors.heading, sigma[:, 2]), (errors.inclination_xy, sigma[:, :2])):
-        parts += [float(np.mean(np.abs(error) < claimed)), rms_deg(error) / rms_deg(claimed)]
+    for error, sigma in ((errors.heading, sigmas[:, 2]), (errors.inclination_xy, sigmas[:, :2])):
+        parts += [float(np.mean(np.abs(error) < sigma)), rms_deg(error) / rms_deg(sigma)]
     return Coverage(*parts)

@@ -61,23 +61,23 @@ def viewing(*arguments):
     """The address that `speckle3d view ...` serves; the server has its port and everything to itself."""
     command = [sys.executable, "-m", "speckle3d.cli", "view", "--no-browser", *arguments]
     with running(command, stderr=subprocess.PIPE) as server:
-        said = []
+        output = []
         for line in server.stderr:
-            said.append(line)
+            output.append(line)
             if line.startswith("http"):
                 break
         else:
-            raise AssertionError("".join(said))
-        drain = threading.Thread(target=lambda: said.extend(server.stderr), daemon=True)
+            raise AssertionError("".join(output))
+        drain = threading.Thread(target=lambda: output.extend(server.stderr), daemon=True)
         drain.start()
-        yield said[-1].strip()
+        yield output[-1].strip()
         server.terminate()
         server.wait(20)
         drain.join(5)
-        assert not [line for line in said if "Traceback" in line], "".join(said)
+        assert not [line for line in output if "Traceback" in line], "".join(output)
 
 
-def opened(browser, address):
+def open_page(browser, address):
     """A page with what it complained of and asked for in `complaints` and `requests`."""
     page = browser.new_page(viewport={"width": 1366, "height": 768})
     # Where no kernel has been compiled yet, that comes first.

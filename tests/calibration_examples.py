@@ -89,7 +89,8 @@ def line_directions(
     **turns,
 ):
     """Directions of a plane's lines (square pixels), the sensor's readings, and the mounting."""
-    mounted = Rotation.random(rng=rng) if mounting is None else mounting
+    if mounting is None:
+        mounting = Rotation.random(rng=rng)
     turn = hand_turns(rng, count, **({"yaw_deg": 30.0} | turns))
     if from_below:
         turn = Rotation.from_euler("x", np.pi) * turn
@@ -99,7 +100,7 @@ def line_directions(
     angle = np.arctan2(along[:, 1], along[:, 0]) + np.deg2rad(noise_deg) * rng.standard_normal(count)
     jitter = Rotation.from_rotvec(np.deg2rad(sensor_noise_deg) * rng.standard_normal((count, 3)))
     heading = Rotation.from_rotvec([0.0, 0.0, np.deg2rad(heading_deg)])
-    return np.column_stack([np.cos(angle), np.sin(angle)]), heading * turn * mounted.inv() * jitter, mounted
+    return np.column_stack([np.cos(angle), np.sin(angle)]), heading * turn * mounting.inv() * jitter, mounting
 
 
 def scan_wires(
@@ -119,12 +120,12 @@ def scan_wires(
         In the phantom's frame.
     """
     count = len(places_mm)
-    seen = rng.uniform([2.0, 5.0], [38.0, 38.0], (count, 2))
+    image_mm = rng.uniform([2.0, 5.0], [38.0, 38.0], (count, 2))
     turn = hand_turns(rng, count, **({"tilt_deg": 35.0, "roll_deg": 35.0} | turns))
     where = RigidTransform.identity() if world_from_phantom is None else world_from_phantom
-    flat = np.column_stack([seen, np.zeros(count)])
+    flat = np.column_stack([image_mm, np.zeros(count)])
     world_from_image = RigidTransform.from_components(where.apply(places_mm) - turn.apply(flat), turn)
-    pixels = (seen + noise_mm * rng.standard_normal((count, 2))) / PIXEL_MM
+    pixels = (image_mm + noise_mm * rng.standard_normal((count, 2))) / PIXEL_MM
     return pixels, world_from_image * sensor_from_image.inv()
 
 

@@ -11,9 +11,9 @@ SUBJECT, SCAN = "050", "LH_Par_C_DtP"
 
 
 def matrix(rotation, translation):
-    made = np.eye(4)
-    made[:3, :3], made[:3, 3] = rotation.as_matrix(), translation
-    return made
+    transform = np.eye(4)
+    transform[:3, :3], transform[:3, 3] = rotation.as_matrix(), translation
+    return transform
 
 
 TOOL_FROM_IMAGE = matrix(Rotation.from_euler("xyz", [20.0, -35.0, 80.0], degrees=True), [-60.0, 12.5, 33.0])
@@ -37,12 +37,12 @@ def write_data_set(root, split=True, landmarks=True):
         [rng.integers(1, FRAMES, 20), rng.integers(1, WIDTH + 1, 20), rng.integers(1, HEIGHT + 1, 20)]
     )
     path = root / "frames" / SUBJECT / f"{SCAN}.h5" if split else root / SUBJECT / f"{SCAN}.h5"
-    other = root / "transfs" / SUBJECT / f"{SCAN}.h5" if split else path
-    for each in {path.parent, other.parent}:
-        each.mkdir(parents=True)
+    poses_path = root / "transfs" / SUBJECT / f"{SCAN}.h5" if split else path
+    for folder in {path.parent, poses_path.parent}:
+        folder.mkdir(parents=True)
     with h5py.File(path, "w") as file:
         file["frames"] = frames
-    with h5py.File(other, "a") as file:
+    with h5py.File(poses_path, "a") as file:
         file["tforms"] = poses
     if landmarks:
         (root / "landmark").mkdir()
@@ -61,8 +61,8 @@ def displacements(tool_poses):
     rows, columns = np.mgrid[1.0 : HEIGHT + 1, 1.0 : WIDTH + 1]
     in_mm = np.stack([SCALE_MM[0] * columns, SCALE_MM[1] * rows, 0 * rows, 1 + 0 * rows])
     steps = np.arange(len(tool_poses) - 1)
-    moved = np.linalg.inv(tool_poses[[0 * steps, steps]]) @ tool_poses[1:]
-    between = np.linalg.inv(TOOL_FROM_IMAGE) @ moved @ TOOL_FROM_IMAGE
+    tool_steps = np.linalg.inv(tool_poses[[0 * steps, steps]]) @ tool_poses[1:]
+    between = np.linalg.inv(TOOL_FROM_IMAGE) @ tool_steps @ TOOL_FROM_IMAGE
     return (np.einsum("gnij,jhw->gnihw", between, in_mm) - in_mm)[:, :, :3]
 
 

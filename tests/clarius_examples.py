@@ -23,28 +23,28 @@ NAME = "2024-05-01T10-00-00+0000"
 ELEMENT_MM = 0.2
 """Of an L7 HD3."""
 
-GIVEN = ImportSettings(probe="Clarius L7 HD3", bandwidth_hz=(4e6, 8e6), dynamic_range_db=60)
+IMPORT_SETTINGS = ImportSettings(probe="Clarius L7 HD3", bandwidth_hz=(4e6, 8e6), dynamic_range_db=60)
 
 BLOCK_BYTES = 256 * 1024
 G = 9.80665
 
 
 def sweep_of(kind, frames=4, samples=40):
-    """A sweep of noise, its sensor in bursts: "rf", "iq" or "env"; `GIVEN` is what its package lacks."""
-    made, times, rng = rf_sweep(frames, 5, samples), bursts_s(9.9, 10.4), np.random.default_rng(1)
+    """A sweep of noise, its sensor in bursts: "rf", "iq" or "env"; `IMPORT_SETTINGS` has what it lacks."""
+    sweep, times, rng = rf_sweep(frames, 5, samples), bursts_s(9.9, 10.4), np.random.default_rng(1)
     # At 11 frames/s and every third frame left out, as RF is interleaved.
     clock = 10.0 + np.delete(np.arange(3 * frames), slice(None, None, 3))[:frames] / 11
-    sensor = sensor_of(swayed(times), times)
-    made = replace(made, orientation=sensor, tracker=None, truth=None, frame_time_s=np.round(clock, 9))
+    sensor = sensor_of(sway(times), times)
+    sweep = replace(sweep, orientation=sensor, tracker=None, truth=None, frame_time_s=np.round(clock, 9))
     if kind == "env":
-        data = rng.integers(0, 256, made.frames.shape).astype(np.uint8)
-        made = replace(made, frames=data, signal=BModeSettings(60.0))
+        data = rng.integers(0, 256, sweep.frames.shape).astype(np.uint8)
+        sweep = replace(sweep, frames=data, signal=BModeSettings(60.0))
     if kind == "iq":
-        pairs = rng.integers(-3000, 3000, (*made.frames.shape, 2)).astype(np.float32)
+        pairs = rng.integers(-3000, 3000, (*sweep.frames.shape, 2)).astype(np.float32)
         signal = RFSettings(15e6, 1540.0, 6e6, (4e6, 8e6), 6e6)
         grid = ImageGrid(5, samples, 0.3, signal.sample_spacing_mm, 2.0)
-        made = replace(made, frames=pairs.view(np.complex64)[..., 0], signal=signal, grid=grid)
-    return made
+        sweep = replace(sweep, frames=pairs.view(np.complex64)[..., 0], signal=signal, grid=grid)
+    return sweep
 
 
 def write_package(target, sweep, **fields):
@@ -64,11 +64,11 @@ def write_files(target, files):
     return target
 
 
-def package_files(sweep, packed=False, name=NAME, element_mm=ELEMENT_MM, yml=None):
+def package_files(sweep, lzop=False, name=NAME, element_mm=ELEMENT_MM, yml=None):
     """Content of a package's files by name."""
     kind, raw = kind_of(sweep), raw_bytes(sweep)
     files = {
-        f"{name}_{kind}.raw{'.lzo' if packed else ''}": lzop_bytes(raw) if packed else raw,
+        f"{name}_{kind}.raw{'.lzo' if lzop else ''}": lzop_bytes(raw) if lzop else raw,
         f"{name}_{kind}.yml": (yml or yml_text(sweep, element_mm)).encode(),
     }
     if sweep.orientation is not None:
@@ -82,7 +82,7 @@ def kind_of(sweep):
     return "rf" if sweep.signal.demodulation_frequency_hz is None else "iq"
 
 
-SAMPLE_BYTES, SPOKEN = {"rf": 2, "iq": 4, "env": 1}, {"rf": "RF", "iq": "IQ", "env": "B pre-scan"}
+SAMPLE_BYTES, TYPE_NAMES = {"rf": 2, "iq": 4, "env": 1}, {"rf": "RF", "iq": "IQ", "env": "B pre-scan"}
 
 
 def raw_bytes(sweep):
@@ -92,8 +92,8 @@ def raw_bytes(sweep):
         frame = sweep.frames[i]
         if kind == "iq":
             frame = np.stack([frame.real, frame.imag], axis=-1)
-        stored = np.uint8 if kind == "env" else "<i2"
-        parts += [struct.pack("<Q", round(time_s * 1e9)), np.round(frame).astype(stored).tobytes()]
+        dtype = np.uint8 if kind == "env" else "<i2"
+        parts += [struct.pack("<Q", round(time_s * 1e9)), np.round(frame).astype(dtype).tobytes()]
     return b"".join(parts)
 
 
@@ -112,7 +112,7 @@ def yml_text(sweep, element_mm=ELEMENT_MM):
         "tgc: { 0.00mm, 23.00dB }{ 40.00mm, 26.00dB }\n"
         f"size: {{samples per line: {samples}, number of lines: {lines}, "
         f"sample size: {SAMPLE_BYTES[kind]} bytes}}\n"
-        f"type: {SPOKEN[kind]}\ncompression: none\n"
+        f"type: {TYPE_NAMES[kind]}\ncompression: none\n"
         f"sampling rate: {rate_hz / 1e6!r} MHz\ndelay samples: {delay!r}\nlines:\n{places}"
         + (focus_text(shift / 1e6, shift / 1e6) if shift else "")
     )
@@ -158,7 +158,7 @@ def sensor_of(rotations, time_s, seed=0):
     )
 
 
-def swayed(time_s, degrees=8.0):
+def sway(time_s, degrees=8.0):
     """Rotations of a hand that tilts slowly."""
     phase = 2 * np.pi * np.asarray(time_s)[:, None] * [0.31, 0.23, 0.17]
     return Rotation.from_euler("zyx", np.array([70.0, 20.0, 80.0]) + degrees * np.sin(phase), degrees=True)
@@ -180,6 +180,6 @@ def lzop_bytes(content):
     compressor = lzallright.LZOCompressor()
     for at in range(0, len(content), BLOCK_BYTES):
         plain = content[at : at + BLOCK_BYTES]
-        packed = min(compressor.compress(plain), plain, key=len)
-        parts += [struct.pack(">III", len(plain), len(packed), zlib.adler32(plain)), packed]
+        block = min(compressor.compress(plain), plain, key=len)
+        parts += [struct.pack(">III", len(plain), len(block), zlib.adler32(plain)), block]
     return b"".join([*parts, struct.pack(">I", 0)])

@@ -14,5 +14,5 @@ def suicide(number):
     return number
 
 
-def lost(job, reason):
+def failure_text(job, reason):
     return f"{job}: {reason}"

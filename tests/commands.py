@@ -21,22 +21,22 @@ def run_command(*arguments):
     """Run it in this process; it must succeed. Returns what it printed on stdout."""
     from speckle3d import cli
 
-    told, before = io.StringIO(), sys.argv
+    output, before = io.StringIO(), sys.argv
     sys.argv = ["speckle3d", *map(str, arguments)]
     try:
-        with contextlib.redirect_stdout(told):
+        with contextlib.redirect_stdout(output):
             cli.main()
     except SystemExit as leave:
         if leave.code:
             raise RuntimeError(f"exit code {leave.code}: {' '.join(sys.argv)}") from None
     finally:
         sys.argv = before
-    return told.getvalue()
+    return output.getvalue()
 
 
 def free_port():
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        return taken.getsockname()[1]
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        return server.getsockname()[1]
 
 
 def read_until(process, words):

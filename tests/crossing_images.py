@@ -57,8 +57,8 @@ class Probe:
     def inside(self, pixels):
         """Whether pixels show anything."""
         beam, sample = self.beam_range(*self.from_image(pixels).T)
-        held = (beam > 0) & (beam < self.beams - 1) & (sample > 0) & (sample < self.samples - 1)
-        return held & np.all((pixels >= 0) & (pixels <= np.array(self.shape) - 1), axis=-1)
+        in_scan = (beam > 0) & (beam < self.beams - 1) & (sample > 0) & (sample < self.samples - 1)
+        return in_scan & np.all((pixels >= 0) & (pixels <= np.array(self.shape) - 1), axis=-1)
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ class World:
     images : ndarray of uint8, shape (n, column, row)
     crossing_px : ndarray, shape (n, 2)
         Nearest point of each image to the crossing.
-    shown : ndarray of bool, shape (n,)
+    is_visible : ndarray of bool, shape (n,)
         Whether the beam meets the crossing, inside the picture.
     """
 
@@ -78,7 +78,7 @@ class World:
     pixel_mm: np.ndarray
     world_from_sensor: RigidTransform
     crossing_px: np.ndarray
-    shown: np.ndarray
+    is_visible: np.ndarray
     sensor_from_image: RigidTransform
 
 
@@ -140,16 +140,16 @@ def crossing_world(seed, frames=54):
     where, turns = _hand(rng, frames)
     centre, pixels = rng.uniform(-300, 300, 3), _places(rng, probe, where)
     away = 0.35 * look.elevation_mm * rng.standard_normal(frames)
-    lost = rng.random(frames) < 0.12  # the beam misses the crossing
-    away = np.where(lost, rng.choice([-1, 1], frames) * rng.uniform(4, 9, frames) * look.elevation_mm, away)
+    misses = rng.random(frames) < 0.12  # the beam misses the crossing
+    away = np.where(misses, rng.choice([-1, 1], frames) * rng.uniform(4, 9, frames) * look.elevation_mm, away)
     flat = np.column_stack([pixels * probe.pixel_mm, away])
     base = Rotation.random(rng=rng)
     world_from_image = RigidTransform.from_components(centre - (base * turns).apply(flat), base * turns)
     # Who holds the probe sees to it that the crossing shows.
-    drawn = [_directions(rng) for _ in range(40)]
-    seen = [_both_seen(probe, look, pixels, turns, one) for one in drawn]
-    best = int(np.argmax([one.sum() for one in seen]))
-    wires = _wires(rng, base, centre, drawn[best])
+    draws = [_directions(rng) for _ in range(40)]
+    visible = [_both_visible(probe, look, pixels, turns, along) for along in draws]
+    best = int(np.argmax([mask.sum() for mask in visible]))
+    wires = _wires(rng, base, centre, draws[best])
     points = _scatterers(rng, look, centre)
     letters = _lettering(rng, probe) if look.lettering else None
     floor = centre + base.apply([0.0, look.floor_mm, 0.0]), base.apply([0.0, 1.0, 0.0])
@@ -159,8 +159,8 @@ def crossing_world(seed, frames=54):
     )
     mounting = RigidTransform.from_components(rng.uniform(-120, 120, 3), Rotation.random(rng=rng))
     readings = world_from_image * mounting.inv() * _errors(rng, frames)
-    shown = (np.abs(away) < 1.2 * look.elevation_mm) & probe.inside(pixels) & seen[best]
-    return World(images, probe.pixel_mm, readings, pixels, shown, mounting)
+    is_visible = (np.abs(away) < 1.2 * look.elevation_mm) & probe.inside(pixels) & visible[best]
+    return World(images, probe.pixel_mm, readings, pixels, is_visible, mounting)
 
 
 def _hand(rng, frames):
@@ -169,9 +169,9 @@ def _hand(rng, frames):
     reach = np.deg2rad([rng.uniform(15, 40), rng.uniform(15, 35), rng.uniform(12, 30)])
     angles = np.empty((frames, 3))
     for axis in range(3):
-        held = np.repeat(rng.uniform(-1, 1, frames // 3 + 1), 3)[:frames]
+        jumps = np.repeat(rng.uniform(-1, 1, frames // 3 + 1), 3)[:frames]
         wave = np.sin(2 * np.pi * rng.uniform(0.02, 0.11) * time + rng.uniform(0, 7))
-        angles[:, axis] = reach[axis] * (0.6 * held + 0.5 * wave)
+        angles[:, axis] = reach[axis] * (0.6 * jumps + 0.5 * wave)
     where = np.repeat(rng.uniform(0, 1, (frames // 2 + 1, 2)), 2, axis=0)[:frames]
     where = np.clip(where + rng.normal(0, 0.04, (frames, 2)), 0, 1)
     # About the beam's axis, about the array's, and in the image.
@@ -201,14 +201,14 @@ def _directions(rng):
     return Rotation.from_rotvec(rng.normal(0, 0.3, 3)).apply(along)
 
 
-def _both_seen(probe, look, pixels, turns, along):
+def _both_visible(probe, look, pixels, turns, along):
     """In which frames an eye finds two wires: both above the speckle, of not too different brightness.
 
     They must be 20 degrees apart, or both be strokes shorter than 8 mm.
     """
     x, y = probe.from_image(pixels).T
     beam = (0.0, 1.0) if np.isinf(probe.radius_mm) else _unit(x, y + probe.radius_mm)
-    in_image = np.stack([turns.inv().apply(one) for one in along])
+    in_image = np.stack([turns.inv().apply(direction) for direction in along])
     level = _slope_loss_db(look, in_image, beam) + np.array([[0.0], [look.faint_db]])
     flat = in_image[..., :2] / np.linalg.norm(in_image[..., :2], axis=2, keepdims=True)
     apart = np.abs(np.sum(flat[0] * flat[1], axis=1)) < np.cos(np.deg2rad(20))
@@ -228,15 +228,15 @@ def _slope_loss_db(look, along, beam):
 def _wires(rng, base, centre, along):
     """Points of two bent wires, shape (2, n, 3), and the directions along them."""
     t = np.arange(-90, 90 + STEP_MM, STEP_MM)[:, None]
-    made = []
+    curves = []
     for direction in along:
-        bent = np.cross(direction, rng.normal(size=3))
-        bent /= np.linalg.norm(bent)
-        curve = t * direction + t**2 / (2 * rng.uniform(120, 900)) * bent
-        made.append(base.apply(curve) + centre)
+        bend = np.cross(direction, rng.normal(size=3))
+        bend /= np.linalg.norm(bend)
+        curve = t * direction + t**2 / (2 * rng.uniform(120, 900)) * bend
+        curves.append(base.apply(curve) + centre)
     # They touch and do not meet.
-    made[1] = made[1] + base.apply([0, 0, rng.uniform(0.0, 0.4)])
-    return np.array(made), base.apply(along)
+    curves[1] = curves[1] + base.apply([0, 0, rng.uniform(0.0, 0.4)])
+    return np.array(curves), base.apply(along)
 
 
 def _scatterers(rng, look, centre):
@@ -261,21 +261,21 @@ def _frame(rng, probe, look, world_from_image, wires, points, floor, skin, lette
         beam = (0.0, 1.0) if np.isinf(probe.radius_mm) else _unit(x, y + probe.radius_mm)
         loss = 10 ** (_slope_loss_db(look, direction, beam) / 20.0)
         weight = (faint if number else 1.0) * amplitude * loss * STEP_MM / 0.6
-        _splat(echoes, probe, x, y, weight * _met(look, y, place[:, 2]))
+        _splat(echoes, probe, x, y, weight * _elevation_weight(look, y, place[:, 2]))
     place = into.apply(points[0])
     near = np.abs(place[:, 2]) < 6 * look.elevation_mm
     x, y = probe.from_image(place[near, :2] / probe.pixel_mm).T
-    _splat(echoes, probe, x, y, points[1][near] * _met(look, y, place[near, 2]))
+    _splat(echoes, probe, x, y, points[1][near] * _elevation_weight(look, y, place[near, 2]))
     if np.isfinite(look.floor_db):
         _splat(echoes, probe, *_floor(rng, probe, look, into.apply(floor[0]), into.rotation.apply(floor[1])))
     speckle = rng.standard_normal((2, *echoes.shape))
-    seen = _blurred(probe, look, echoes, lobes=True)
-    grains = _blurred(probe, look, speckle[0] + 1j * speckle[1], lobes=False)
+    specular = _blur(probe, look, echoes, lobes=True)
+    grains = _blur(probe, look, speckle[0] + 1j * speckle[1], lobes=False)
     grains *= 10 ** (look.speckle_db / 20.0) / np.sqrt(np.mean(np.abs(grains) ** 2))
     hiss = rng.standard_normal((2, *echoes.shape)) * 10 ** (look.noise_db / 20.0)
     depth = np.linspace(0, 1, probe.samples)
     total = np.abs(
-        seen + grains + skin * rng.uniform(0.7, 1.3) + (hiss[0] + 1j * hiss[1]) * (0.3 + 1.2 * depth)
+        specular + grains + skin * rng.uniform(0.7, 1.3) + (hiss[0] + 1j * hiss[1]) * (0.3 + 1.2 * depth)
     )
     level = 20 * np.log10(total + 1e-4) + look.gain_step_db * (depth > 0.5)
     grey = np.clip(255.0 * (level + look.range_db) / (look.range_db + 2.0), 0, 255)
@@ -306,7 +306,7 @@ def _unit(x, y):
     return x / length, y / length
 
 
-def _met(look, y, z):
+def _elevation_weight(look, y, z):
     """Amplitude of what lies `z` out of the image: the beam is thinnest at its focus."""
     width = look.elevation_mm * np.sqrt(1.0 + ((y - look.focus_mm) / look.spread_mm) ** 2)
     return np.exp(-0.5 * (z / width) ** 2)
@@ -315,13 +315,13 @@ def _met(look, y, z):
 def _splat(echoes, probe, x, y, weight):
     beam, sample = probe.beam_range(x, y)
     b, s = np.floor(beam).astype(int), np.floor(sample).astype(int)
-    held = (b >= 0) & (b < probe.beams - 1) & (s >= 0) & (s < probe.samples - 1)
-    b, s, fb, fs, w = b[held], s[held], (beam - b)[held], (sample - s)[held], weight[held]
+    inside = (b >= 0) & (b < probe.beams - 1) & (s >= 0) & (s < probe.samples - 1)
+    b, s, fb, fs, w = b[inside], s[inside], (beam - b)[inside], (sample - s)[inside], weight[inside]
     for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)):
         np.add.at(echoes, (b + i, s + j), w * np.where(i, fb, 1 - fb) * np.where(j, fs, 1 - fs))
 
 
-def _blurred(probe, look, echoes, lobes):
+def _blur(probe, look, echoes, lobes):
     """Pulse, tail, beam (wider away from the focus) and arcs of side lobes, of unit peak for one point."""
     pitch, spacing = probe.width_mm / (probe.beams - 1), probe.depth_mm / (probe.samples - 1)
     pulse = max(look.pulse_mm / spacing, 0.6)
@@ -344,17 +344,17 @@ def _blurred(probe, look, echoes, lobes):
         shape = (
             np.cos(np.pi * step / (2 * reach + 1)) * (0.6 + 0.4 * np.cos(step * 1.3)) * (-1) ** (step // 2)
         )
-        moved = np.zeros_like(out)
+        lobe = np.zeros_like(out)
         if step >= 0:
-            moved[step:] = out[: len(out) - step]
+            lobe[step:] = out[: len(out) - step]
         else:
-            moved[:step] = out[-step:]
+            lobe[:step] = out[-step:]
         # An echo from the side comes late: a linear array's arcs bend down.
         if np.isinf(probe.radius_mm):
             late = round((step * pitch) ** 2 / (2 * 0.5 * probe.depth_mm) / spacing)
-            moved[:, late:] = moved[:, : probe.samples - late].copy()
-            moved[:, :late] = 0
-        arcs += shape * moved
+            lobe[:, late:] = lobe[:, : probe.samples - late].copy()
+            lobe[:, :late] = 0
+        arcs += shape * lobe
     return beam + 10 ** (look.lobes_db / 20.0) * arcs
 
 

@@ -43,12 +43,12 @@ def tissue(rng, size_mm):
     return level.astype(np.float32), sheets
 
 
-def seen_by(rng, level, sheets, elevation_axis):
+def grey_of(rng, level, sheets, elevation_axis):
     """Grey voxels as one sweep sees them: its own speckle, beam and reflections."""
     power = 10.0 ** (level / 10.0) * rng.standard_exponential(level.shape, dtype=np.float32)
     for away, slope in sheets:
-        met = np.hypot(*slope) + 0.15  # of the beam, rad
-        power += 60.0 * np.exp(-((met / 0.2) ** 2)) * np.exp(-0.5 * (away / 0.3) ** 2)
+        angle = np.hypot(*slope) + 0.15  # of the beam, rad
+        power += 60.0 * np.exp(-((angle / 0.2) ** 2)) * np.exp(-0.5 * (away / 0.3) ** 2)
     blur = np.full(3, 0.45)
     blur[1], blur[elevation_axis] = 0.2, 1.1
     return 10.0 * np.log10(gaussian_filter(power, blur / VOXEL_MM, truncate=3.0) + 1e-3)
@@ -69,26 +69,26 @@ def crossing_sweeps(
     side = max(LENGTH_MM, grid.width_mm) + 14.0 + grid.depth_mm * np.tan(np.deg2rad(fan_deg / 2.0))
     size = np.array([side, grid.depth_mm + 12.0, side])
     level, sheets = tissue(rng, size)
-    made = []
+    sweeps = []
     for number in range(2):
-        grey = seen_by(rng, level, sheets, 2 - 2 * number) if speckle else level
+        grey = grey_of(rng, level, sheets, 2 - 2 * number) if speckle else level
         poses = _path(rng, frames, fan_deg, crossing_deg * number, grid, size)
         images = _frames(grey, poses, grid)
         sensor = poses * MOUNTING.inv() * _jitter(rng, frames, jitter)
         time_s = np.arange(frames) * 0.04
-        made.append(Recording(images, grid, time_s, TimedPoses(time_s, sensor), name=f"sweep {number + 1}"))
-    return made[0], made[1], MOUNTING
+        sweeps.append(Recording(images, grid, time_s, TimedPoses(time_s, sensor), name=f"sweep {number + 1}"))
+    return sweeps[0], sweeps[1], MOUNTING
 
 
-def displaced(truth, rng, mm=20.0, deg=20.0):
+def displace(truth, rng, mm=20.0, deg=20.0):
     """A start, every parameter displaced at random."""
     turn = Rotation.from_euler("xyz", rng.uniform(-deg, deg, 3), degrees=True)
     return truth * RigidTransform.from_components(rng.uniform(-mm, mm, 3), turn)
 
 
-def centre_error_mm(found, truth, grid):
+def centre_error_mm(estimate, truth, grid):
     """How far the image's centre is off, along the image's own axes."""
-    return (truth.inv() * found).apply(grid.centre_mm) - grid.centre_mm
+    return (truth.inv() * estimate).apply(grid.centre_mm) - grid.centre_mm
 
 
 def _path(rng, frames, fan_deg, turn_deg, grid, size_mm):
@@ -96,13 +96,13 @@ def _path(rng, frames, fan_deg, turn_deg, grid, size_mm):
     s = np.linspace(-0.5, 0.5, frames) + 0.02 * np.sin(np.linspace(0, 9.0, frames) + rng.uniform(0, 6))
     wander = np.cumsum(rng.normal(0, 1, (frames, 6)), axis=0) / np.sqrt(frames)
     tilt = np.deg2rad(fan_deg) * s + 0.01 * wander[:, 3]
-    turned = rotation_from_fixed_angles(0.01 * wander[:, 5], 0.01 * wander[:, 4], tilt)
+    rotation = rotation_from_fixed_angles(0.01 * wander[:, 5], 0.01 * wander[:, 4], tilt)
     place = np.column_stack([0.5 * wander[:, 0], 0.3 * wander[:, 1], LENGTH_MM * s])
     middle = RigidTransform.from_translation([-grid.width_mm / 2.0, 0.0, 0.0])
     about = RigidTransform.from_components(
         [size_mm[0] / 2.0, 3.0, size_mm[2] / 2.0], Rotation.from_euler("y", turn_deg, degrees=True)
     )
-    return about * RigidTransform.from_components(place, turned) * middle
+    return about * RigidTransform.from_components(place, rotation) * middle
 
 
 def _frames(grey, poses, grid):

@@ -37,7 +37,7 @@ class PairCase:
         Factor on the contrast of everything in the tissue; 1 is usual, 0.3 poor.
     moved_mm : float
         RMS displacement of the tissue between the sweeps, smooth over 8 mm.
-    own : float
+    independent : float
         Share of the speckle's power that the sweeps do not share.
     stretch : float
         Standard deviation of the logarithm of the scale that both sweeps have wrong together.
@@ -53,16 +53,16 @@ class PairCase:
     frames: int = 150
     texture: float = 1.0
     moved_mm: float = 0.0
-    own: float = 0.3
+    independent: float = 0.3
     stretch: float = 0.08
     varying: float = 0.03
     turn_per_mm: float = 0.002
-    sensed: bool = False
-    mirrored: bool = False
+    with_sensor: bool = False
+    mirror: bool = False
 
 
 @dataclass(frozen=True)
-class MadePair:
+class TissuePair:
     """Two sweeps with their true poses in the tissue."""
 
     first: CrossingSweep
@@ -70,13 +70,13 @@ class MadePair:
     truth: tuple[RigidTransform, RigidTransform]
 
 
-def made_pair(case):
+def tissue_pair(case):
     """Make the two sweeps of a case."""
     rng = np.random.default_rng([case.seed, 611])
     strength = _strength(case, rng)
-    shared = rng.standard_normal((2, *strength.shape), np.float32)
-    shared_stretch = case.stretch * rng.standard_normal()
-    moved = _moved_field(rng, case.moved_mm)
+    common = rng.standard_normal((2, *strength.shape), np.float32)
+    common_stretch = case.stretch * rng.standard_normal()
+    displacement = _displacement_field(rng, case.moved_mm)
     heading = Rotation.from_rotvec([0.0, 0.0, rng.uniform(-np.pi, np.pi)])
     # The medium's y points down, the sensor's z up.
     world = heading * Rotation.from_matrix([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
@@ -84,18 +84,21 @@ def made_pair(case):
     sweeps, truths = [], []
     for number in (0, 1):
         truth = _hand(case, rng, number, sign * case.angle_deg)
-        own = rng.standard_normal(shared.shape, np.float32)
-        field = strength * (np.float32(np.sqrt(1 - case.own)) * shared + np.float32(np.sqrt(case.own)) * own)
-        stack = _imaged(field, truth, moved if number else 0.0 * moved, rng)
-        poses = _drifted(case, truth, shared_stretch, rng)
-        if case.mirrored and number:
+        fresh = rng.standard_normal(common.shape, np.float32)
+        weight = np.float32(np.sqrt([1 - case.independent, case.independent]))
+        field = strength * (weight[0] * common + weight[1] * fresh)
+        stack = _images(field, truth, displacement if number else 0.0 * displacement, rng)
+        poses = _drifting_poses(case, truth, common_stretch, rng)
+        if case.mirror and number:
             flip = np.diag([1.0, 1.0, -1.0, 1.0])
             poses = RigidTransform.from_matrix(flip @ poses.as_matrix() @ flip)
-        sensed = world * truth.rotation * _slow_errors(len(truth), rng, world, truth) if case.sensed else None
+        sensor = (
+            world * truth.rotation * _slow_errors(len(truth), rng, world, truth) if case.with_sensor else None
+        )
         name = ("first", "second")[number]
-        sweeps.append(CrossingSweep(name, stack, poses, GRID.centre_mm, 0.08, 0.002, sensed))
+        sweeps.append(CrossingSweep(name, stack, poses, GRID.centre_mm, 0.08, 0.002, sensor))
         truths.append(truth)
-    return MadePair(*sweeps, tuple(truths))
+    return TissuePair(*sweeps, tuple(truths))
 
 
 def _strength(case, rng):
@@ -135,7 +138,7 @@ def _smooth_noise(rng, shape, sigma_mm):
     return noise / noise.std()
 
 
-def _moved_field(rng, rms_mm):
+def _displacement_field(rng, rms_mm):
     """Displacement of the tissue on a grid of 1 mm, shape (3, x, y, z); no shift nor turn of the whole."""
     shape = tuple(np.round(SPACE_MM).astype(int) + 1)
     field = np.stack([gaussian_filter(rng.standard_normal(shape), 8.0 / np.sqrt(2.0)) for _ in range(3)])
@@ -144,9 +147,9 @@ def _moved_field(rng, rms_mm):
         - np.array(shape)[:, None, None, None] / 2
     )
     rows = [np.concatenate([np.eye(3), np.cross(np.eye(3), p)]) for p in places.reshape(3, -1).T[::7]]
-    seen = field.reshape(3, -1).T[::7]
-    found = np.linalg.lstsq(np.concatenate([r.T for r in rows]), seen.ravel(), rcond=None)[0]
-    field -= found[:3, None, None, None] + np.cross(found[3:], places, axisb=0, axisc=0)
+    values = field.reshape(3, -1).T[::7]
+    rigid = np.linalg.lstsq(np.concatenate([r.T for r in rows]), values.ravel(), rcond=None)[0]
+    field -= rigid[:3, None, None, None] + np.cross(rigid[3:], places, axisb=0, axisc=0)
     return rms_mm * field / np.sqrt((field**2).mean())
 
 
@@ -164,22 +167,22 @@ def _hand(case, rng, number, angle_deg):
     return path.medium_from_image(np.arange(case.frames) / FRAME_RATE_HZ)
 
 
-def _drifted(case, truth, stretch, rng):
+def _drifting_poses(case, truth, stretch, rng):
     """Poses as images give them: steps about the centre with errors, chained."""
-    centred = truth * RigidTransform.from_translation(GRID.centre_mm)
-    steps = centred[:-1].inv() * centred[1:]
-    moved, turns = steps.translation.copy(), steps.rotation.as_rotvec()
-    n, dz = len(moved), np.abs(moved[:, 2]).mean()
-    own = stretch + case.varying * rng.standard_normal() + case.varying * _walk(rng, n, 8.0 / dz)
-    scale = np.exp(-(own + 0.10 * rng.standard_normal(n)))
+    at_centre = truth * RigidTransform.from_translation(GRID.centre_mm)
+    steps = at_centre[:-1].inv() * at_centre[1:]
+    shift, turns = steps.translation.copy(), steps.rotation.as_rotvec()
+    n, dz = len(shift), np.abs(shift[:, 2]).mean()
+    log_scale = stretch + case.varying * rng.standard_normal() + case.varying * _walk(rng, n, 8.0 / dz)
+    scale = np.exp(-(log_scale + 0.10 * rng.standard_normal(n)))
     for axis in (0, 1):
         rate = case.turn_per_mm * (rng.standard_normal() + 0.5 * _walk(rng, n, 10.0 / dz))
-        turns[:, axis] -= rate * moved[:, 2] + 2e-4 * rng.standard_normal(n)
-    moved[:, 2] *= scale
-    moved[:, :2] += 0.002 * rng.standard_normal((n, 2))
+        turns[:, axis] -= rate * shift[:, 2] + 2e-4 * rng.standard_normal(n)
+    shift[:, 2] *= scale
+    shift[:, :2] += 0.002 * rng.standard_normal((n, 2))
     turns[:, 2] += 3e-5 * rng.standard_normal(n)
     poses, chain = [RigidTransform.identity()], RigidTransform.identity()
-    for step in RigidTransform.from_components(moved, Rotation.from_rotvec(turns)):
+    for step in RigidTransform.from_components(shift, Rotation.from_rotvec(turns)):
         chain = chain * step
         poses.append(chain)
     whole = RigidTransform.concatenate(poses)
@@ -203,7 +206,7 @@ def _slow_errors(n, rng, world, truth):
     return Rotation.from_rotvec(inside)
 
 
-def _imaged(field, truth, moved, rng):
+def _images(field, truth, displacement, rng):
     """Images as log-compressed stack."""
     stack = ImageStack(GRID)
     poses = truth.as_matrix()[:, :3]
@@ -217,7 +220,7 @@ def _imaged(field, truth, moved, rng):
     depth = GRID.first_sample_depth_mm + np.arange(GRID.samples) * GRID.sample_spacing_mm
     gain = 10 ** ((shade[:, :, None] + tilt_db * depth + rng.normal(0, 4.0)) / 10.0)
     noise = 10 ** (-2.2 + 0.05 * (depth - 20.0))
-    small = moved.astype(np.float32)
+    small = displacement.astype(np.float32)
     for number, pose in enumerate(poses):
         _echo(field, pose, small, focus, amplitude)
         intensity = (amplitude**2).sum(axis=0).reshape(GRID.vectors, GRID.samples, 2).mean(axis=2)
@@ -229,11 +232,11 @@ def _imaged(field, truth, moved, rng):
 
 
 @njit(cache=True, fastmath=True)
-def _echo(field, pose, moved, focus_mm, out):  # pragma: no cover
+def _echo(field, pose, displacement, focus_mm, out):  # pragma: no cover
     """Sum scatterers about every point of an image over the beam."""
     vectors, samples = out.shape[1], out.shape[2]
     nx, ny, nz = field.shape[1:]
-    mx, my, mz = moved.shape[1:]
+    mx, my, mz = displacement.shape[1:]
     for j in range(samples):
         y = 0.2 + (j / 2.0 - 0.25) * 0.35
         away = (y - focus_mm) / 10.0
@@ -248,9 +251,9 @@ def _echo(field, pose, moved, focus_mm, out):  # pragma: no cover
             m0 = min(max(int(p0 + 23.5), 0), mx - 1)
             m1 = min(max(int(p1 + 2.5), 0), my - 1)
             m2 = min(max(int(p2 + 23.5), 0), mz - 1)
-            p0 += moved[0, m0, m1, m2]
-            p1 += moved[1, m0, m1, m2]
-            p2 += moved[2, m0, m1, m2]
+            p0 += displacement[0, m0, m1, m2]
+            p1 += displacement[1, m0, m1, m2]
+            p2 += displacement[2, m0, m1, m2]
             for a in range(-3, 4):
                 ez = a * 0.75 * thick
                 wz = np.exp(-0.5 * (ez / thick) ** 2)

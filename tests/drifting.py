@@ -19,10 +19,10 @@ def wobble(rng, frames, amplitude, slowest=1.0, fastest=6.0):
 def hand_sweep(rng, frames=200, length_mm=20.0, turns=0):
     """True ``world_from_image``: uneven speed, 0.3 mm and 0.5 degrees of wobble, `turns` reversals."""
     speed = np.clip(1.0 + wobble(rng, frames, 0.25), 0.1, None)
-    travelled = np.concatenate([[0.0], np.cumsum(speed[1:])])
-    travelled *= (turns + 1) / travelled[-1]
-    leg = np.floor(travelled).astype(int)
-    z = length_mm * np.where(leg % 2 == 0, travelled - leg, 1.0 - travelled + leg)
+    travel = np.concatenate([[0.0], np.cumsum(speed[1:])])
+    travel *= (turns + 1) / travel[-1]
+    leg = np.floor(travel).astype(int)
+    z = length_mm * np.where(leg % 2 == 0, travel - leg, 1.0 - travel + leg)
     z[-1] = length_mm * ((turns + 1) % 2)
     position = np.stack([wobble(rng, frames, 0.3), wobble(rng, frames, 0.3), z], axis=1)
     roll, yaw, tilt = (np.deg2rad(wobble(rng, frames, 0.5)) for _ in range(3))
@@ -49,12 +49,12 @@ def drifting_poses(truth, rng):
     n = len(steps)
     at_centre = steps.apply(CENTRE_MM) - CENTRE_MM
     uneven = 1.0 + wobble(rng, n, 1.0 / 3.0, 0.3, 1.2)
-    moved = at_centre + rng.normal(0.0, 0.005, (n, 3))
-    moved[:, 2] += 0.15 * uneven * at_centre[:, 2]
+    shift = at_centre + rng.normal(0.0, 0.005, (n, 3))
+    shift[:, 2] += 0.15 * uneven * at_centre[:, 2]
     angles = np.deg2rad(rng.normal(0.0, 0.01, (n, 3)))
     angles[:, 0] += np.deg2rad(1.5) / 20.0 * uneven * at_centre[:, 2]
     rotation = steps.rotation * rotation_from_fixed_angles(angles[:, 2], angles[:, 1], angles[:, 0])
-    about_centre = RigidTransform.from_components(CENTRE_MM + moved, rotation)
+    about_centre = RigidTransform.from_components(CENTRE_MM + shift, rotation)
     return accumulate(about_centre * RigidTransform.from_translation(-CENTRE_MM))
 
 

@@ -32,43 +32,43 @@ class Scene(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """A recording from the first camera image to the last; `turns` is true wherever `known`."""
+    """A recording from the first camera image to the last; `turns` is true wherever `has_truth`."""
 
     log: ImuLog
     true_wxyz: np.ndarray
     moving: np.ndarray
     turns: Rotation
-    known: np.ndarray
+    has_truth: np.ndarray
 
 
 def scene(motion, kind, amount, rng):
     """A recording as it would be in such a field or of such a sensor."""
     if kind == "truncated":
-        return Scene(*truncated(motion, amount, rng))
+        return Scene(*truncate(motion, amount, rng))
     readings = FIELDS[kind](motion, amount, rng)
     residual = np.eye(3) + RESIDUAL * rng.standard_normal((3, 3))
     readings = readings @ residual.T + RESIDUAL * np.linalg.norm(EARTH_UT) * rng.standard_normal(3)
     readings = readings + NOISE_UT * rng.standard_normal(readings.shape)
-    log = with_readings(motion.log, magnetometer_au=np.where(motion.known[:, None], readings, np.nan))
+    log = with_readings(motion.log, magnetometer_au=np.where(motion.has_truth[:, None], readings, np.nan))
     return Scene(log, motion.true_wxyz, motion.moving)
 
 
-def with_readings(log, **changed):
-    kept = {name: getattr(log, name) for name in VECTORS}
-    return ImuLog(log.time_s, source=log.source, **(kept | changed))
+def with_readings(log, **changes):
+    readings = {name: getattr(log, name) for name in VECTORS}
+    return ImuLog(log.time_s, source=log.source, **(readings | changes))
 
 
 # -- motions
 
 
-def simulated(rng, seconds, rate_hz=100.0, period_s=2.0):
+def simulate_motion(rng, seconds, rate_hz=100.0, period_s=2.0):
     """The motion of a hand, in waves of a period and longer: at rest for 3 s, then turning and shifting."""
     time_s = np.arange(0.0, seconds, 1.0 / rate_hz)
     fade = np.clip((time_s - 3.0) / 1.0, 0.0, 1.0)[:, None]
     turns = Rotation.from_euler("ZYX", fade * wandering(time_s, rng, [0.9, 0.5, 0.5], period_s))
     shift_m = fade * wandering(time_s, rng, 0.1, period_s)
-    pushed = np.gradient(np.gradient(shift_m, time_s, axis=0), time_s, axis=0)
-    force = turns.inv().apply(pushed + np.array([0.0, 0.0, 9.81]))
+    acceleration_m_s2 = np.gradient(np.gradient(shift_m, time_s, axis=0), time_s, axis=0)
+    force = turns.inv().apply(acceleration_m_s2 + np.array([0.0, 0.0, 9.81]))
     rate = (turns[:-1].inv() * turns[1:]).as_rotvec() * rate_hz
     rate = np.vstack([rate[:1], rate]) + np.deg2rad(rng.normal(0.0, 0.3, 3))
     log = ImuLog(
@@ -103,7 +103,7 @@ def room_ut(motion, rng):
     return EARTH_UT + wandering(walked_s, rng, ROOM * np.linalg.norm(EARTH_UT), 7.0)
 
 
-def attached(motion, amount, rng):
+def iron_on_sensor(motion, amount, rng):
     """Iron and a magnet that turn with the sensor."""
     magnet_ut, soft = amount * direction(rng), np.eye(3) + 0.03 * rng.standard_normal((3, 3))
     return seen_by(motion, room_ut(motion, rng)) @ soft.T + magnet_ut
@@ -128,7 +128,7 @@ def drift(motion, amount, rng):
 
 
 FIELDS = {
-    "attached": attached,
+    "attached": iron_on_sensor,
     "start": start,
     "drift": drift,
 }
@@ -137,7 +137,7 @@ FIELDS = {
 # -- other gyroscopes: log, truth, where it moves
 
 
-def truncated(motion, amount, rng):
+def truncate(motion, amount, rng):
     """Coarser steps, cut toward zero, about another bias: at rest it differs from that in motion."""
     step = np.deg2rad(amount)
     rate = motion.log.gyroscope_rad_s + rng.uniform(-0.5, 0.5, 3) * step

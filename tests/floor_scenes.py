@@ -24,8 +24,8 @@ class Floor:
         self.size_mm = np.array([rng.uniform(30.0, 60.0), rng.uniform(50.0, 120.0)])
         self.pixel_mm = rng.uniform(0.08, 0.3, 2)
         self.mounting = RigidTransform.from_components(rng.uniform(-120, 120, 3), Rotation.random(rng=rng))
-        turned = Rotation.identity() if level else Rotation.random(rng=rng)
-        self.world_from_floor = RigidTransform.from_components(rng.uniform(-300, 300, 3), turned)
+        rotation = Rotation.identity() if level else Rotation.random(rng=rng)
+        self.world_from_floor = RigidTransform.from_components(rng.uniform(-300, 300, 3), rotation)
         reach = dict(zip(MOTIONS, (25.0, 15.0, 60.0, 0.3 * self.size_mm[1], 60.0, 60.0), strict=True))
         reach |= {name: STILL[name] for name in missing}
         self._hertz = np.exp(rng.uniform(np.log(0.05), np.log(0.5), (6, 4)))
@@ -42,8 +42,8 @@ class Floor:
     def image(self, time_s):
         """Pose of the image over the floor at z = 0."""
         tremor = np.sin(2 * np.pi * self._tremor_hz[:, None] * time_s + self._phase[:, :1])
-        moved = self._gain[:, None] * (self._swing(time_s) - self._middle[:, None])
-        tilt, roll, yaw, depth, x, y = moved + TREMOR[:, None] * tremor
+        motion = self._gain[:, None] * (self._swing(time_s) - self._middle[:, None])
+        tilt, roll, yaw, depth, x, y = motion + TREMOR[:, None] * tremor
         turn = about(2, np.deg2rad(yaw)) * BEAM_DOWN * about(2, np.deg2rad(roll)) * about(0, np.deg2rad(tilt))
         up = turn.inv().apply([0.0, 0.0, 1.0])
         # The line passes through this depth in the image's middle.
@@ -62,8 +62,8 @@ class Floor:
         """What the tracker says: white errors of 0.15 mm and 0.1 degrees, wandering ones of 0.3 and 0.2."""
         exact = self.world_from_floor * self.image(time_s) * self.mounting.inv()
         wander = self.rng.standard_normal((len(time_s), 6))
-        for i, kept in enumerate(np.exp(-np.abs(np.diff(time_s)) / DRIFT_S)):
-            wander[i + 1] = kept * wander[i] + np.sqrt(1.0 - kept**2) * wander[i + 1]
+        for i, memory in enumerate(np.exp(-np.abs(np.diff(time_s)) / DRIFT_S)):
+            wander[i + 1] = memory * wander[i] + np.sqrt(1.0 - memory**2) * wander[i + 1]
         white = self.rng.standard_normal((len(time_s), 6))
         mm, degrees = (
             size * white[:, part] + drifts * drift * wander[:, part]

@@ -39,43 +39,43 @@ def write_uff(path, frames, modulation_hz=0.0, scan="uff.linear_scan"):
         _put(group, "data", data)
         _put(group, "modulation_frequency", np.array([[modulation_hz]]))
         _put(group, "frame_rate", np.array([[1.0]]))
-        held = _object(group, "scan", scan)
+        part = _object(group, "scan", scan)
         for axis, values in (("x_axis", x), ("z_axis", z)):
-            _put(held, axis, values[None])
+            _put(part, axis, values[None])
         for axis, values in (("x", np.repeat(x, z.size)), ("z", np.tile(z, x.size))):
-            _put(held, axis, values[None])
-        held = _object(group, "pulse", "uff.pulse")
-        _put(held, "center_frequency", np.array([[6e6]]))
-        _put(held, "fractional_bandwidth", np.array([[0.5]]))
+            _put(part, axis, values[None])
+        part = _object(group, "pulse", "uff.pulse")
+        _put(part, "center_frequency", np.array([[6e6]]))
+        _put(part, "fractional_bandwidth", np.array([[0.5]]))
     return path
 
 
 def _object(group, name, kind):
-    made = group.create_group(name)
-    made.attrs.update({"class": kind, "name": name, "size": [1.0, 1.0], "array": 0.0})
-    return made
+    child = group.create_group(name)
+    child.attrs.update({"class": kind, "name": name, "size": [1.0, 1.0], "array": 0.0})
+    return child
 
 
 def _put(group, name, values):
     if np.iscomplexobj(values):
-        made = group.create_group(name)
-        made.attrs.update({"class": "single", "name": name, "complex": 1.0})
-        made["real"], made["imag"] = values.real.astype("f4"), values.imag.astype("f4")
+        child = group.create_group(name)
+        child.attrs.update({"class": "single", "name": name, "complex": 1.0})
+        child["real"], child["imag"] = values.real.astype("f4"), values.imag.astype("f4")
         return
     group[name] = values.astype("f4")
     group[name].attrs.update({"class": "single", "name": name, "complex": 0.0, "imaginary": 0.0})
 
 
-def write_ultrasonix(path, frames, kind=16, tags=False, **given):
+def write_ultrasonix(path, frames, kind=16, tags=False, **fields):
     """Write `frames` (frame, vector, sample) after 19 integers; rows lie together in images (type 4)."""
     n, width, height = frames.shape
     bits = 8 * frames.itemsize
-    values = {"probe": 2, "transmit_hz": 6_660_000, "sampling_hz": 40_000_000, "rate": 31} | given
+    values = {"probe": 2, "transmit_hz": 6_660_000, "sampling_hz": 40_000_000, "rate": 31} | fields
     head = [kind, n, width, height, bits, 0, 0, width - 1, 0, width - 1, height - 1, 0, height - 1]
     head += [values["probe"], values["transmit_hz"], values["sampling_hz"], values["rate"], 128, 0]
-    turned = frames.transpose(0, 2, 1) if kind == 4 else frames
+    images = frames.transpose(0, 2, 1) if kind == 4 else frames
     parts = [struct.pack("<19i", *head)]
-    for i, frame in enumerate(turned):
+    for i, frame in enumerate(images):
         parts += [struct.pack("<i", i)] * tags + [np.ascontiguousarray(frame).tobytes()]
     path.write_bytes(b"".join(parts))
     return path
@@ -100,11 +100,11 @@ BOX = ("RegionLocationMinX0", "RegionLocationMinY0", "RegionLocationMaxX1", "Reg
 def region(left, top, right, bottom, **changes):
     from pydicom.dataset import Dataset
 
-    made = Dataset()
+    area = Dataset()
     for name, value in (TISSUE | dict(zip(BOX, (left, top, right, bottom), strict=True)) | changes).items():
         if value is not None:
-            setattr(made, name, value)
-    return made
+            setattr(area, name, value)
+    return area
 
 
 def write_dicom(
@@ -123,41 +123,41 @@ def write_dicom(
     meta.MediaStorageSOPClassUID = UltrasoundMultiFrameImageStorage
     meta.MediaStorageSOPInstanceUID = generate_uid(entropy_srcs=["speckle3d"])
     meta.TransferSyntaxUID = ExplicitVRLittleEndian
-    made = FileDataset(None, {}, file_meta=meta, preamble=b"\0" * 128)
-    made.SOPClassUID, made.SOPInstanceUID = meta.MediaStorageSOPClassUID, meta.MediaStorageSOPInstanceUID
-    made.Modality, made.Manufacturer, made.PatientName = "US", "Someone", "Doe^Jane"
-    made.NumberOfFrames, made.Rows, made.Columns = images.shape[:3]
-    made.SamplesPerPixel = images.shape[3] if images.ndim == 4 else 1
+    file = FileDataset(None, {}, file_meta=meta, preamble=b"\0" * 128)
+    file.SOPClassUID, file.SOPInstanceUID = meta.MediaStorageSOPClassUID, meta.MediaStorageSOPInstanceUID
+    file.Modality, file.Manufacturer, file.PatientName = "US", "Someone", "Doe^Jane"
+    file.NumberOfFrames, file.Rows, file.Columns = images.shape[:3]
+    file.SamplesPerPixel = images.shape[3] if images.ndim == 4 else 1
     if images.ndim == 4:
-        made.PlanarConfiguration = 0
-    made.PhotometricInterpretation = photometric
-    made.BitsAllocated = made.BitsStored = 8 * images.itemsize
-    made.HighBit, made.PixelRepresentation = 8 * images.itemsize - 1, 0
+        file.PlanarConfiguration = 0
+    file.PhotometricInterpretation = photometric
+    file.BitsAllocated = file.BitsStored = 8 * images.itemsize
+    file.HighBit, file.PixelRepresentation = 8 * images.itemsize - 1, 0
     if regions:
-        made.SequenceOfUltrasoundRegions = Sequence(regions)
+        file.SequenceOfUltrasoundRegions = Sequence(regions)
     for name, value in ({"FrameTime": 40.0} | elements).items():
         if value is not None:
-            setattr(made, name, value)
-    made.PixelData = images.tobytes()
-    made.save_as(path, enforce_file_format=True)
+            setattr(file, name, value)
+    file.PixelData = images.tobytes()
+    file.save_as(path, enforce_file_format=True)
     return path
 
 
 def write_zea(path, frames, kind="beamformed_data", scan=()):
     """Write `frames` (frame, vector, sample) as zea 0.0.12 does."""
-    turned = frames.transpose(0, 2, 1)
+    values = frames.transpose(0, 2, 1)
     if kind == "beamformed_data":
-        parts = (turned.real, turned.imag) if np.iscomplexobj(frames) else (turned,)
-        turned = np.stack(parts, axis=-1).astype("f4")
+        parts = (values.real, values.imag) if np.iscomplexobj(frames) else (values,)
+        values = np.stack(parts, axis=-1).astype("f4")
     x, z = axes(*frames.shape[1:])
     positions = np.stack([*np.broadcast_arrays(x[None], 0.0, z[:, None])], axis=-1)
-    given = {"sound_speed": 1480.0, "center_frequency": 6e6, "demodulation_frequency": 6e6} | dict(scan)
+    fields = {"sound_speed": 1480.0, "center_frequency": 6e6, "demodulation_frequency": 6e6} | dict(scan)
     with h5py.File(path, "a") as file:
         file.attrs.update({"zea_version": "0.0.12", "probe_name": "L11-4v"})
         group = file.create_group(f"data/{kind}")
-        group.create_dataset("values", data=turned, compression="gzip", chunks=(1, *turned.shape[1:]))
+        group.create_dataset("values", data=values, compression="gzip", chunks=(1, *values.shape[1:]))
         group["coordinates"] = np.broadcast_to(positions, (len(frames), *positions.shape)).astype("f4")
-        for name, value in given.items():
+        for name, value in fields.items():
             if value is not None:
                 file[f"scan/{name}"] = np.asarray(value, "f4")
     return path
@@ -190,11 +190,11 @@ def write_mat(path, new=False, **variables):
 
 def _old(value):
     if isinstance(value, dict):
-        return {name: _old(each) for name, each in value.items()}
+        return {name: _old(element) for name, element in value.items()}
     if isinstance(value, list):
         cell = np.empty((1, len(value)), dtype=object)
-        for i, each in enumerate(value):
-            cell[0, i] = _old(each)
+        for i, element in enumerate(value):
+            cell[0, i] = _old(element)
         return cell
     return value
 
@@ -211,17 +211,17 @@ def _write_mat_73(path, variables):
 
 def _put_73(file, group, name, value):
     if isinstance(value, dict):
-        made = group.create_group(name)
-        made.attrs["MATLAB_class"] = np.bytes_("struct")
-        for field, each in value.items():
-            _put_73(file, made, field, each)
+        child = group.create_group(name)
+        child.attrs["MATLAB_class"] = np.bytes_("struct")
+        for field, element in value.items():
+            _put_73(file, child, field, element)
         return
     if isinstance(value, list):
-        held = file.require_group("#refs#")
-        names = [f"r{len(held) + i}" for i in range(len(value))]
-        for each, element in zip(names, value, strict=True):
-            _put_73(file, held, each, element)
-        data = np.array([[held[each].ref] for each in names], dtype=h5py.ref_dtype)
+        refs = file.require_group("#refs#")
+        names = [f"r{len(refs) + i}" for i in range(len(value))]
+        for ref, element in zip(names, value, strict=True):
+            _put_73(file, refs, ref, element)
+        data = np.array([[refs[ref].ref] for ref in names], dtype=h5py.ref_dtype)
         group.create_dataset(name, data=data).attrs["MATLAB_class"] = np.bytes_("cell")
         return
     values = np.array([list(map(ord, value))], "u2") if isinstance(value, str) else np.atleast_2d(value)

@@ -17,19 +17,20 @@ BURST, OF = 4, 9
 def handheld(sweep):
     """The sweep as such a scanner records it: one clock, the sensor in bursts, its mounting not known."""
     sensor, start = sweep.orientation, sweep.frame_time_s[0] - 5.0
-    kept = np.arange(len(sensor.readings)) % OF < BURST
-    turned = TimedRotations(
-        sensor.readings.time_s[kept] + sensor.time_offset_s - start, sensor.readings.world_from_sensor[kept]
+    burst = np.arange(len(sensor.readings)) % OF < BURST
+    readings = TimedRotations(
+        sensor.readings.time_s[burst] + sensor.time_offset_s - start,
+        sensor.readings.world_from_sensor[burst],
     )
     vectors = {
-        name: getattr(sensor, name)[kept]
+        name: getattr(sensor, name)[burst]
         for name in ("accelerometer_m_s2", "gyroscope_rad_s", "magnetometer_au")
     }
-    inside = replace(sensor, readings=turned, sensor_from_image=None, time_offset_s=0.0, **vectors)
+    inside = replace(sensor, readings=readings, sensor_from_image=None, time_offset_s=0.0, **vectors)
     times = sweep.frame_time_s - start
     return replace(sweep, frame_time_s=times, orientation=inside, tracker=None, truth=None)
 
 
 def write_handheld(path, sweep, element_mm=PITCH_MM):
     """Write the sweep's package, packed, under the file's own name."""
-    return write_package(path, handheld(sweep), packed=True, element_mm=element_mm, name=path.stem)
+    return write_package(path, handheld(sweep), lzop=True, element_mm=element_mm, name=path.stem)

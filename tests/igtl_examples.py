@@ -10,21 +10,21 @@ from pyigtl.messages import CRC64
 from speckle3d.io.igtl.messages import HEADER, body_bytes, decode
 
 
-def image(columns=6, rows=9, dtype=np.int16, version=1, **said):
+def image(columns=6, rows=9, dtype=np.int16, version=1, **fields):
     """An IMAGE of pyigtl, the pixels (column, row) in it, and where they lie."""
     pixels = np.random.default_rng(0).integers(0, 200, (columns, rows)).astype(dtype)
     place = np.array([[0.0, 0, 2, 1], [0.3, 0, 0, 2], [0, 0.1, 0, 3], [0, 0, 0, 1]])
-    message = pyigtl.ImageMessage(pixels.T[None], place, said.pop("world", "ras"), 12.25, "Image_Reference")
-    message.header_version, message.metadata = version, said
+    message = pyigtl.ImageMessage(pixels.T[None], place, fields.pop("world", "ras"), 12.25, "Image_Reference")
+    message.header_version, message.metadata = version, fields
     return message.pack(), pixels, place
 
 
-def transform(device="ProbeToTracker", version=1, **said):
+def transform(device="ProbeToTracker", version=1, **fields):
     """A TRANSFORM of pyigtl and its matrix."""
     matrix = np.eye(4)
     matrix[:3] += np.random.default_rng(1).normal(0, 1, (3, 4))
     message = pyigtl.TransformMessage(matrix, 12.5, device)
-    message.header_version, message.metadata = version, said
+    message.header_version, message.metadata = version, fields
     return message.pack(), matrix
 
 
@@ -38,16 +38,16 @@ def with_body(message, body):
     return HEADER.pack(*fields) + body
 
 
-def decoded(message):
+def decode_whole(message):
     """A packed message as we read it; of a STRING, the words behind its type."""
     start, body = message[: HEADER.size], message[HEADER.size :]
     body_bytes(start)
-    got = decode(start, body)
-    is_text = getattr(got, "type", "") == "STRING"
-    return replace(got, type=f"STRING {body[4:].decode()}") if is_text else got
+    content = decode(start, body)
+    is_text = getattr(content, "type", "") == "STRING"
+    return replace(content, type=f"STRING {body[4:].decode()}") if is_text else content
 
 
-def changed(at, form, *values):
+def with_values(at, form, *values):
     """An image with other bytes in its body, and their check sum."""
     message = image()[0]
     body = bytearray(message[HEADER.size :])

@@ -60,14 +60,14 @@ def raw_values(s, unit, first=0):
     }
 
 
-def framed(payloads, mid=MessageId.MT_DATA):
+def frame_payloads(payloads, mid=MessageId.MT_DATA):
     """Messages of one kind, a list so that tests can lose some."""
     return [encode(Message(mid, bytes(payload))) for payload in payloads]
 
 
 def mt9_records(s, unit, first=0):
     """Records of an MT9-B."""
-    return framed(mtdata_payloads(DataLayout(OutputMode.MT9), raw_values(s, unit, first)))
+    return frame_payloads(mtdata_payloads(DataLayout(OutputMode.MT9), raw_values(s, unit, first)))
 
 
 def mt9_bin(s, unit, first=0):
@@ -76,7 +76,7 @@ def mt9_bin(s, unit, first=0):
     return encode(calibration_message(unit)) + records[0][-15:] + b"".join(records)
 
 
-def configured(layout, period=1152):
+def configuration(layout, period=1152):
     """The answer to a request for the configuration."""
     return encode(configuration_message([(layout.mode, layout.settings)], period))
 
@@ -84,15 +84,15 @@ def configured(layout, period=1152):
 def legacy_values(s, layout, first=0):
     """Everything a layout may ask for, by field name; orientation in the layout's world."""
     m = len(s["time_s"])
-    turned = s["world_from_sensor"]
+    rotation = s["world_from_sensor"]
     if layout.frame == "NED":
-        turned = Rotation.from_euler("x", np.pi) * turned
+        rotation = Rotation.from_euler("x", np.pi) * rotation
     return {
         **{name: s[name] for name in ("accelerometer_m_s2", "gyroscope_rad_s", "magnetometer_au")},
         "temperature_c": np.full((m, 1), 31.25),
-        "quaternion_wxyz": turned.as_quat(scalar_first=True),
-        "euler_deg": turned.as_euler("xyz", degrees=True),
-        "matrix": turned.as_matrix().reshape(m, 9),
+        "quaternion_wxyz": rotation.as_quat(scalar_first=True),
+        "euler_deg": rotation.as_euler("xyz", degrees=True),
+        "matrix": rotation.as_matrix().reshape(m, 9),
         "analog_1": np.full((m, 1), 17),
         "analog_2": np.full((m, 1), 18),
         "position": np.tile([52.25, 6.75, 30.5], (m, 1)),
@@ -105,7 +105,7 @@ def legacy_values(s, layout, first=0):
 
 def legacy_messages(s, layout, first=0):
     """Messages of an MTi in legacy mode."""
-    return framed(mtdata_payloads(layout, legacy_values(s, layout, first)))
+    return frame_payloads(mtdata_payloads(layout, legacy_values(s, layout, first)))
 
 
 WORLDS = {
@@ -118,12 +118,12 @@ WORLDS = {
 
 def items_of(s, i, form=0, world="ENU", orientation="quaternion", ticks=100, first_tick=0, first=0):
     """Items of sample `i`: counter, time, acceleration, rate, field, orientation."""
-    turned = WORLDS[world] * s["world_from_sensor"][i]
+    rotation = WORLDS[world] * s["world_from_sensor"][i]
     bits = form | ("ENU", "NED", "NWU").index(world) << 2
     shape = {
-        "quaternion": (0x2010, turned.as_quat(scalar_first=True)),
-        "matrix": (0x2020, turned.as_matrix().T.ravel()),
-        "euler": (0x2030, turned.as_euler("xyz", degrees=True)),
+        "quaternion": (0x2010, rotation.as_quat(scalar_first=True)),
+        "matrix": (0x2020, rotation.as_matrix().T.ravel()),
+        "euler": (0x2030, rotation.as_euler("xyz", degrees=True)),
     }[orientation]
     return [
         Item(0x1020, ((first + i) % 65536,)),
@@ -138,4 +138,4 @@ def items_of(s, i, form=0, world="ENU", orientation="quaternion", ticks=100, fir
 def mtdata2_messages(s, **how):
     """Messages of an MTi with MTData2."""
     payloads = [items_payload(items_of(s, i, **how)) for i in range(len(s["time_s"]))]
-    return framed(payloads, MessageId.MT_DATA2)
+    return frame_payloads(payloads, MessageId.MT_DATA2)

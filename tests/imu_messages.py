@@ -81,5 +81,5 @@ def calibration_message(unit):
 
 def counts_of(unit, values):
     """Raw counts, shape (n, 3, 3), that the calibration takes to `values`, shape (3, n, 3)."""
-    sensed = np.stack([values[i] @ unit.misalignments[i].T for i in range(3)], axis=1)
-    return np.clip(np.round(sensed * unit.gains + unit.offsets), 0, 0xFFFF).astype(np.uint16)
+    outputs = np.stack([values[i] @ unit.misalignments[i].T for i in range(3)], axis=1)
+    return np.clip(np.round(outputs * unit.gains + unit.offsets), 0, 0xFFFF).astype(np.uint16)

@@ -48,9 +48,9 @@ def sensors():
     }
 
 
-def sweep(frames, signal=RF, **more):
+def sweep(frames, signal=RF, **fields):
     """A sweep of the common grid and clock."""
-    return Sweep(frames, GRID, signal, np.arange(N) / 25, **more)
+    return Sweep(frames, GRID, signal, np.arange(N) / 25, **fields)
 
 
 def sweeps():
@@ -107,11 +107,11 @@ def calibrations():
         "plane", "tracker", TURNS[1], np.array([1.0, 2, 3]), np.array([0.1, 0.11]), np.eye(6), parameters,
         0.3, "mm", np.inf, frames, 0.02, "the motion was sufficient", source,
     )  # fmt: skip
-    turned = Calibration(
+    orientation = Calibration(
         "orientation", "orientation", TURNS[2], None, None, 1e-4 * np.eye(3), (), 0.2, "deg", 12.0,
         FramesUsed(2, (0, 1)),
     )  # fmt: skip
-    return {"calibration": whole, "calibration_orientation": turned}
+    return {"calibration": whole, "calibration_orientation": orientation}
 
 
 def pairs():

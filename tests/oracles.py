@@ -151,7 +151,7 @@ def coherence(ramp_rad):
 
     def alike(a, b, places):
         energy = np.vdot(a, a).real * np.vdot(b, b).real
-        aligned = b * np.exp(1j * places @ ramp_rad)
-        return np.abs(np.vdot(a, aligned)) ** 2 / energy if energy > 0 else np.nan
+        without_ramp = b * np.exp(1j * places @ ramp_rad)
+        return np.abs(np.vdot(a, without_ramp)) ** 2 / energy if energy > 0 else np.nan
 
     return alike

@@ -11,7 +11,7 @@ ROOT = Path(__file__).parents[1]
 _FENCE = re.compile(r"^```(\w+)[^\n]*\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 _TIMEOUT_S = 1800
-_LEFT_OUT = ("pip ", "python -m pytest")
+_OMISSIONS = ("pip ", "python -m pytest")
 
 
 def blocks(page):
@@ -21,8 +21,8 @@ def blocks(page):
 
 def shown_commands(page):
     """Command lines behind a `$` in blocks that are shown, continued lines joined."""
-    shown = "".join(text for language, text in blocks(page) if language == "console")
-    return [line[2:] for line in shown.replace("\\\n", " ").splitlines() if line.startswith("$ ")]
+    console = "".join(text for language, text in blocks(page) if language == "console")
+    return [line[2:] for line in console.replace("\\\n", " ").splitlines() if line.startswith("$ ")]
 
 
 def run_page(page, folder):
@@ -30,7 +30,7 @@ def run_page(page, folder):
 
     Installing is left out, as the tests run installed; so is the command that runs the tests.
     """
-    return "".join(printed for language, _, printed in ran(page, folder) if language in ("sh", "python"))
+    return "".join(output for language, _, output in ran(page, folder) if language in ("sh", "python"))
 
 
 def ran(page, folder):
@@ -60,12 +60,12 @@ def ran(page, folder):
         else:
             yield language, text, ""
             continue
-        done = subprocess.run(
+        process = subprocess.run(
             arguments, cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
             text=True, timeout=_TIMEOUT_S,
         )  # fmt: skip
-        assert done.returncode == 0, f"{page.name}:\n{text}\n{done.stdout}"
-        yield language, text, done.stdout
+        assert process.returncode == 0, f"{page.name}:\n{text}\n{process.stdout}"
+        yield language, text, process.stdout
 
 
 def _after(before, text):
@@ -78,11 +78,11 @@ def _after(before, text):
 
 
 def _without_installing(text):
-    kept = []
+    lines = []
     for line in text.splitlines():
-        parts = [part for part in line.split(" && ") if not part.lstrip().startswith(_LEFT_OUT)]
-        kept.append(" && ".join(parts))
-    return "\n".join(kept)
+        parts = [part for part in line.split(" && ") if not part.lstrip().startswith(_OMISSIONS)]
+        lines.append(" && ".join(parts))
+    return "\n".join(lines)
 
 
 def run_tutorial(name, tmp_path):

@@ -35,8 +35,8 @@ def fit(problem, rho, shift_mm=(0.0, 0.0), share=None, gain=None, **priors):
     """Plane of one pair, from correlations of shape (p,); None if they determine none."""
     alone = {name: np.asarray(value)[None] for name, value in priors.items()}
     models = None if share is None else EchoModels(share[None], gain[None])
-    planes, is_determined = fit_many(problem, np.asarray(rho)[None], shift_mm, models=models, **alone)
-    if not is_determined[0]:
+    planes, has_plane = fit_many(problem, np.asarray(rho)[None], shift_mm, models=models, **alone)
+    if not has_plane[0]:
         return None
     offset, slope_x, slope_y = planes.coefficients[0]
     fields = {name: value[0] for name, value in vars(planes).items()}

@@ -22,12 +22,12 @@ def place(page, column, row, name="picture"):
     return at["x"] + share[0] * at["width"], at["y"] + share[1] * at["height"]
 
 
-def told(page, name, wanted):
+def text_match(page, name, pattern):
     """Wait until the page says something, a pattern; returns its match."""
-    found = re.compile(wanted)
+    regex = re.compile(pattern)
     where = page.locator(f".{name}")
-    where.filter(has_text=found).first.wait_for()
-    return found.search(where.inner_text())
+    where.filter(has_text=regex).first.wait_for()
+    return regex.search(where.inner_text())
 
 
 def run_and_save(page, name):
@@ -43,13 +43,13 @@ def run_and_save(page, name):
     return page.locator("pre.calibration").inner_text()
 
 
-def by_command(saved, out):
+def by_command(result, out):
     """What the command that a saved calibration's report names writes elsewhere, and prints."""
-    line = saved.with_suffix(".txt").read_text().split("made by: ")[1].strip()
+    line = result.with_suffix(".txt").read_text().split("made by: ")[1].strip()
     words = shlex.split(line)
     assert words[0] == "speckle3d"
     words[words.index("-o") + 1] = str(out)
     command = [sys.executable, "-m", "speckle3d.cli", *words[1:]]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
-    assert done.returncode == 0, done.stderr
-    return done.stdout.split("made by: ")[0].strip()
+    process = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert process.returncode == 0, process.stderr
+    return process.stdout.split("made by: ")[0].strip()

@@ -36,10 +36,10 @@ def floor_recording(path):
 
 def wire_recording(path, config):
     """Write a recording of N-wires and PLUS's configuration of them; returns the scene."""
-    shown = scene(4, 16)
-    images = np.stack([picture(pixels, seed=i) for i, pixels in enumerate(shown.pixels)])
-    _write(path, images, WIRE_PIXEL_MM, shown.world_from_sensor)
-    phantom = shown.phantom
+    sequence = scene(4, 16)
+    images = np.stack([picture(pixels, seed=i) for i, pixels in enumerate(sequence.pixels)])
+    _write(path, images, WIRE_PIXEL_MM, sequence.world_from_sensor)
+    phantom = sequence.phantom
     patterns = []
     for pattern in phantom.patterns:
         wires = "".join(
@@ -56,7 +56,7 @@ def wire_recording(path, config):
         f"<PlusConfiguration><PhantomDefinition><Geometry>{''.join(patterns)}</Geometry>"
         "</PhantomDefinition></PlusConfiguration>"
     )
-    return shown
+    return sequence
 
 
 def _write(path, images, pixel_mm, poses):

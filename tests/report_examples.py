@@ -37,12 +37,12 @@ def small_study(folder, sweeps):
     shutil.copytree(folder / "sweeps" / "forward-0a", folder / "sweeps" / "gone-0b")
     doubt = Doubt("tracker", "units <in> metres", "expected 3 mm, got 0.003", True)
     drift = [{"mode": "image", "FDR_percent": 12.34, "GPE_mm": 0.5, "EA_deg": None}]
-    own = replace(job.summary, sweep="forward", drift=drift, doubts=[doubt])
+    summary = replace(job.summary, sweep="forward", drift=drift, doubts=[doubt])
     sha256 = sha256_of(source)
     study = Study(
         folder,
         [
-            SweepOutcome("forward", source, "", sha256, "0a", "sweeps/forward-0a", summary=own),
+            SweepOutcome("forward", source, "", sha256, "0a", "sweeps/forward-0a", summary=summary),
             SweepOutcome(HOSTILE, folder / "gone.h5", "", sha256, "0b", "sweeps/gone-0b",
                          summary=replace(job.summary, sweep=HOSTILE, drift=(), doubts=())),
             SweepOutcome("torn", folder / "torn.h5", REASON),

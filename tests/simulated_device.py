@@ -57,10 +57,10 @@ def values(index, rate_hz, iron=0.0):
     )
 
 
-def of_kind(*kinds, **more):
+def of_kind(*kinds, **options):
     """Run a test that takes `sensor` with each of some kinds."""
     return pytest.mark.parametrize(
-        "sensor", [{"kind": kind, **more} for kind in kinds], indirect=True, ids=kinds
+        "sensor", [{"kind": kind, **options} for kind in kinds], indirect=True, ids=kinds
     )
 
 
@@ -206,7 +206,7 @@ class SimulatedDevice:
             if self.mode & 0x4:
                 payload += struct.pack(">4f", *q)
             return frame(0x32, payload + (struct.pack(">H", counter) if self.settings & 1 else b""))
-        return frame(0x36, b"".join(self._item(each, index, counter) for each, _ in self.outputs))
+        return frame(0x36, b"".join(self._item(identifier, index, counter) for identifier, _ in self.outputs))
 
     def _item(self, identifier, index, counter):
         acc, gyr, mag, q = values(index, self.rate_hz, self.iron)
@@ -245,9 +245,9 @@ class SimulatedDevice:
                 return
             else:
                 message, self._buffer = self._buffer[:size], self._buffer[size:]
-                self._heed(message[2], message[4:-1])
+                self._obey(message[2], message[4:-1])
 
-    def _heed(self, mid, payload):
+    def _obey(self, mid, payload):
         if mid == 0x30 or (mid == 0x3F and self.state == ASLEEP):
             self.state = CONFIGURATION
             if mid == 0x30:

@@ -57,16 +57,13 @@ class Pairs:
         return self.pairs[index].astype(np.float32).view(np.complex64)[..., 0]
 
 
-def iq_sweep(paired=True, frames=6):
+def iq_sweep(frames=6):
     rng = np.random.default_rng(0)
     pairs = rng.integers(-32768, 32768, (frames, 5, 40, 2)).astype(np.int16)
     signal = replace(RF, sampling_rate_hz=10e6, demodulation_frequency_hz=6e6)
     plain = rf_sweep(frames)
     grid = replace(plain.grid, sample_spacing_mm=signal.sample_spacing_mm)
-    held = Pairs(pairs)
-    if not paired:
-        held = (np.stack([held[i] for i in range(frames)]) / 7).astype(np.complex64)
-    return replace(plain, frames=held, grid=grid, signal=signal)
+    return replace(plain, frames=Pairs(pairs), grid=grid, signal=signal)
 
 
 def bmode_sweep(frames=4):

@@ -20,14 +20,14 @@ PUBLIC = [
 
 def section(doc, *titles):
     """Lines of sections of a numpydoc docstring."""
-    found = []
+    lines = []
     for title in titles:
         match = re.search(rf"^{title}\n-+\n(.*?)(?=^\w[^\n]*\n-+\n|\Z)", doc, re.MULTILINE | re.DOTALL)
-        found += match[1].splitlines() if match else []
-    return found
+        lines += match[1].splitlines() if match else []
+    return lines
 
 
-def named(doc, *titles):
+def entry_names(doc, *titles):
     """Names that stand at the beginning of a section's entries, several to an entry by commas."""
     entries = [line.split(" : ")[0] for line in section(doc, *titles) if line and not line.startswith(" ")]
     return {name.strip().lstrip("*") for entry in entries for name in entry.split(",")}
@@ -39,11 +39,11 @@ def test_it_says_what_it_takes_and_gives(thing):
     assert doc.strip()
     if inspect.isfunction(thing):
         parameters = inspect.signature(thing).parameters
-        missing = set(parameters) - named(doc, "Parameters", "Other Parameters")
+        missing = set(parameters) - entry_names(doc, "Parameters", "Other Parameters")
         assert not missing
         gives = inspect.signature(thing).return_annotation
         if gives not in (None, "None"):
             assert section(doc, "Returns", "Yields") or doc.split()[0] in ("Whether",), "Returns"
     elif is_dataclass(thing) and not issubclass(thing, BaseModel):
-        public = {each.name for each in fields(thing) if not each.name.startswith("_")}
-        assert not public - named(doc, "Parameters", "Attributes")
+        public = {field.name for field in fields(thing) if not field.name.startswith("_")}
+        assert not public - entry_names(doc, "Parameters", "Attributes")

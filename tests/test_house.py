@@ -31,8 +31,8 @@ def test_importing_a_package_loads_nothing_heavy(python, code):
 
 def test_the_errors_load_nothing_heavy_and_the_core_only_numpy_and_scipy(python):
     assert loaded_after(python, "from speckle3d import Speckle3DError", HEAVY) == []
-    found = loaded_after(python, "from speckle3d import Sweep", HEAVY)
-    assert set(found) <= {"numpy", "scipy"}
+    modules = loaded_after(python, "from speckle3d import Sweep", HEAVY)
+    assert set(modules) <= {"numpy", "scipy"}
 
 
 def test_every_module_of_the_sensor_package_stays_clear_of_numba_and_h5py(python, project):
@@ -54,11 +54,11 @@ def test_the_version_is_the_distributions_and_a_misspelt_name_an_attribute_error
 
 
 def test_the_version_stands_in_one_place(project):
-    cited = re.search(
+    citation = re.search(
         r"^version: (\S+)$", (project / "CITATION.cff").read_text(encoding="utf-8"), re.MULTILINE
     )
     settings = tomllib.loads((project / "pyproject.toml").read_text(encoding="utf-8"))
-    assert cited[1] == settings["project"]["version"]
+    assert citation[1] == settings["project"]["version"]
 
 
 def test_every_kernel_says_how_it_is_rounded_and_is_kept(project):
@@ -73,7 +73,7 @@ def test_every_kernel_says_how_it_is_rounded_and_is_kept(project):
     assert len(uses) > 60
     assert [words for words, _ in uses if "fastmath" not in words] == []
     # Called at once, it compiles a function a second time.
-    assert [words for words, called in uses if ("cache=True" in words) == bool(called)] == []
+    assert [words for words, call in uses if ("cache=True" in words) == bool(call)] == []
 
 
 def examples(page):

@@ -16,12 +16,12 @@ named_page = pytest.mark.parametrize("page", PAGES, ids=[page.stem for page in P
 
 def settings_in(text):
     """Group and name of each setting in a page, and the number in parentheses behind it, if any."""
-    found = re.findall(
+    mentions = re.findall(
         r"([a-z]+)\.([a-z_]+)\b(?:`|\})(?:\s(?:\(|\| )([-\d.]+)(?=[\s),;]))?", text.replace("\\_", "_")
     )
     return [
         (group, name, value)
-        for group, name, value in found
+        for group, name, value in mentions
         if group in SETTINGS and name not in ("md", "png", "py")
     ]
 
@@ -32,8 +32,8 @@ def test_settings_of_a_page_exist_with_the_defaults_it_gives(page):
         assert name in SETTINGS[group], f"{page.name}: {group}.{name}"
         default = SETTINGS[group][name]
         if value and isinstance(default, (int, float)):
-            shown = pytest.approx(float(value))
-            assert shown in (default, 100 * default), f"{page.name}: {group}.{name}"
+            number = pytest.approx(float(value))
+            assert number in (default, 100 * default), f"{page.name}: {group}.{name}"
 
 
 @named_page
@@ -45,5 +45,5 @@ def test_modules_that_a_page_names_exist(page):
         r"`((?:speckle3d|calibration|xsens)/[\w/]+)` \((`\w+`(?:, `\w+`)*)\)", text
     ):
         for name in re.findall(r"`(\w+)`", names):
-            there = ROOT / folder / name
-            assert there.is_dir() or there.with_suffix(".py").exists(), f"{page.name}: {folder}/{name}"
+            module = ROOT / folder / name
+            assert module.is_dir() or module.with_suffix(".py").exists(), f"{page.name}: {folder}/{name}"

@@ -46,7 +46,7 @@ def test_curves_of_other_depths_are_refused(part, curves):
 
 
 def test_curves_and_sweep_at_another_sampling_rate_are_refused(part, curves):
-    resampled = at_rate(part, 2.0)
-    key = replace(curves.key, signal=resampled.signal)
+    fast = at_rate(part, 2.0)
+    key = replace(curves.key, signal=fast.signal)
     with pytest.raises(MismatchError, match=r"^phantom: (images: expected echoes|the curves do not match)"):
-        track(resampled, replace(curves, key=key))
+        track(fast, replace(curves, key=key))

@@ -23,12 +23,12 @@ def poses_of(tracking, sweep):
 
 def test_poses_do_not_depend_on_threads(sweep, curves, many_threads):
     part = sweep.part(0, 40)
-    threaded = poses_of(track(part, curves), part)
+    parallel = poses_of(track(part, curves), part)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(threads, "cores", lambda: 1)
         single = poses_of(track(part, curves), part)
     for name, values in single.items():
-        np.testing.assert_array_equal(threaded[name], values, err_msg=name)
+        np.testing.assert_array_equal(parallel[name], values, err_msg=name)
 
 
 class OneBuffer:

@@ -48,12 +48,12 @@ def scene(seed, frames=30, degrees=12.0):
     sensor_from_image = RigidTransform.from_components([-31.0, 12.0, 7.0], Rotation.random(rng=rng))
     # The image's x axis against the phantom's, its y axis down through the layers.
     square = Rotation.from_matrix(np.array([[-1.0, 0, 0], [0, 0, -1.0], [0, -1.0, 0]]).T)
-    turned = Rotation.from_rotvec(np.radians(rng.uniform(-degrees, degrees, (frames, 3)))) * square
+    rotation = Rotation.from_rotvec(np.radians(rng.uniform(-degrees, degrees, (frames, 3)))) * square
     middle = np.column_stack(
         [rng.uniform(44, 47, frames), rng.uniform(10, 30, frames), rng.uniform(7, 13, frames)]
     )
     centre = np.array([*(PIXEL_MM * SHAPE / 2), 0.0])
-    phantom_from_image = RigidTransform.from_components(middle - turned.apply(centre), turned)
+    phantom_from_image = RigidTransform.from_components(middle - rotation.apply(centre), rotation)
     world_from_sensor = world_from_phantom * phantom_from_image * sensor_from_image.inv()
     pixels = np.stack([cut(ENDS_MM, phantom_from_image[i]) for i in range(frames)])
     return Scene(
@@ -100,23 +100,23 @@ def plus_results(folder, kind):
     """PLUS's frames, points (frame, wire, 2), errors (frame, middle wire), and its ImageToProbe."""
     root = ElementTree.parse(folder / PLUS_RESULTS).getroot()
     matrix = np.array(root.find(".//Transform").get("Matrix").split(), float).reshape(4, 4)
-    done = [f for f in root.find(f".//{kind}Data") if f.get("SegmentationStatus") == "OK"]
-    points = [[p.get("Position").split()[:2] for p in f.find("SegmentedPoints")] for f in done]
-    errors = [[e.get("ErrorMm") for e in f.find("ReprojectionError3DList")] for f in done]
-    frames = np.array([int(f.get("Index")) for f in done])
+    results = [f for f in root.find(f".//{kind}Data") if f.get("SegmentationStatus") == "OK"]
+    points = [[p.get("Position").split()[:2] for p in f.find("SegmentedPoints")] for f in results]
+    errors = [[e.get("ErrorMm") for e in f.find("ReprojectionError3DList")] for f in results]
+    frames = np.array([int(f.get("Index")) for f in results])
     return frames, np.array(points, dtype=float), np.array(errors, dtype=float), matrix
 
 
-def candidates(shown, seed, noise_mm=0.1, missing=()):
+def candidates(sequence, seed, noise_mm=0.1, missing=()):
     """Dots as found, strongest first: most wires and, weaker, wrong dots and ringing under some wires.
 
     `missing` holds (frame, wire) pairs without a dot.
     """
     rng = np.random.default_rng(seed)
-    found = []
-    for i, true in enumerate(shown.pixels):
-        there = [w for w in range(len(true)) if (i, w) not in missing]
-        wires = true[there] + rng.normal(size=(len(there), 2)) * noise_mm / PIXEL_MM
+    dots = []
+    for i, true in enumerate(sequence.pixels):
+        visible = [w for w in range(len(true)) if (i, w) not in missing]
+        wires = true[visible] + rng.normal(size=(len(visible), 2)) * noise_mm / PIXEL_MM
         ringing = wires[rng.permutation(len(wires))[:4]] + [0.0, 1.2 / PIXEL_MM[1]]
         anywhere = rng.uniform(0, 1, (6, 2)) * SHAPE
         pixels = np.concatenate([wires, ringing, anywhere])
@@ -124,6 +124,6 @@ def candidates(shown, seed, noise_mm=0.1, missing=()):
             [rng.uniform(60, 150, len(wires)), rng.uniform(20, 50, 4), rng.uniform(20, 100, 6)]
         )
         order = np.argsort(-score)
-        found.append((np.full(len(score), i), pixels[order], score[order]))
-    frame, pixels, score = (np.concatenate(column) for column in zip(*found, strict=True))
+        dots.append((np.full(len(score), i), pixels[order], score[order]))
+    frame, pixels, score = (np.concatenate(column) for column in zip(*dots, strict=True))
     return Seen(frame, pixels, score=score)

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import pytest
-from accuracy_set import INDEPENDENT, KEPT, MOST_CLAIMS, AccuracySet, read_table, simulate_set
+from accuracy_set import INDEPENDENT, MOST_CLAIMS, SWEEPS_FOLDER, AccuracySet, read_table, simulate_set
 from made_once import made_once
 
 ROOM = 1.5
@@ -19,8 +19,8 @@ every_claim = pytest.mark.parametrize("row", CLAIMS)
 
 @pytest.fixture(scope="session")
 def accuracy_set(tmp_path_factory, data_folder):
-    if KEPT:
-        return AccuracySet(Path(KEPT), data_folder)
+    if SWEEPS_FOLDER:
+        return AccuracySet(Path(SWEEPS_FOLDER), data_folder)
     folder = made_once(tmp_path_factory, "accuracy", lambda folder: simulate_set(folder, data_folder))
     return AccuracySet(folder, data_folder)
 

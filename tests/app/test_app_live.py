@@ -2,7 +2,7 @@
 
 import subprocess
 
-from browsers import needs_browser, opened, running
+from browsers import needs_browser, open_page, running
 from commands import RF, command, free_port, read_until
 
 pytestmark = needs_browser
@@ -18,7 +18,7 @@ def test_picture_length_and_end_are_shown(browser, data_folder, tmp_path, monkey
     with running(play, stderr=subprocess.PIPE) as playing:
         read_until(playing, "127.0.0.1")
         with running(live, stderr=subprocess.PIPE) as session:
-            page = opened(browser, read_until(session, "http"))
+            page = open_page(browser, read_until(session, "http"))
             page.wait_for_selector("text=/\\+1\\d\\.\\d mm ±\\d/")
             page.wait_for_selector("text=/the sweep has ended/")
             session.communicate()

@@ -4,7 +4,7 @@ import tempfile
 from pathlib import Path
 
 import pytest
-from browsers import needs_browser, opened, viewing
+from browsers import needs_browser, open_page, viewing
 
 from xsens.logs.read import read_log
 
@@ -26,7 +26,7 @@ def scratch_folders():
 def test_it_is_shown_judged_and_recorded_until_the_end(browser, sensor, tmp_path):
     out, before = tmp_path / "out.mtb", scratch_folders()
     with viewing(sensor.path, "--record", out) as address:
-        page = opened(browser, address)
+        page = open_page(browser, address)
         page.wait_for_selector("text=The magnetometer can be trusted here")
         assert page.is_visible("text=0 samples, 0 interruptions")
         assert page.is_visible(f"text=in {out}")

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from field_scenes import simulated
+from field_scenes import simulate_motion
 from scipy.spatial.transform import Rotation
 
 from speckle3d.app.sensor.log import LogReadings
@@ -16,7 +16,7 @@ from xsens.live.monitor import LiveState
 
 @pytest.fixture(scope="module")
 def motion():
-    return simulated(np.random.default_rng(7), 12.0)
+    return simulate_motion(np.random.default_rng(7), 12.0)
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ import urllib.request
 
 import pytest
 from bokeh.util.token import generate_session_id
-from browsers import needs_browser, opened, running, viewing
+from browsers import needs_browser, open_page, running, viewing
 
 pytestmark = needs_browser
 
@@ -31,7 +31,7 @@ def status(address, **headers):
 
 
 def test_it_opens_without_complaint_and_asks_nobody_else(browser, address):
-    page = opened(browser, address)
+    page = open_page(browser, address)
     page.wait_for_selector("canvas")
     page.click("text=Sensor")
     page.wait_for_selector(".magnetometer")
@@ -63,7 +63,7 @@ def test_the_address_that_a_browser_is_started_with_opens_once(browser, data_fol
     command = [sys.executable, "-c", code, data_folder / "phantom.h5"]
     with running(command, stdout=subprocess.PIPE) as server:
         once = server.stdout.readline().strip()
-        page = opened(browser, once)
+        page = open_page(browser, once)
         page.wait_for_selector("canvas")
         assert "bokeh-session-id" in page.url
         assert status(once) == 403
@@ -78,7 +78,7 @@ def test_a_page_of_another_server_cannot_ask_it(browser, address, tmp_path):
     command = [sys.executable, "-u", "-m", "http.server", "0", "--bind", "127.0.0.1", "--directory", tmp_path]
     with running(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as server:
         port = re.search(r"port (\d+)", server.stdout.readline())[1]
-        page = opened(browser, f"http://127.0.0.1:{port}/other.html")
+        page = open_page(browser, f"http://127.0.0.1:{port}/other.html")
         socket = f"{address.split('?')[0]}ws".replace("http", "ws")
         answer = page.evaluate(
             "at => new Promise(done => { const s = new WebSocket(at, ['bokeh', 'x']);"

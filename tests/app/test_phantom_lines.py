@@ -1,8 +1,8 @@
 """The tuner of line detection as somebody uses it: what the sliders, the mouse and the button do."""
 
 import pytest
-from browsers import needs_browser, opened, viewing
-from phantom_pages import by_command, place, run_and_save, told
+from browsers import needs_browser, open_page, viewing
+from phantom_pages import by_command, place, run_and_save, text_match
 from phantom_recordings import MEMBRANE_MM, PIXEL_MM, floor_recording
 
 from speckle3d.io.calibrations import read_calibration
@@ -19,7 +19,7 @@ def recording(tmp_path_factory):
 @pytest.fixture(scope="module")
 def page(browser, recording):
     with viewing(recording[0], "--calibrate", "plane") as address:
-        page = opened(browser, address)
+        page = open_page(browser, address)
         page.locator(".phantom-told").wait_for()
         page.set_default_timeout(30_000)
         yield page
@@ -34,7 +34,7 @@ def handle(page, number):
 def test_a_region_drawn_with_the_mouse_changes_the_line(page, recording):
     row = recording[1][0]
     above = row - MEMBRANE_MM / PIXEL_MM[1]
-    told(page, "phantom-told", f"row {int(above)}")
+    text_match(page, "phantom-told", f"row {int(above)}")
     # A box about the middle that leaves the membrane out.
     top = above + MEMBRANE_MM / PIXEL_MM[1] / 2
     start, end = place(page, 104, top), place(page, 184, 285)
@@ -46,10 +46,10 @@ def test_a_region_drawn_with_the_mouse_changes_the_line(page, recording):
     region = page.get_by_label("region")
     places = [tuple(map(float, corner.split(","))) for corner in region.input_value().split()]
     assert places == [pytest.approx(at, abs=1.0) for at in ((104, top), (184, top), (184, 285), (104, 285))]
-    told(page, "phantom-told", f"row {int(row)}")
+    text_match(page, "phantom-told", f"row {int(row)}")
     region.fill("")
     region.press("Enter")
-    told(page, "phantom-told", f"row {int(above)}")
+    text_match(page, "phantom-told", f"row {int(above)}")
 
 
 def test_the_calibration_is_the_commands_to_the_last_digit(page, recording, tmp_path):
@@ -59,7 +59,7 @@ def test_the_calibration_is_the_commands_to_the_last_digit(page, recording, tmp_
     for _ in range(2):
         handle(page, 1).press("ArrowLeft")
     handle(page, 2).press("ArrowRight")
-    told(page, "phantom-told", "of 58 columns agree")
+    text_match(page, "phantom-told", "of 58 columns agree")
     # A double click on the strip leaves a frame out; the first shows the membrane, not the floor.
     page.mouse.dblclick(*place(page, 0, 0.5, "strip"))
     page.wait_for_timeout(500)

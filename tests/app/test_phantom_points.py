@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from browsers import needs_browser, opened, viewing
-from phantom_pages import place, told
+from browsers import needs_browser, open_page, viewing
+from phantom_pages import place, text_match
 from phantom_recordings import wire_recording
 
 from speckle3d.io.points import read_points
@@ -21,10 +21,10 @@ def recording(tmp_path_factory):
 def page(browser, recording):
     path = recording[0]
     with viewing(path, "--calibrate", "wires", "--phantom", path.with_suffix(".xml")) as address:
-        page = opened(browser, address)
+        page = open_page(browser, address)
         page.locator(".phantom-told").wait_for()
         page.get_by_role("button", name="Find points in all frames").click()
-        told(page, "phantom-told", r"in \d+ frames")
+        text_match(page, "phantom-told", r"in \d+ frames")
         page.set_default_timeout(30_000)
         yield page
         assert page.complaints == []
@@ -41,7 +41,7 @@ def saved(page, path, name):
 
 def test_points_are_found_moved_deleted_and_added_by_mouse(page, recording):
     path, scene = recording
-    told(page, "phantom-told", "frame 0: 9 points")
+    text_match(page, "phantom-told", "frame 0: 9 points")
     found = saved(page, path, "found.csv")
     away = found.pixels - scene.pixels[found.frame, found.wire]
     assert np.abs(away).max() < 2.0
@@ -54,12 +54,12 @@ def test_points_are_found_moved_deleted_and_added_by_mouse(page, recording):
     page.mouse.click(*place(page, *found.pixels[1]))
     page.wait_for_timeout(400)
     page.keyboard.press("Backspace")
-    told(page, "phantom-told", "frame 0: 8 points; none on b")
+    text_match(page, "phantom-told", "frame 0: 8 points; none on b")
     changed = saved(page, path, "changed.csv")
     assert changed.pixels[0] == pytest.approx(first + np.array([30, -12]), abs=1.5)
     assert 1 not in changed.wire[changed.frame == 0]
     # The wire that is missing is the next one.
     page.mouse.click(*place(page, *first))
-    told(page, "phantom-told", "frame 0: 9 points")
+    text_match(page, "phantom-told", "frame 0: 9 points")
     again = saved(page, path, "again.csv")
     assert again.pixels[(again.frame == 0) & (again.wire == 1)][0] == pytest.approx(first, abs=1.5)

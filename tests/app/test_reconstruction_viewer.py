@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from browsers import needs_browser, opened, viewing
+from browsers import needs_browser, open_page, viewing
 
 from speckle3d.io.curves import read_curves
 from speckle3d.io.load import load_sweep
@@ -23,7 +23,7 @@ def page(browser, small_sweeps, tmp_path_factory):
     folder, path = tmp_path_factory.mktemp("results"), small_sweeps / "s5.h5"
     run_job(load_sweep(path), path, read_curves(small_sweeps / "curves.h5"), folder / "made")
     with viewing(folder / "made") as address:
-        page = opened(browser, address)
+        page = open_page(browser, address)
         page.wait_for_function(f"() => window.Bokeh && ({TITLE})('cut-depth')")
         page.get_by_text("depth / mm").first.wait_for()
         page.set_default_timeout(20_000)

@@ -14,7 +14,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from broad import OFFLINE, ONLINE, coverage, errors_deg, estimate, read_trial, trials_in
-from field_scenes import scene, simulated
+from field_scenes import scene, simulate_motion
 from options import parsed
 
 METHODS = ONLINE + OFFLINE
@@ -26,7 +26,7 @@ def trials(folder):
     """Name, log, true orientation and where the sensor moved, of every trial."""
     if folder is None:
         rng = np.random.default_rng(20)
-        yield "attached", *scene(simulated(rng, 20.0), "attached", 5.0, rng)
+        yield "attached", *scene(simulate_motion(rng, 20.0), "attached", 5.0, rng)
     else:
         for name in trials_in(folder):
             yield name, *read_trial(folder, name)

@@ -16,7 +16,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import numpy as np
 from cache import simulated
-from crossing_scenes import displaced
+from crossing_scenes import displace
 from options import parsed
 
 from calibration.images.similarity import prepare
@@ -62,7 +62,7 @@ def study(crossing, starts):
     rng, rows = np.random.default_rng(183), []
     for _ in range(starts):
         try:
-            found = calibrate_from_sweeps(crossing, displaced(TRUTH, rng), ImageFit()).sensor_from_image
+            found = calibrate_from_sweeps(crossing, displace(TRUTH, rng), ImageFit()).sensor_from_image
             error = (TRUTH.inv() * found).apply(crossing.centre_mm) - crossing.centre_mm
         except InsufficientDataError:
             error = np.full(3, np.inf)

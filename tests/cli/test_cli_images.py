@@ -4,7 +4,7 @@ import re
 
 import numpy as np
 import pytest
-from crossing_scenes import centre_error_mm, crossing_sweeps, displaced
+from crossing_scenes import centre_error_mm, crossing_sweeps, displace
 
 from speckle3d.core.geometry import roll_yaw_tilt
 from speckle3d.core.grid import ImageGrid
@@ -20,7 +20,7 @@ def test_two_sweeps_of_a_curved_array_are_calibrated(run, tmp_path):
     for path, made in zip(files, sweeps, strict=True):
         tracker = Tracker(made.readings)
         write_sweep(path, Sweep(made.images, grid, BModeSettings(60.0), made.frame_time_s, tracker=tracker))
-    start = displaced(truth, np.random.default_rng(3), 2.0, 2.0)
+    start = displace(truth, np.random.default_rng(3), 2.0, 2.0)
     degrees = np.rad2deg(roll_yaw_tilt(start.rotation))
     code, _, err = run(
         *("calibrate", "images", *files, "-o", tmp_path / "tracker.h5", "--capture-mm", "0"),

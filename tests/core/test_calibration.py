@@ -31,7 +31,7 @@ def test_a_calibration_goes_on_its_sensor_and_nothing_else(name, offset_s):
     assert sensor.time_offset_s == (before.time_offset_s if offset_s is None else offset_s)
     assert sensor.readings is before.readings
     fields_beside = {field.name for field in fields(sweep)} - {name}
-    assert all(getattr(with_calibration, other) is getattr(sweep, other) for other in fields_beside)
+    assert all(getattr(with_calibration, field) is getattr(sweep, field) for field in fields_beside)
 
 
 @pytest.mark.parametrize("sensor", ["tracker", "orientation"])

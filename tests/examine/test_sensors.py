@@ -41,7 +41,7 @@ BESIDE_THE_IMAGES = {
     "tracker drift of 5 mm": "x ",
 }
 """Faults that only the images contradict: both numbers are told."""
-REFUTED = (
+REFUTES = (
     *("tracker frozen", "tracker frozen from halfway", "tracker random", "orientation stored xyzw"),
     *("orientation inverted", "orientation random", "orientation mirrored"),
 )
@@ -68,7 +68,7 @@ def test_a_sensor_that_contradicts_itself_is_named(name, sweep, tracking):
     about = "tracker" if name.startswith("tracker") else "orientation sensor"
     assert {doubt.about for doubt in examination.doubts} == {about}
     assert any(AGAINST_THEMSELVES[name] in doubt.suspect for doubt in examination.doubts)
-    if name in REFUTED:
+    if name in REFUTES:
         assert any(doubt.refuted for doubt in examination.doubts)
 
 
@@ -117,10 +117,10 @@ def test_a_sensor_that_contradicts_itself_gives_no_mode_unless_told_to(sweep, tr
 
 def test_spikes_are_left_out_and_counted(sweep, tracking):
     bad = spoil(sweep, "tracker spikes of 30 mm")
-    trusted, (doubt,) = repair_readings(bad)
+    filtered_sweep, (doubt,) = repair_readings(bad)
     places = [s.tracker.readings.world_from_sensor.translation for s in (bad, sweep)]
     spikes = np.linalg.norm(places[0] - places[1], axis=1) > 10.0
-    left_out = len(bad.tracker.readings) - len(trusted.tracker.readings)
+    left_out = len(bad.tracker.readings) - len(filtered_sweep.tracker.readings)
     assert left_out >= spikes.sum()
     assert str(left_out) in doubt.evidence
     at = bad.tracker.readings.time_s[spikes] + bad.tracker.time_offset_s

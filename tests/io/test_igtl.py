@@ -6,7 +6,7 @@ import time
 import numpy as np
 import pyigtl
 import pytest
-from igtl_examples import LAST, changed, decoded, image, transform, with_body
+from igtl_examples import LAST, decode_whole, image, transform, with_body, with_values
 from pyigtl.messages import MessageBase
 
 from speckle3d.io.igtl import link
@@ -32,7 +32,7 @@ def by_pyigtl(message):
 @pytest.mark.parametrize("version", [1, 2])
 def test_an_image_of_pyigtl_is_read(version):
     message, pixels, place = image(dtype="f4", version=version)
-    got = decoded(message)
+    got = decode_whole(message)
     assert (got.device, got.time_s, got.components, got.pixels.dtype) == ("Image_Reference", 12.25, 1, "f4")
     np.testing.assert_array_equal(got.pixels, pixels)
     np.testing.assert_allclose(got.image_to_world, place, atol=SINGLE)
@@ -44,7 +44,7 @@ def test_pyigtl_and_we_read_an_image_of_ours(shape):
     pixels = np.random.default_rng(0).integers(0, 100, shape).astype(np.int16)
     colours, place = 3 if shape[-1] == 3 else 1, image()[2]
     message = packed_image("Volume", 1700000000.123456, pixels, place, colours)
-    theirs, ours = by_pyigtl(message), decoded(message)
+    theirs, ours = by_pyigtl(message), decode_whole(message)
     whole = pixels[:, :, None] if pixels.ndim == 2 or colours == 3 else pixels
     np.testing.assert_array_equal(theirs.image, whole.transpose(2, 1, 0, *range(3, whole.ndim)))
     np.testing.assert_array_equal(ours.pixels, pixels)
@@ -60,20 +60,20 @@ def test_pyigtl_and_we_read_an_image_of_ours(shape):
 ])  # fmt: skip
 def test_a_transform_of_plus_says_whether_the_tool_was_in_sight(said, valid):
     message, matrix = transform(version=2, **said)
-    assert decoded(message).valid == valid
-    np.testing.assert_allclose(decoded(message).matrix, matrix, atol=SINGLE)
+    assert decode_whole(message).valid == valid
+    np.testing.assert_allclose(decode_whole(message).matrix, matrix, atol=SINGLE)
 
 
 IMAGE = image()[0]
 
 
 @pytest.mark.parametrize("message", [
-    changed(6, ">3H", 65535, 65535, 65535),
+    with_values(6, ">3H", 65535, 65535, 65535),
     with_body(transform()[0], bytes(47)),
 ])  # fmt: skip
 def test_what_makes_no_sense_is_refused_in_one_line(message):
     with pytest.raises(MessageError) as error:
-        decoded(message)
+        decode_whole(message)
     assert str(error.value).isprintable()
 
 

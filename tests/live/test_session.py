@@ -4,7 +4,7 @@ import time
 
 import numpy as np
 import pytest
-from igtl_examples import decoded
+from igtl_examples import decode_whole
 from scipy.spatial.transform import RigidTransform
 
 import speckle3d as s3
@@ -54,7 +54,7 @@ def run(batches, done, curves, folder, **settings):
     known = SessionSettings(folder / "sweep.h5", imported=RF, **{"volume": False, **settings})
     messages.session = Session(messages, [sent.append], curves, known)
     messages.session.run()
-    return messages.session, [decoded(each) for each in sent]
+    return messages.session, [decode_whole(each) for each in sent]
 
 
 @pytest.fixture(scope="module")
@@ -138,7 +138,7 @@ def test_a_pose_takes_pixels_to_slicers_axes(recorded):
     layout = ImageLayout.of(image(frames[0], 0.0), RF, "sweep")
     world = RigidTransform.from_translation([1.0, 2.0, 3.0])
     packed = pose_message(world, layout.image_from_pixel, 5.0)
-    found = decoded(packed)
+    found = decode_whole(packed)
     # Sample 100 of vector 10: 3 mm along x and 1.155 mm deep in the image; x and y are reversed in RAS.
     at = found.matrix @ [100, 10, 0, 1]
     assert at[:3] == pytest.approx([-(1.0 + 3.0), -(2.0 + 1.155), 3.0], abs=1e-4)

@@ -12,12 +12,8 @@ from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.load import load_sweep
 from speckle3d.matching.intensity import IntensityExtractor
 from speckle3d.matching.patches import PatchSettings, lay_patches
-from speckle3d.matching.quality import (
-    FrameFlag,
-    QualitySettings,
-    flag_frames,
-    inspect_frame,
-)
+from speckle3d.matching.quality import FrameFlag as Flag
+from speckle3d.matching.quality import QualitySettings, flag_frames, inspect_frame
 from speckle3d.simulation.presets import SimulationSettings, simulate
 
 RAIL = 8191
@@ -63,16 +59,16 @@ def lift(frame, grid):
 
 
 BAD = {
-    "clipped": (lambda f, g: counts(30.0 * f), FrameFlag.SATURATED),
-    "noise": (lambda f, g: noise(f), FrameFlag.LIFTED),
-    "lifted": (lambda f, g: lift(f, g), FrameFlag.LIFTED),
-    "air": (air, FrameFlag.LIFTED),
-    "black": (lambda f, g: np.zeros_like(f), FrameFlag.NO_SPECKLE),
+    "clipped": (lambda f, g: counts(30.0 * f), Flag.SATURATED),
+    "noise": (lambda f, g: noise(f), Flag.LIFTED),
+    "lifted": (lambda f, g: lift(f, g), Flag.LIFTED),
+    "air": (air, Flag.LIFTED),
+    "black": (lambda f, g: np.zeros_like(f), Flag.NO_SPECKLE),
     "ramp both ways": (
         lambda f, g: counts(
             np.linspace(-3000, 3000, f.shape[0])[:, None] + np.linspace(-4000, 4000, f.shape[1])
         ),
-        FrameFlag.NO_SPECKLE,
+        Flag.NO_SPECKLE,
     ),
 }
 
@@ -126,16 +122,7 @@ def test_only_the_repeat_of_the_frame_before_is_frozen(phantom):
     edit = b.copy()
     edit[20, 1700] += 30  # in the band, as an offset of the line would not be
     order = [a, a, b, a, b, b.copy(), b, edit]
-    assert flags_of(order, signal, grid) == [
-        0,
-        FrameFlag.FROZEN,
-        0,
-        0,
-        0,
-        FrameFlag.FROZEN,
-        FrameFlag.FROZEN,
-        0,
-    ]
+    assert flags_of(order, signal, grid) == [0, Flag.FROZEN, 0, 0, 0, Flag.FROZEN, Flag.FROZEN, 0]
 
 
 @pytest.mark.parametrize(("gain", "saturates"), [(8.0, False), (12.0, True)])
@@ -144,16 +131,14 @@ def test_clipping_is_saturation_from_where_distances_are_wrong(phantom, gain, sa
     # too long.
     frames, signal, grid = phantom
     spoilt = [counts(gain * frame) for frame in frames]
-    assert flags_of(spoilt, signal, grid) == [FrameFlag.SATURATED if saturates else 0] * len(frames)
+    assert flags_of(spoilt, signal, grid) == [Flag.SATURATED if saturates else 0] * len(frames)
 
 
 def test_a_frame_with_samples_that_are_not_finite_has_no_speckle(phantom):
     frames, signal, grid = phantom
     mixture = [frame.astype(np.float32) for frame in frames]
     mixture[2][5, 1700] = np.nan
-    assert flags_of(mixture, signal, grid) == [
-        FrameFlag.NO_SPECKLE if i == 2 else 0 for i in range(len(frames))
-    ]
+    assert flags_of(mixture, signal, grid) == [Flag.NO_SPECKLE if i == 2 else 0 for i in range(len(frames))]
 
 
 def test_bmode_of_good_frames_is_not_flagged(good):
@@ -183,8 +168,8 @@ REAL = {
     "liver of a mouse, RF": ("rf/MouseLiverRF.mha", MOUSE, 0),
     "spine phantom, B-mode": ("plus/SpinePhantomFreehand.igs.mha", PLUS, 0),
     # No echo but ring-down to 14 mm, the same in all vectors, and noise below: the probe is in air.
-    "ring-down, I/Q": ("plus/UltrasonixLinearRfData.igs.mha", ULTRASONIX, FrameFlag.LIFTED),
-    "wires in water, B-mode": ("plus/NwirePhantomFreehand.igs.nrrd", PLUS, FrameFlag.NO_SPECKLE),
+    "ring-down, I/Q": ("plus/UltrasonixLinearRfData.igs.mha", ULTRASONIX, Flag.LIFTED),
+    "wires in water, B-mode": ("plus/NwirePhantomFreehand.igs.nrrd", PLUS, Flag.NO_SPECKLE),
 }
 
 

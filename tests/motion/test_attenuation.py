@@ -62,9 +62,9 @@ def test_attenuation_in_spite_of_structure_and_noise(difference):
 
 @pytest.mark.parametrize("difference", [-0.2, 0.3])
 def test_curves_stretch_as_the_beam_widens(difference):
-    expected, phantom = _curves(0.5 + difference), _curves(0.5)
+    tissue, phantom = _curves(0.5 + difference), _curves(0.5)
     stretch = _estimate(phantom, _power(0.5 + difference)).applied(phantom)
-    half = [curve_widths(DISTANCE, c.correlation) for c in (stretch, expected, phantom)]
+    half = [curve_widths(DISTANCE, c.correlation) for c in (stretch, tissue, phantom)]
     # Length depends on the mean over depth; one power of wavelength for all depths is off by 2 % at some.
     assert abs((half[0] / half[1]).mean() - 1.0) < 0.012
     assert np.abs(half[0] / half[1] - 1.0).max() < 0.025

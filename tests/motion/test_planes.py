@@ -60,8 +60,8 @@ def fits(problem_, plane, draws, law="gaussian", spoilt=0.0):
     rng, of_echo = np.random.default_rng(1), problem_.at_patches.of_echo
     rho = draw(np.tile(correlations(plane), (draws, 1)), rng, law, of_echo)
     rho = np.where(rng.random(rho.shape) < spoilt, rng.random(rho.shape), rho)
-    planes, is_determined = fit_many(problem_, rho)
-    assert is_determined.all()
+    planes, has_plane = fit_many(problem_, rho)
+    assert has_plane.all()
     return planes.coefficients, np.sqrt(np.diagonal(planes.covariance, axis1=1, axis2=2))
 
 
@@ -178,6 +178,6 @@ def test_a_wrong_guess_of_the_distance_does_no_harm(start_mm):
     """A path may have frames together that are apart: from nothing, a tilt would explain it, too."""
     for plane in (*PLANES, *PARALLEL):
         rho = draw(np.tile(correlations(plane), (5, 1)), np.random.default_rng(2))
-        free, guided = (fit_many(problem(), rho, start_mm=s)[0] for s in (None, np.full(5, start_mm)))
-        assert np.abs(free.offset_mm - guided.offset_mm).max() < 0.015 * plane[0] + 1e-3
-        assert not crossing(guided.coefficients).any()
+        free, from_guess = (fit_many(problem(), rho, start_mm=s)[0] for s in (None, np.full(5, start_mm)))
+        assert np.abs(free.offset_mm - from_guess.offset_mm).max() < 0.015 * plane[0] + 1e-3
+        assert not crossing(from_guess.coefficients).any()

@@ -144,9 +144,9 @@ def test_a_frame_that_is_held_alone_lies_between_its_neighbours_and_is_not_trust
     estimate, full = (solve_trajectory(p, len(truth), CENTRE_MM, 2.0, True) for p in (without_lone, pairs))
     before, at, after = elevation(estimate.poses)[lone - 1 : lone + 2]
     assert abs(at - (before + after) / 2) < 1e-3
-    rest = np.delete(np.arange(len(truth)), lone)
-    assert np.abs(elevation(estimate.poses) - elevation(full.poses))[rest].max() < 0.03
+    neighbour_frames = np.delete(np.arange(len(truth)), lone)
+    assert np.abs(elevation(estimate.poses) - elevation(full.poses))[neighbour_frames].max() < 0.03
     deviation = np.sqrt(np.diagonal(estimate.covariance, axis1=1, axis2=2))
     # Two edges of 1 mm and 0.05 rad side by side.
     np.testing.assert_allclose(deviation[lone], np.repeat([1.0, 0.05], 3) / np.sqrt(2), rtol=0.05)
-    assert (deviation[lone] > 4 * deviation[rest].max(axis=0)).all()
+    assert (deviation[lone] > 4 * deviation[neighbour_frames].max(axis=0)).all()

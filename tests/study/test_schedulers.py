@@ -3,7 +3,7 @@
 import re
 
 import pytest
-from cluster_jobs import double, lost, suicide
+from cluster_jobs import double, failure_text, suicide
 
 from speckle3d.study.schedulers import scheduler_for
 
@@ -11,7 +11,7 @@ from speckle3d.study.schedulers import scheduler_for
 @pytest.mark.slow
 def test_a_job_that_kills_its_worker_is_named_and_the_others_are_done():
     with scheduler_for(None, 2) as where:
-        results = list(where.run(suicide, [0, 1, 2, 3], lost))
+        results = list(where.run(suicide, [0, 1, 2, 3], failure_text))
     (reason,) = [each for each in results if isinstance(each, str)]
     assert re.match("1: its worker died", reason)
     assert sorted(each for each in results if isinstance(each, int)) == [0, 2, 3]
@@ -23,5 +23,5 @@ def test_a_cluster_gives_the_same_results():
     distributed = pytest.importorskip("distributed", reason="needs Dask (extra cluster)")
     cluster = distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None)
     with cluster, scheduler_for(cluster.scheduler_address, None) as where:
-        assert sorted(where.run(double, [3, 1, 2], lost)) == [2, 4, 6]
-        assert list(where.run(double, ["a", None], lost)).count("aa") == 1
+        assert sorted(where.run(double, [3, 1, 2], failure_text)) == [2, 4, 6]
+        assert list(where.run(double, ["a", None], failure_text)).count("aa") == 1

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from browsers import needs_browser, opened, viewing
+from browsers import needs_browser, open_page, viewing
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.app.sweep.page import SweepPage, _Player
@@ -104,7 +104,7 @@ def test_flags_and_doubts_are_marked_at_their_frames_and_a_click_goes_there(play
 def test_in_the_browser_it_plays_and_the_image_fills_the_height(browser, files):
     recording, reconstruction = files
     with viewing(recording, "--reconstruction", reconstruction) as address:
-        page = opened(browser, address)
+        page = open_page(browser, address)
         page.set_default_timeout(30_000)
         page.get_by_text("of 0 to 47").wait_for()
         plot = page.locator(".bk-Figure").first.bounding_box()

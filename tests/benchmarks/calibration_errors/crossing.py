@@ -29,7 +29,7 @@ def judged(seed):
     picked = solution.points_used
     off_mm = np.hypot(*((picked.pixels - world.crossing_px[picked.frame]) * world.pixel_mm).T)
     right = off_mm < NEAR_MM
-    found = np.isin(np.flatnonzero(world.shown), picked.frame[right]).mean()
+    found = np.isin(np.flatnonzero(world.is_visible), picked.frame[right]).mean()
     return found, 1.0 - right.mean(), solution.rms
 
 

@@ -7,7 +7,7 @@ The tissue is that of `crossing_scenes`, which is not the calibration's model; e
 from functools import partial
 
 import numpy as np
-from crossing_scenes import centre_error_mm, crossing_sweeps, displaced
+from crossing_scenes import centre_error_mm, crossing_sweeps, displace
 
 from calibration.images.angulation import angulation
 from calibration.images.solver import calibrate_images
@@ -25,7 +25,7 @@ def judged(crossing_deg, seed):
     first, second, truth = crossing_sweeps(
         seed, frames=50, fan_deg=rng.uniform(35.0, 50.0), crossing_deg=rng.uniform(*crossing_deg)
     )
-    start, grid = displaced(truth, rng, 1.5, 1.5), first.grid
+    start, grid = displace(truth, rng, 1.5, 1.5), first.grid
     poses = [each.world_from_sensor(each.covered()) for each in (first, second)]
     try:  # as the command does it: the motion is judged first at the start
         angulation(*poses, start).require(0.5)

@@ -10,7 +10,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
-from crossing_tissue import GRID, PairCase, made_pair
+from crossing_tissue import GRID, PairCase, tissue_pair
 
 from length.sweeps import figures
 from speckle3d.core.errors import InsufficientDataError, MismatchError
@@ -18,13 +18,13 @@ from speckle3d.correction.crossing.pair import crossed
 
 GROUPS = {
     "90 deg": {},
-    "90 deg, orientation": {"sensed": True},
+    "90 deg, orientation": {"with_sensor": True},
     "45 deg": {"angle_deg": 45.0},
     "tissue moved 0.3 mm rms": {"moved_mm": 0.3},
     "tissue moved 0.6 mm rms": {"moved_mm": 0.6},
     "tissue moved 1.0 mm rms": {"moved_mm": 1.0},
     "poor texture": {"texture": 0.3},
-    "sign of the second unknown": {"mirrored": True},
+    "sign of the second unknown": {"mirror": True},
 }
 PAIRS = 8
 """Of each group, at share 1."""
@@ -43,7 +43,7 @@ def measure(share, first_seed):
 
 def solved(case):
     """Of both sweeps: log of the length's error, tilt in degrees, and the length's claim; or why not."""
-    pair = made_pair(case)
+    pair = tissue_pair(case)
     try:
         found = crossed(pair.first, pair.second)
     except (InsufficientDataError, MismatchError) as error:

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from bench_image_calibration import TRUTH, prepared
 from calibration_examples import scan_plane
-from crossing_scenes import displaced
+from crossing_scenes import displace
 from imu_logs import calibration, mt9_bin, mtdata2_messages, samples
 from vqf import VQF, offlineVQF
 
@@ -40,7 +40,7 @@ def plane(runs):
 
 def images(runs, seed=601):
     """A calibration from two crossing sweeps, 20 mm and 20 degrees off at most."""
-    crossing, start = prepared(seed), displaced(TRUTH, np.random.default_rng(183))
+    crossing, start = prepared(seed), displace(TRUTH, np.random.default_rng(183))
     taken = timed(lambda: calibrate_from_sweeps(crossing, start, ImageFit()), runs)
     what = "calibration from two sweeps, 160 frames each"
     return [Row(what, taken.seconds, "s", target=IMAGES_S, falling=True, cores=taken.cores)]

@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from crossing_scenes import centre_error_mm, crossing_sweeps, displaced
+from crossing_scenes import centre_error_mm, crossing_sweeps, displace
 
 from calibration.images.similarity import prepare
 from calibration.images.solver import calibrate_from_sweeps, calibrate_images
@@ -19,13 +19,13 @@ def crossing(scene):
 
 @pytest.fixture(scope="module")
 def found(scene, crossing):
-    start = displaced(scene[2], np.random.default_rng(0))
+    start = displace(scene[2], np.random.default_rng(0))
     return calibrate_from_sweeps(crossing, start)
 
 
 @pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_far_starts_reach_the_truth(scene, crossing, found, seed):
-    start = displaced(scene[2], np.random.default_rng(seed))
+    start = displace(scene[2], np.random.default_rng(seed))
     result = found if seed == 0 else calibrate_from_sweeps(crossing, start)
     error = centre_error_mm(result.sensor_from_image, scene[2], scene[0].grid)
     # Of it, 0.1 mm along the beams comes from the tracker: 0.1 mm and 0.05 degrees of jitter.

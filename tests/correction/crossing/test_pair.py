@@ -5,7 +5,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from crossing_tissue import GRID, PairCase, made_pair
+from crossing_tissue import GRID, PairCase, tissue_pair
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.errors import InsufficientDataError, MismatchError
@@ -16,7 +16,7 @@ from speckle3d.correction.crossing.sweep import CrossingSweep
 
 @cache
 def made(**case):
-    return made_pair(PairCase(**case))
+    return tissue_pair(PairCase(**case))
 
 
 def errors(poses, truth):
@@ -48,7 +48,7 @@ def test_finds_lengths_that_were_a_fifth_wrong():
 
 @pytest.mark.slow
 def test_finds_which_sweep_went_the_other_way():
-    pair = made(seed=381, mirrored=True)
+    pair = made(seed=381, mirror=True)
     found = crossed(pair.first, pair.second)
     assert found.mirrored == (False, True)
     assert abs(errors(found.second.poses, pair.truth[1])[0]) < 2.0
@@ -56,7 +56,7 @@ def test_finds_which_sweep_went_the_other_way():
 
 @pytest.mark.slow
 def test_a_sensor_tells_the_turns():
-    pair = made(seed=1, sensed=True)
+    pair = made(seed=1, with_sensor=True)
     found = crossed(pair.first, pair.second)
     for side, truth in zip((found.first, found.second), pair.truth, strict=True):
         length, tilt = errors(side.poses, truth)
@@ -67,7 +67,7 @@ def test_a_sensor_tells_the_turns():
 
 @pytest.mark.slow
 def test_refuses_other_tissue():
-    one, other = made(seed=4), made(seed=1, sensed=True)
+    one, other = made(seed=4), made(seed=1, with_sensor=True)
     with pytest.raises((MismatchError, InsufficientDataError)):
         crossed(one.first, replace(other.second, sensed=None))
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import clarius_examples as examples
 import numpy as np
 import pytest
-from clarius_examples import GIVEN, sweep_of
+from clarius_examples import IMPORT_SETTINGS, sweep_of
 from sweep_examples import sizes_of
 
 from speckle3d.core.errors import FileError, InvalidInputError
@@ -40,7 +40,7 @@ def require_equal(got, expected):
 @pytest.mark.parametrize(("packed", "place"), [(False, "folder"), (True, "package.tar")])
 def test_what_is_written_is_read(tmp_path, kind, packed, place):
     sweep = sweep_of(kind)
-    got = load_sweep(examples.write_package(tmp_path / place, sweep, packed=packed), GIVEN)
+    got = load_sweep(examples.write_package(tmp_path / place, sweep, lzop=packed), IMPORT_SETTINGS)
     require_equal(got, sweep)
     assert got.probe == "Clarius L7HD3"
     assert got.frames.stored_dtype == (np.uint8 if kind == "env" else np.int16)
@@ -50,14 +50,14 @@ def test_an_archive_cut_short_is_refused(tmp_path):
     path = examples.write_package(tmp_path / "p.tar", sweep_of("rf"))
     path.write_bytes(path.read_bytes()[:3000])
     with pytest.raises((FileError, InvalidInputError), match=r"p\.tar"):
-        _ = load_sweep(path, GIVEN)
+        _ = load_sweep(path, IMPORT_SETTINGS)
 
 
 def test_rf_is_preferred_and_a_raw_file_gives_its_own_kind(tmp_path):
     rf, iq = sweep_of("rf"), sweep_of("iq")
     folder = examples.write_files(tmp_path / "both", examples.package_files(iq) | examples.package_files(rf))
-    require_equal(load_sweep(folder, GIVEN), rf)
-    require_equal(load_sweep(folder / f"{examples.NAME}_iq.raw", GIVEN), iq)
+    require_equal(load_sweep(folder, IMPORT_SETTINGS), rf)
+    require_equal(load_sweep(folder / f"{examples.NAME}_iq.raw", IMPORT_SETTINGS), iq)
 
 
 def test_iq_of_a_falling_frequency_becomes_that_of_one(tmp_path):
@@ -70,7 +70,7 @@ def test_iq_of_a_falling_frequency_becomes_that_of_one(tmp_path):
     frames = np.tile(np.round(8000 * np.exp(1j * phase)), (len(sweep), 5, 1)).astype(np.complex64)
     sweep = replace(sweep, frames=frames, grid=replace(sweep.grid, first_sample_depth_mm=0.0))
     yml = examples.yml_text(sweep).split("focus:")[0] + examples.focus_text(9, 6)
-    got = load_sweep(examples.write_package(tmp_path / "p.tar", sweep, yml=yml), GIVEN)
+    got = load_sweep(examples.write_package(tmp_path / "p.tar", sweep, yml=yml), IMPORT_SETTINGS)
     line = got.frames[1][2]
     turn_hz = np.angle(line[1:] * line[:-1].conj()) * rate_hz / (2 * np.pi)
     # Rounding of 8000 to whole numbers: 1e-4 rad, 200 Hz.
@@ -89,7 +89,7 @@ def off_deg(samples):
 
 
 def moving(degrees=25.0):
-    return examples.sensor_of(examples.swayed(TIMES_S, degrees), TIMES_S)
+    return examples.sensor_of(examples.sway(TIMES_S, degrees), TIMES_S)
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
@@ -165,7 +165,7 @@ def test_lines_of_a_curved_array_spread_by_its_radius(tmp_path):
     sweep = sweep_of("rf")
     yml = examples.yml_text(sweep) + "probe: {radius: 45 mm, pitch: 0.35 mm, elements: 192}\n"
     path = examples.write_package(tmp_path / "folder", sweep, yml=yml)
-    grid = load_sweep(path, GIVEN.model_copy(update={"probe": None})).grid
+    grid = load_sweep(path, IMPORT_SETTINGS.model_copy(update={"probe": None})).grid
     assert grid.fan.radius_mm == 45.0
     # Lines lie where their elements do; the middle of 192 elements looks straight down.
     elements = np.arange(grid.vectors) * sweep.grid.vector_pitch_mm / examples.ELEMENT_MM
@@ -174,7 +174,7 @@ def test_lines_of_a_curved_array_spread_by_its_radius(tmp_path):
 
 def test_a_curved_model_without_its_radius_is_asked_for_it(tmp_path):
     path = examples.write_package(tmp_path / "folder", sweep_of("rf"))
-    curved = GIVEN.model_copy(update={"probe": "Clarius C3 HD3", "element_pitch_mm": 0.35})
+    curved = IMPORT_SETTINGS.model_copy(update={"probe": "Clarius C3 HD3", "element_pitch_mm": 0.35})
     with pytest.raises(MissingSettingsError) as caught:
         load_sweep(path, curved)
     assert set(caught.value.settings) == {"array_radius_mm", "line_angles_deg"}

@@ -5,7 +5,7 @@ from functools import cache
 import numpy as np
 import pytest
 from broad import OFFLINE, ONLINE, counting, errors_deg, estimate, rms_deg
-from field_scenes import scene, simulated
+from field_scenes import scene, simulate_motion
 
 WORSE = 1.15
 """Error over VQF's, as on the recorded trials."""
@@ -25,7 +25,7 @@ KINDS = [
 @cache
 def made(kind, amount):
     rng = np.random.default_rng([20, *kind.encode()])
-    return scene(simulated(rng, 120.0 if kind == "drift" else 60.0), kind, amount, rng)
+    return scene(simulate_motion(rng, 120.0 if kind == "drift" else 60.0), kind, amount, rng)
 
 
 @pytest.mark.parametrize("methods", [ONLINE, OFFLINE], ids=["on-line", "off-line"])

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from imu_logs import calibration, calibration_message, framed, mtdata_payloads, raw_values
+from imu_logs import calibration, calibration_message, frame_payloads, mtdata_payloads, raw_values
 from scipy.spatial.transform import Rotation
 
 from speckle3d.core.errors import InvalidInputError, Speckle3DError
@@ -122,7 +122,7 @@ def test_raw_counts_at_the_end_of_their_range_are_missing():
     middle = np.median(counts)
     wrong = np.abs(counts - middle) > 1000
     values["raw_gyroscope"][:, 0] = np.clip(counts, middle - 1000, middle + 1000)
-    records = framed(mtdata_payloads(DataLayout(OutputMode.MT9), values))
+    records = frame_payloads(mtdata_payloads(DataLayout(OutputMode.MT9), values))
     spoiled = parse_stream(encode(calibration_message(unit)) + b"".join(records))
     missing = np.isnan(spoiled.gyroscope_rad_s).any(axis=1)
     assert missing[wrong].mean() > 0.9 > 0.02 > missing[~wrong].mean()

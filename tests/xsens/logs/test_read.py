@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from imu_logs import (
     calibration,
-    configured,
-    framed,
+    configuration,
+    frame_payloads,
     legacy_messages,
     mt9_bin,
     mtdata2_messages,
@@ -72,7 +72,7 @@ def test_legacy_data_by_their_configuration(s, form, shape, world):
         EVERYTHING | OutputMode.TEMPERATURE | OutputMode.AUXILIARY | OutputMode.POSITION | OutputMode.STATUS,
         COUNTED | OutputSettings.UTC | shape | form << 8 | world,
     )
-    log = parse_stream(configured(layout) + b"".join(legacy_messages(s, layout)))
+    log = parse_stream(configuration(layout) + b"".join(legacy_messages(s, layout)))
     # FP12.20's last bit is 1e-6; of an angle in degrees it is 57 times less.
     assert_same_samples(log, s, atol=2e-6)
     assert log.rate_hz == pytest.approx(100.0)
@@ -107,7 +107,7 @@ def test_increments_stand_in_for_rates(s):
         )
         for i in range(200)
     ]
-    log = parse_stream(b"".join(framed(payloads, MessageId.MT_DATA2)))
+    log = parse_stream(b"".join(frame_payloads(payloads, MessageId.MT_DATA2)))
     np.testing.assert_allclose(log.accelerometer_m_s2, s["accelerometer_m_s2"], atol=2e-6)
     np.testing.assert_allclose(log.gyroscope_rad_s, s["gyroscope_rad_s"], atol=2e-5)  # 2**-24 over the period
     assert sum("increments" in note for note in log.notes) == 2
@@ -120,7 +120,7 @@ def test_a_sensor_plugged_in_again_is_away_as_long_as_the_computer_says(s):
     layout = DataLayout(EVERYTHING, COUNTED)
     begin = datetime(2026, 2, 28, 23, 59, 58, 500_000, tzinfo=UTC)
     stretches = [
-        configured(layout) + encode(utc_message(begin + timedelta(seconds=away))) + b"".join(messages)
+        configuration(layout) + encode(utc_message(begin + timedelta(seconds=away))) + b"".join(messages)
         for away, messages in ((0.0, legacy_messages(s, layout)), (7.25, legacy_messages(s, layout, 5)))
     ]
     log = parse_stream(b"".join(stretches))
