@@ -92,9 +92,9 @@ def tissue_pair(case):
         if case.mirror and number:
             flip = np.diag([1.0, 1.0, -1.0, 1.0])
             poses = RigidTransform.from_matrix(flip @ poses.as_matrix() @ flip)
-        sensor = (
-            world * truth.rotation * _slow_errors(len(truth), rng, world, truth) if case.with_sensor else None
-        )
+        sensor = None
+        if case.with_sensor:
+            sensor = world * truth.rotation * _slow_errors(len(truth), rng, world, truth)
         name = ("first", "second")[number]
         sweeps.append(CrossingSweep(name, stack, poses, GRID.centre_mm, 0.08, 0.002, sensor))
         truths.append(truth)

@@ -19,8 +19,8 @@ from pathlib import Path
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
-from cache import DEFAULT, simulated
-from options import parsed
+from cache import DEFAULT, sweep_file
+from options import parse_options
 
 from speckle3d.config import Config
 from speckle3d.corrections import correct
@@ -33,11 +33,11 @@ from speckle3d.simulation.presets import SimulationSettings
 from speckle3d.tracking import track
 
 FIRST_SEED = 1001
-SHIPPED = Path(__file__).resolve().parents[2] / "data" / "curves.h5"
+CURVES_FILE = Path(__file__).resolve().parents[2] / "data" / "curves.h5"
 VECTORS = 48
-STEPPED = {"preset": "stepped", "steps": 27, "step_mm": 0.06, "blocks": 6}
+STEPS = {"preset": "stepped", "steps": 27, "step_mm": 0.06, "blocks": 6}
 CURVE_SWEEPS = (
-    *({**STEPPED, "seed": seed} for seed in (11, 12, 13)),
+    *({**STEPS, "seed": seed} for seed in (11, 12, 13)),
     {"preset": "rotation", "seed": 14, "turn_deg": 8.0},
     {"preset": "rotation", "seed": 15, "turn_deg": 8.0},
     {"preset": "rotation", "seed": 16, "turn_deg": 20.0, "length_mm": 2.0, "frames": 160},
@@ -75,24 +75,24 @@ def settings_of(options):
 
 def curves_of(folder):
     """Curves of the default probe, as data/README.md makes them."""
-    return calibrate_curves([load_sweep(simulated(settings_of(each), folder)) for each in CURVE_SWEEPS])
+    return calibrate_curves([load_sweep(sweep_file(settings_of(o), folder)) for o in CURVE_SWEEPS])
 
 
 def measure(options, curves, folder, seed):
     """Reconstruct and score one sweep of a case."""
-    sweep = load_sweep(simulated(settings_of({**options, "seed": seed}), folder))
+    sweep = load_sweep(sweep_file(settings_of({**options, "seed": seed}), folder))
     centre, pairs = sweep.grid.centre_mm, []
-    tracked = track(sweep, curves, sink=pairs.append)
-    poses = {"image": tracked.image}
-    poses |= {mode: each.poses for mode, each in correct(tracked, sweep, MODES[1:]).items()}
-    length, true = (accumulated(each, centre).length_mm for each in (tracked.image, sweep.truth))
+    tracking = track(sweep, curves, sink=pairs.append)
+    poses = {"image": tracking.image}
+    poses |= {mode: m.poses for mode, m in correct(tracking, sweep, MODES[1:]).items()}
+    length, true = (accumulated(p, centre).length_mm for p in (tracking.image, sweep.truth))
     return Result(
         seed,
         compare_modes(poses, sweep.truth, centre, end_frames=1),
-        _direction_without_tracker(sweep, tracked.image),
+        _direction_without_tracker(sweep, tracking.image),
         float(np.sqrt(np.mean(np.diff(length - true) ** 2))),
-        _standard_poses(sweep, tracked),
-        np.concatenate([_standard_patches(sweep, some) for some in pairs]),
+        _standard_poses(sweep, tracking),
+        np.concatenate([_standard_patches(sweep, table) for table in pairs]),
     )
 
 
@@ -102,24 +102,24 @@ def _direction_without_tracker(sweep, image):
     return "undecided" if source == "assumed" else "right" if sign > 0 else "wrong"
 
 
-def _standard_poses(sweep, tracked):
+def _standard_poses(sweep, tracking):
     """Errors of every eighth pose over their deviations, shape (m, 6)."""
-    centre, true, image = sweep.grid.centre_mm, sweep.truth[0].inv() * sweep.truth, tracked.image
-    turned = (image.rotation * true.rotation.inv()).as_rotvec()
-    error = np.hstack([image.apply(centre) - true.apply(centre), turned])
-    return (error / np.sqrt(np.maximum(np.diagonal(tracked.covariance, axis1=1, axis2=2), 1e-30)))[8::8]
+    centre, true, image = sweep.grid.centre_mm, sweep.truth[0].inv() * sweep.truth, tracking.image
+    rotation = (image.rotation * true.rotation.inv()).as_rotvec()
+    error = np.hstack([image.apply(centre) - true.apply(centre), rotation])
+    return (error / np.sqrt(np.maximum(np.diagonal(tracking.covariance, axis1=1, axis2=2), 1e-30)))[8::8]
 
 
 def _standard_patches(sweep, pairs):
     """Errors of the distances of patches over their deviations."""
-    found = []
+    errors = []
     for i, j, pose, d, sigma in zip(
         pairs.first, pairs.second, pairs.first_from_second, pairs.distance_mm, pairs.sigma_mm, strict=True
     ):
         at = np.pad(pairs.patch_centre_mm - pose[:2, 3], ((0, 0), (0, 1)))
         z = (sweep.truth[int(i)].inv() * sweep.truth[int(j)]).apply(at)[:, 2]
-        found.append((d - np.abs(z)) / sigma)
-    values = np.concatenate(found)
+        errors.append((d - np.abs(z)) / sigma)
+    values = np.concatenate(errors)
     return values[np.isfinite(values)]
 
 
@@ -127,19 +127,19 @@ def report(case, results):
     """Print the table of one case, a row for each mode."""
     print(f"\n{case}: {len(results)} sweeps of {VECTORS} vectors; absolute errors: median, worst (seed)")
     for mode in MODES:
-        rows = [(row, each.seed) for each in results for row in each.rows if row.mode == mode]
+        rows = [(row, result.seed) for result in results for row in result.rows if row.mode == mode]
         cells = []
         for name in ("length_error_percent", "tilt_error_deg", "yaw_error_deg"):
             errors = [(abs(getattr(row, name)), seed) for row, seed in rows]
             worst, seed = max(errors)
             cells.append(f"{np.median([error for error, _ in errors]):8.2f} {worst:6.2f} ({seed})")
         print(f"  {mode:12} length, % {cells[0]}   tilt, deg {cells[1]}   yaw {cells[2]}")
-    print(f"  steps wrong by {1e3 * np.median([each.jitter_mm for each in results]):.1f} um rms")
-    words = [each.direction for each in results]
+    print(f"  steps wrong by {1e3 * np.median([r.jitter_mm for r in results]):.1f} um rms")
+    words = [r.direction for r in results]
     shares = ", ".join(f"{word} in {words.count(word)}" for word in ("right", "wrong", "undecided"))
     print(f"  sign of the motion from the orientation sensor alone: {shares}")
-    poses = np.concatenate([each.poses for each in results])
-    shares = {"patches": np.concatenate([each.patches for each in results])}
+    poses = np.concatenate([r.poses for r in results])
+    shares = {"patches": np.concatenate([r.patches for r in results])}
     shares |= dict(zip(PARTS, poses.T, strict=True)) | {"all of the pose": poses}
     print("  within 68 / 95 % intervals: " + ", ".join(f"{k} {_coverage(v)}" for k, v in shares.items()))
 
@@ -156,8 +156,8 @@ def main():
     parser.add_argument("--workers", type=int, default=2, help="sweeps at a time, a process each")
     parser.add_argument("--case", default="", help="only cases whose name holds this")
     parser.add_argument("--cache", type=Path, default=DEFAULT)
-    options = parsed(parser, seeds=1, case="tissue, 8 mm", workers=1)
-    curves = read_curves(SHIPPED) if options.quick else curves_of(options.cache)
+    options = parse_options(parser, seeds=1, case="tissue, 8 mm", workers=1)
+    curves = read_curves(CURVES_FILE) if options.quick else curves_of(options.cache)
     seeds = range(options.first, options.first + options.seeds)
     print(f"seeds {seeds[0]} to {seeds[-1]}; curves from other sweeps, of seeds 11 to 16")
     # Spawned, not forked: numba's threads do not survive a fork.

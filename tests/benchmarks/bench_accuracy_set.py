@@ -16,7 +16,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from accuracy_set import CASES, INDEPENDENT, MOST_CLAIMS, TABLE, AccuracySet, read_table, simulate_set
-from options import parsed
+from options import parse_options
 
 HEAD = """\
 # By tests/benchmarks/bench_accuracy_set.py, but for goals and for `missed`: why goals are not asserted yet.
@@ -27,27 +27,27 @@ HEAD = """\
 def row(errors, before):
     """Values of a row, and which of its goals it misses."""
     values = {"length_percent": round(errors.length_percent, 2), "tilt_deg": round(errors.tilt_deg, 2)}
-    missed = []
+    misses = []
     if errors.claim_percent is not None:
         values["claim_percent"] = round(errors.claim_percent, 2)
         if errors.over_claim > MOST_CLAIMS:
-            missed.append(f"{errors.over_claim:.1f} claims")
+            misses.append(f"{errors.over_claim:.1f} claims")
     for goal, value in (("goal_percent", errors.length_percent), ("goal_deg", errors.tilt_deg)):
         if goal in before:
             values[goal] = before[goal]
             if abs(value) > before[goal]:
-                missed.append(f"{value:+.2f} for {goal} {before[goal]:g}")
-    if missed and "missed" in before:
+                misses.append(f"{value:+.2f} for {goal} {before[goal]:g}")
+    if misses and "missed" in before:
         values["missed"] = before["missed"]
-    return values, missed
+    return values, misses
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--keep", type=Path, help="folder of the simulated sweeps, made if it is not there")
     parser.set_defaults(cases="")
-    options = parsed(parser, cases="phantom, 3.5 mm")
-    before, lines, unsaid = read_table() if TABLE.exists() else {}, [], []
+    options = parse_options(parser, cases="phantom, 3.5 mm")
+    before, lines, surprises = read_table() if TABLE.exists() else {}, [], []
     with tempfile.TemporaryDirectory() as scratch:
         folder = options.keep or Path(scratch) / "sweeps"
         data_folder = TABLE.parents[2] / "data"
@@ -60,9 +60,9 @@ def main():
                 sys.exit(f"expected sweeps of another physics in {INDEPENDENT}")
             for mode, errors in accuracy_set.errors(case).items():
                 name = f"{case} | {mode}"
-                values, missed = row(errors, before.get(name, {}))
-                if missed and "missed" not in values:
-                    unsaid.append(f"{name}: {', '.join(missed)}")
+                values, misses = row(errors, before.get(name, {}))
+                if misses and "missed" not in values:
+                    surprises.append(f"{name}: {', '.join(misses)}")
                 cells = (
                     f"{key} = {v!r}" if not isinstance(v, str) else f'{key} = "{v}"'
                     for key, v in values.items()
@@ -72,8 +72,8 @@ def main():
     if options.quick:
         return
     TABLE.write_text(HEAD + "\n".join(lines) + "\n", encoding="utf-8")
-    if unsaid:
-        sys.exit("\n".join(["misses its goal:", *unsaid]))
+    if surprises:
+        sys.exit("\n".join(["misses its goal:", *surprises]))
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import numpy as np
 from commands import run_command
 from handheld import PITCH_MM, write_handheld
-from options import parsed
+from options import parse_options
 from scipy.spatial.transform import RigidTransform
 
 from calibration.detection.lines import detect_lines
@@ -36,7 +36,7 @@ FIRST_SEED = 3001
 """Seeds that no test and no development used."""
 
 
-def simulated(preset, seed, frames, **settings):
+def simulate_sweep(preset, seed, frames, **settings):
     settings = SimulationSettings(preset=preset, seed=seed, frames=frames, **settings)
     return simulate(settings)[0].sweep
 
@@ -48,25 +48,25 @@ def recording_of(sweep, sensor):
 
 def plane(reflector, seed, frames):
     """Name and calibration of both sensors by one scan of a plane."""
-    sweep = simulated("plane", seed, frames, reflector=reflector, duration_s=frames / 5)
-    turned, placed = (recording_of(sweep, sensor) for sensor in (sweep.orientation, sweep.tracker))
-    seen = detect_lines(turned.images, turned.pixel_mm)
+    sweep = simulate_sweep("plane", seed, frames, reflector=reflector, duration_s=frames / 5)
+    orientation, tracker = (recording_of(sweep, sensor) for sensor in (sweep.orientation, sweep.tracker))
+    lines = detect_lines(orientation.images, orientation.pixel_mm)
     for level in (False, True):
-        outcome = solved(turned, seen, OrientationSettings(level=level))
+        outcome = solved(orientation, lines, OrientationSettings(level=level))
         yield f"orientation sensor, {'level' if level else 'any'} plane", outcome.calibration
-    for held in (False, True):
-        outcome = solved(placed, seen, PlaneSettings(fixed_pixels=held, reflector="bar"))
-        yield f"tracker, pixels {'held' if held else 'fitted'}", outcome.calibration
+    for fixed in (False, True):
+        outcome = solved(tracker, lines, PlaneSettings(fixed_pixels=fixed, reflector="bar"))
+        yield f"tracker, pixels {'held' if fixed else 'fitted'}", outcome.calibration
 
 
 def wires(seed, frames):
-    sweep = simulated("wires", seed, frames, vectors=64)
+    sweep = simulate_sweep("wires", seed, frames, vectors=64)
     recording = recording_of(sweep, sweep.tracker)
     yield "tracker", solved(recording, found(recording, WireSettings()), WireSettings()).calibration
 
 
 def handheld(reflector, seed, frames):
-    sweep = simulated("plane", seed, frames, reflector=reflector, vectors=48, signal="iq")
+    sweep = simulate_sweep("plane", seed, frames, reflector=reflector, vectors=48, signal="iq")
     with tempfile.TemporaryDirectory() as folder:
         settings, out = Path(folder) / "import.toml", Path(folder) / "mounting.h5"
         settings.write_text(f"vector_pitch_mm = {PITCH_MM}\nbandwidth_hz = [5e6, 10e6]\n", encoding="utf-8")
@@ -87,27 +87,27 @@ SCANS = {
 def errors_of(calibration):
     """Errors about and along the image's x, y, z, degrees and mm, and those claimed; NaN without a place."""
     units = np.repeat([180.0 / np.pi, 1.0], 3)
-    claimed = np.full(6, np.nan)
+    sigma = np.full(6, np.nan)
     variance = np.diag(calibration.covariance)[:6]
-    claimed[: variance.size] = np.sqrt(variance)
+    sigma[: variance.size] = np.sqrt(variance)
     if calibration.sensor == "orientation":
         shift, turn = np.full(3, np.nan), ORIENTATION_FROM_IMAGE.inv() * calibration.rotation
     else:
         place = RigidTransform.from_components(calibration.translation_mm, calibration.rotation)
         shift, turn = (TRACKER_FROM_IMAGE.inv() * place).as_components()
-    return np.array([[*turn.as_rotvec(), *shift], claimed]) * units
+    return np.array([[*turn.as_rotvec(), *shift], sigma]) * units
 
 
 def report(name, errors):
     """Print bias, spread and claims of some scans."""
-    known = ~np.isnan(errors[0, 0])
-    error, claimed = errors[:, 0, known], errors[:, 1, known]
-    scores = error / claimed
+    finite = ~np.isnan(errors[0, 0])
+    error, sigma = errors[:, 0, finite], errors[:, 1, finite]
+    scores = error / sigma
     print(f"  {name}, {len(error)} scans: tilt, yaw, roll (and x, y, z)")
     rows = {
         "mean error, deg, mm": error.mean(axis=0),
         "standard deviation": error.std(axis=0, ddof=min(1, len(error) - 1)),
-        "claimed": np.median(claimed, axis=0),
+        "claimed": np.median(sigma, axis=0),
         "rms over claims": np.sqrt(np.mean(scores**2, axis=0)),
     }
     for row, values in rows.items():
@@ -126,19 +126,19 @@ def main():
     parser.add_argument("--scans", type=int, default=25)
     parser.add_argument("--frames", type=int, default=100)
     parser.add_argument("--first-seed", type=int, default=FIRST_SEED)
-    options = parsed(parser, phantoms=["bar", "handheld"], scans=1, frames=40)
+    options = parse_options(parser, phantoms=["bar", "handheld"], scans=1, frames=40)
     for phantom in options.phantoms or SCANS:
         print(
             f"{phantom}, {options.frames} frames (published, plane: sd of tilt, yaw, roll 1.50, 1.10, 0.08)"
         )
-        collected = {}
+        errors_by_name = {}
         for seed in range(options.first_seed, options.first_seed + options.scans):
             try:
                 for name, calibration in SCANS[phantom](seed, options.frames):
-                    collected.setdefault(name, []).append(errors_of(calibration))
+                    errors_by_name.setdefault(name, []).append(errors_of(calibration))
             except InsufficientDataError as error:
                 print(f"  seed {seed} refused: {error}")
-        for name, errors in collected.items():
+        for name, errors in errors_by_name.items():
             report(name, np.array(errors))
 
 

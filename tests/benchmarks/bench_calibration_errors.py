@@ -14,14 +14,14 @@ import time
 from importlib import import_module
 from pathlib import Path
 
-from options import parsed
+from options import parse_options
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("NUMBA_NUM_THREADS", "1")
 
-HERE = Path(__file__).resolve().parent
-sys.path.insert(0, str(HERE.parent))  # processes of trials have it, too
-KINDS = sorted(path.stem for path in (HERE / "calibration_errors").glob("[!_]*.py") if path.stem != "rows")
+FOLDER = Path(__file__).resolve().parent
+sys.path.insert(0, str(FOLDER.parent))  # processes of trials have it, too
+KINDS = sorted(path.stem for path in (FOLDER / "calibration_errors").glob("[!_]*.py") if path.stem != "rows")
 FIRST_SEED = 900_001
 
 
@@ -30,19 +30,19 @@ def main():
     parser.add_argument("kinds", nargs="*", metavar="KIND", help=f"any of: {', '.join(KINDS)}; or all")
     parser.add_argument("--share", type=float, default=1.0, help="of the trials")
     parser.add_argument("--first-seed", type=int, default=FIRST_SEED)
-    options = parsed(parser, share=0.02, kinds=["clock", "motions", "plane"])
+    options = parse_options(parser, share=0.02, kinds=["clock", "motions", "plane"])
     if unknown := sorted(set(options.kinds) - set(KINDS)):
         parser.error(f"expected kinds among {', '.join(KINDS)}, got {', '.join(unknown)}")
-    missed = 0
+    misses = 0
     for kind in options.kinds or KINDS:
-        started = time.perf_counter()
+        start_s = time.perf_counter()
         rows = import_module(f"calibration_errors.{kind}").measure(options.share, options.first_seed)
-        print(f"{kind} ({time.perf_counter() - started:.0f} s)", flush=True)
+        print(f"{kind} ({time.perf_counter() - start_s:.0f} s)", flush=True)
         for row in rows:
-            print(f"  {'' if row.reached else 'MISSED '}{row.case}: {row.found} (target {row.target})")
-        missed += sum(not row.reached for row in rows)
+            print(f"  {'' if row.is_on_target else 'MISSED '}{row.case}: {row.figures} (target {row.target})")
+        misses += sum(not row.is_on_target for row in rows)
     # The few trials of a quick run miss some by chance.
-    sys.exit(1 if missed and not options.quick else 0)
+    sys.exit(1 if misses and not options.quick else 0)
 
 
 if __name__ == "__main__":

@@ -9,8 +9,8 @@ import os
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-from cache import simulated
-from options import parsed
+from cache import sweep_file
+from options import parse_options
 
 from calibration.clock.images import delay_from_images
 from calibration.points import Recording
@@ -25,15 +25,15 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--scans", type=int, default=3)
     parser.add_argument("--frames", type=int, default=100)
-    options = parsed(parser, scans=1, frames=60)
+    options = parse_options(parser, scans=1, frames=60)
     for seed in range(FIRST_SEED, FIRST_SEED + options.scans):
         frames = {"frames": options.frames, "length_mm": options.frames / 5.0}
         settings = SimulationSettings(preset="reversal", seed=seed, vectors=32, samples=1909, **frames)
-        sweep = load_sweep(simulated(settings))
+        sweep = load_sweep(sweep_file(settings))
         images, tracker = GreyImages(sweep, 60.0, clipped=False), sweep.tracker
-        tracked = Recording(images, images.grid, sweep.frame_time_s, tracker.readings)
-        found = delay_from_images(tracked, tracker.sensor_from_image)
-        off_ms, claim_ms = 1e3 * (found.seconds - tracker.time_offset_s), 1e3 * found.standard_error_s
+        recording = Recording(images, images.grid, sweep.frame_time_s, tracker.readings)
+        offset = delay_from_images(recording, tracker.sensor_from_image)
+        off_ms, claim_ms = 1e3 * (offset.seconds - tracker.time_offset_s), 1e3 * offset.standard_error_s
         print(f"seed {seed}: {off_ms:+.1f} ms off, claimed {claim_ms:.1f} ms")
 
 

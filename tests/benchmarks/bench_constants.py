@@ -16,7 +16,7 @@ from pathlib import Path
 from unittest.mock import patch
 
 import numpy as np
-from options import parsed
+from options import parse_options
 
 import speckle3d.motion
 from speckle3d.core.errors import Speckle3DError
@@ -24,7 +24,7 @@ from speckle3d.io.curves import read_curves
 from speckle3d.io.load import load_sweep
 from speckle3d.tracking import track
 
-SHIPPED = Path(__file__).resolve().parents[2] / "data"
+DATA = Path(__file__).resolve().parents[2] / "data"
 NOT_OF_THE_PATH = ("diffraction", "lens", "phantom")
 """Modules of curves, which change no estimate."""
 MODULES = [
@@ -68,11 +68,11 @@ def travels(sweeps, curves):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("sweeps", nargs="*", type=Path, default=[SHIPPED / "phantom.h5"])
-    parser.add_argument("--curves", type=Path, default=SHIPPED / "curves.h5")
+    parser.add_argument("sweeps", nargs="*", type=Path, default=[DATA / "phantom.h5"])
+    parser.add_argument("--curves", type=Path, default=DATA / "curves.h5")
     parser.add_argument("--frames", type=int, default=100000, help="of each sweep, at most")
     parser.add_argument("--most", type=int, default=1000, help="changes, at most")
-    options = parsed(parser, frames=12, most=4)
+    options = parse_options(parser, frames=12, most=4)
     sweeps = [load_sweep(path) for path in options.sweeps]
     sweeps = [sweep.part(0, min(options.frames, len(sweep))) for sweep in sweeps]
     curves, rows = read_curves(options.curves), {}

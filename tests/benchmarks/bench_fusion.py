@@ -15,7 +15,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from broad import OFFLINE, ONLINE, coverage, errors_deg, estimate, read_trial, trials_in
 from field_scenes import scene, simulate_motion
-from options import parsed
+from options import parse_options
 
 METHODS = ONLINE + OFFLINE
 GROUPS = {"undisturbed": "_undisturbed_", "disturbed": "_disturbed_", "all": ""}
@@ -33,21 +33,21 @@ def trials(folder):
 
 
 def row(cells):
-    return "".join(f"{both[0]:8.2f} ({both[1]:.2f})  " for both in cells)
+    return "".join(f"{errors[0]:8.2f} ({errors[1]:.2f})  " for errors in cells)
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path, nargs="?")
-    options = parsed(parser, folder=None)
+    options = parse_options(parser, folder=None)
     print(f"{'RMS, degrees (without constant heading)':42}" + "".join(f"{m:^16}" for m in METHODS))
     cells, shares = {}, []
     for name, log, true, moving in trials(options.folder):
-        found = [estimate(log, method) for method in METHODS]
+        estimates = [estimate(log, method) for method in METHODS]
         cells[name] = np.array(
-            [[errors_deg(f.wxyz, true, moving, steady)[0] for steady in (False, True)] for f in found]
+            [[errors_deg(f.wxyz, true, moving, steady)[0] for steady in (False, True)] for f in estimates]
         )
-        shares.append([coverage(f, true, moving) for f in found[1::2]])
+        shares.append([coverage(f, true, moving) for f in estimates[1::2]])
         print(f"{name:42}{row(cells[name])}", flush=True)
     for label, mark in GROUPS.items():
         part = [cell for name, cell in cells.items() if mark in name]

@@ -18,7 +18,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import numpy as np
 import sweep_examples
-from options import parsed
+from options import parse_options
 
 from speckle3d.core.sweep import stored_dtype
 from speckle3d.io.load import load_sweep, open_recording
@@ -48,7 +48,7 @@ def write(path, sweep, compression, count):
             count.value = i + 1
 
 
-def killed(path, sweep, compression, wait_s):
+def count_until_kill(path, sweep, compression, wait_s):
     """Write in a process of its own and kill it; returns how many frames it counted."""
     count = FORK.Value("i", -1, lock=False)
     child = FORK.Process(target=write, args=(path, sweep, compression, count))
@@ -76,13 +76,13 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--kills", type=int, default=200)
     parser.add_argument("--seed", type=int, default=1)
-    options = parsed(parser, kills=8)
-    drawn, frames = random.Random(options.seed), 0
+    options = parse_options(parser, kills=8)
+    rng, frames = random.Random(options.seed), 0
     with tempfile.TemporaryDirectory() as folder:
         for k in range(options.kills):
             sweep, compression = KINDS[k % len(KINDS)]
             path = Path(folder) / f"{k}.h5"
-            count = killed(path, sweep, compression, drawn.uniform(0, LONGEST_S))
+            count = count_until_kill(path, sweep, compression, rng.uniform(0, LONGEST_S))
             if count:  # nothing can be read before the first
                 check(path, sweep, count)
             frames += count

@@ -15,9 +15,9 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import numpy as np
-from cache import simulated
+from cache import sweep_file
 from crossing_scenes import displace
-from options import parsed
+from options import parse_options
 
 from calibration.images.similarity import prepare
 from calibration.images.solver import calibrate_from_sweeps
@@ -29,20 +29,20 @@ from speckle3d.simulation.presets import SimulationSettings
 from speckle3d.simulation.sensors import TRACKER_FROM_IMAGE
 from speckle3d.study.images import GreyImages
 
-SAME_MM = 0.5
+AGREEMENT_MM = 0.5
 TRUTH = TRACKER_FROM_IMAGE
 
 
-def opened(path):
+def read_recording(path):
     """A sweep as B-mode with its tracker's readings, which do not say how the image sits."""
     sweep = load_sweep(path)
     images = GreyImages(sweep, 60.0, clipped=False)
-    held = np.stack([images[k] for k in range(len(sweep))])
+    frames = np.stack([images[k] for k in range(len(sweep))])
     tracker = sweep.tracker
-    return Recording(held, images.grid, sweep.frame_time_s, tracker.readings, tracker.time_offset_s)
+    return Recording(frames, images.grid, sweep.frame_time_s, tracker.readings, tracker.time_offset_s)
 
 
-def prepared(seed, frames=160):
+def prepare_pair(seed, frames=160):
     """A simulated pair of sweeps, read."""
     settings = SimulationSettings(
         preset="crossed",
@@ -54,7 +54,7 @@ def prepared(seed, frames=160):
         samples=3000,
         uncalibrated=True,
     )
-    return prepare(*(opened(simulated(settings, number=number)) for number in (0, 1)))
+    return prepare(*(read_recording(sweep_file(settings, number=number)) for number in (0, 1)))
 
 
 def study(crossing, starts):
@@ -62,8 +62,8 @@ def study(crossing, starts):
     rng, rows = np.random.default_rng(183), []
     for _ in range(starts):
         try:
-            found = calibrate_from_sweeps(crossing, displace(TRUTH, rng), ImageFit()).sensor_from_image
-            error = (TRUTH.inv() * found).apply(crossing.centre_mm) - crossing.centre_mm
+            estimate = calibrate_from_sweeps(crossing, displace(TRUTH, rng), ImageFit()).sensor_from_image
+            error = (TRUTH.inv() * estimate).apply(crossing.centre_mm) - crossing.centre_mm
         except InsufficientDataError:
             error = np.full(3, np.inf)
         rows.append(error)
@@ -75,13 +75,13 @@ def main():
     parser.add_argument("--starts", type=int, default=183)
     parser.add_argument("--seed", type=int, default=601)
     parser.add_argument("--frames", type=int, default=160)
-    options = parsed(parser, starts=1, frames=40)
-    errors = study(prepared(options.seed, options.frames), options.starts)
+    options = parse_options(parser, starts=1, frames=40)
+    errors = study(prepare_pair(options.seed, options.frames), options.starts)
     middle = np.median(errors, axis=0)
     with np.errstate(invalid="ignore"):
-        same = np.mean(np.linalg.norm(errors - middle, axis=1) < SAME_MM)
+        agreement = np.mean(np.linalg.norm(errors - middle, axis=1) < AGREEMENT_MM)
     print(
-        f"pair {options.seed}, {len(errors)} starts: {same:.1%} reach the same answer; centre off by "
+        f"pair {options.seed}, {len(errors)} starts: {agreement:.1%} reach the same answer; centre off by "
         f"{np.median(np.linalg.norm(errors, axis=1)):.3f} mm median, along x, y, z by {middle.round(3)}"
     )
 

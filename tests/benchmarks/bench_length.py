@@ -12,7 +12,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 from cache import DEFAULT
 from length import crossing, sweeps
-from options import parsed
+from options import parse_options
 
 FIRST_SEED = 970_001
 """Judged seeds count from here; development used 1 to 99."""
@@ -25,7 +25,7 @@ def main():
     parser.add_argument("--seeds", type=int, default=6, help="RF sweeps of each case")
     parser.add_argument("--share", type=float, default=1.0, help="of the cheaper cases")
     parser.add_argument("--workers", type=int, default=2)
-    options = parsed(parser, part=["crossing"], share=0.01)
+    options = parse_options(parser, part=["crossing"], share=0.01)
     seeds = range(options.first_seed, options.first_seed + options.seeds)
     parts = {
         "sweeps": lambda: sweeps.measure(seeds, DEFAULT, options.workers),

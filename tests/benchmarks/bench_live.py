@@ -12,7 +12,7 @@ from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
-from options import parsed
+from options import parse_options
 
 import speckle3d as s3
 from speckle3d.io.igtl.link import Connection, Server
@@ -21,7 +21,7 @@ from speckle3d.io.import_settings import ImportSettings
 from speckle3d.live.session import Session, SessionSettings
 from speckle3d.live.warming import warm_up
 
-SHIPPED = Path(__file__).resolve().parents[2] / "data"
+DATA = Path(__file__).resolve().parents[2] / "data"
 
 
 def play(path, seconds, answers):
@@ -30,16 +30,16 @@ def play(path, seconds, answers):
     ahead = [np.asarray(sweep.frames[k]).T for k in range(len(sweep))]
     order = ahead + ahead[-2:0:-1]
     interval_s = float(np.median(np.diff(sweep.frame_time_s)))
-    sent, delays, over = {}, [], threading.Event()
+    send_time_s, delays, over = {}, [], threading.Event()
     with Server(0) as server:
         answers.put(server.port)
         server.wait_connected(60.0)
 
         def listen():
             while not over.is_set():
-                messages, now = server.receive(0.05), time.monotonic()
-                poses = (each for each in messages if isinstance(each, TransformReceived))
-                delays.extend(now - sent[round(each.time_s / interval_s)] for each in poses)
+                messages, time_s = server.receive(0.05), time.monotonic()
+                poses = (m for m in messages if isinstance(m, TransformReceived))
+                delays.extend(time_s - send_time_s[round(m.time_s / interval_s)] for m in poses)
 
         listening = threading.Thread(target=listen)
         listening.start()
@@ -47,7 +47,7 @@ def play(path, seconds, answers):
         for k in range(count):
             message = packed_image("Image", (k + 1) * interval_s, order[k % len(order)], np.eye(4))
             time.sleep(max(0.0, begin + k * interval_s - time.monotonic()))
-            sent[k + 1] = time.monotonic()
+            send_time_s[k + 1] = time.monotonic()
             server.send(message)
         time.sleep(2.0)
         over.set()
@@ -57,31 +57,31 @@ def play(path, seconds, answers):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("sweep", type=Path, nargs="?", default=SHIPPED / "phantom.h5")
-    parser.add_argument("curves", type=Path, nargs="?", default=SHIPPED / "curves.h5")
+    parser.add_argument("sweep", type=Path, nargs="?", default=DATA / "phantom.h5")
+    parser.add_argument("curves", type=Path, nargs="?", default=DATA / "curves.h5")
     parser.add_argument("--seconds", type=float, default=20.0)
-    options = parsed(parser, seconds=2.0)
+    options = parse_options(parser, seconds=2.0)
     curves, sweep = s3.load_curves(options.curves), s3.load_sweep(options.sweep)
     signal = {
         name: getattr(sweep.signal, name)
         for name in vars(sweep.signal)
         if name in ImportSettings.model_fields
     }
-    imported = ImportSettings(vector_pitch_mm=sweep.grid.vector_pitch_mm, **signal)
+    geometry = ImportSettings(vector_pitch_mm=sweep.grid.vector_pitch_mm, **signal)
     warm_up(curves, s3.Config())
     context = get_context("spawn")
     answers = context.Queue()
     playing = context.Process(target=play, args=(options.sweep, options.seconds, answers))
     playing.start()
     with tempfile.TemporaryDirectory() as folder, Connection("127.0.0.1", answers.get()) as connection:
-        settings = SessionSettings(Path(folder) / "sweep.h5", imported=imported, volume=True, check=True)
+        settings = SessionSettings(Path(folder) / "sweep.h5", imported=geometry, volume=True, check=True)
         Session(connection, [connection.send], curves, settings).run(options.seconds + 3.0)
         count, delays = answers.get()
-        kept = len(s3.load_sweep(settings.recording))
+        length = len(s3.load_sweep(settings.recording))
     playing.join()
     middle, late, last = 1e3 * np.quantile(delays, [0.5, 0.95, 1.0])
     grid = sweep.grid
-    print(f"{grid.vectors} x {grid.samples}: {count} frames sent, {kept} recorded, {len(delays)} placed")
+    print(f"{grid.vectors} x {grid.samples}: {count} frames sent, {length} recorded, {len(delays)} placed")
     print(f"delay of poses, ms: median {middle:.0f}, 95 % {late:.0f}, largest {last:.0f}")
 
 

@@ -15,7 +15,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import numpy as np
 import spoiled_images as spoil
 from accuracy_set import SHEET, grey
-from options import parsed
+from options import parse_options
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.errors import Speckle3DError
@@ -31,7 +31,7 @@ falls to 1/e on either side of a vessel in the middle of the image."""
 
 
 @dataclass(frozen=True)
-class Deformed:
+class MovingMedium:
     """A medium whose scatterers have moved along the beam by some share or depth since the first frame."""
 
     medium: object
@@ -43,9 +43,9 @@ class Deformed:
         apart = self.poses.translation - medium_from_image.translation
         frame = int(np.argmin((apart**2).sum(axis=1)))
         for position, strength in self.medium.scatterers(medium_from_image, box):
-            moved = position.copy()
-            moved[:, 1] += self.shift_mm(position[:, 1], frame)
-            yield moved, strength
+            place = position.copy()
+            place[:, 1] += self.shift_mm(position[:, 1], frame)
+            yield place, strength
 
 
 def moving(sweep):
@@ -56,10 +56,10 @@ def moving(sweep):
     middle = sweep.grid.depth_mm / 2
 
     def along_beam(shift_mm):
-        return replace(frames, medium=Deformed(frames.medium, poses, shift_mm))
+        return replace(frames, medium=MovingMedium(frames.medium, poses, shift_mm))
 
-    def along_sweep(moved_mm):
-        back = RigidTransform.from_translation(np.outer(moved_mm, [0.0, 0.0, -1.0]))
+    def along_sweep(shift_mm):
+        back = RigidTransform.from_translation(np.outer(shift_mm, [0.0, 0.0, -1.0]))
         return replace(frames, medium_from_image=back * poses)
 
     return {
@@ -106,10 +106,10 @@ def in_memory(sweep):
 
 def cases(sweep, is_bmode):
     """The same sweep as it is and in all those ways, by name."""
-    shown = {name: in_memory(replace(sweep, frames=frames)) for name, frames in moving(sweep).items()}
-    shown |= dict(spoilt(shown["at rest"], is_bmode))
-    is_echo = {name: case.signal == sweep.signal for name, case in shown.items()}
-    return {name: in_memory(grey(c)) if is_bmode and is_echo[name] else c for name, c in shown.items()}
+    sweeps = {name: in_memory(replace(sweep, frames=frames)) for name, frames in moving(sweep).items()}
+    sweeps |= dict(spoilt(sweeps["at rest"], is_bmode))
+    is_echo = {name: case.signal == sweep.signal for name, case in sweeps.items()}
+    return {name: in_memory(grey(c)) if is_bmode and is_echo[name] else c for name, c in sweeps.items()}
 
 
 def main():
@@ -119,7 +119,7 @@ def main():
     parser.add_argument("--length-mm", type=float, default=6.0)
     parser.add_argument("--vectors", type=int, default=36)
     parser.add_argument("--signal", choices=("rf", "bmode"), default="rf")
-    options = parsed(parser, seeds=1, length_mm=1.5, vectors=20)
+    options = parse_options(parser, seeds=1, length_mm=1.5, vectors=20)
     size = {"length_mm": options.length_mm, "vectors": options.vectors, "samples": 2600}
     rows = {}
     for seed in range(options.first_seed, options.first_seed + options.seeds):
@@ -128,21 +128,21 @@ def main():
         for name, case in cases(sweep, options.signal == "bmode").items():
             true = np.ptp((case.truth[0].inv() * case.truth).apply(centre)[:, 2])
             try:
-                tracked = track(replace(case, truth=None), data_sheet_curves(SHEET, case))
+                tracking = track(replace(case, truth=None), data_sheet_curves(SHEET, case))
             except Speckle3DError:
                 rows.setdefault(name, []).append((np.nan, np.nan, np.nan))
                 continue
-            length = np.ptp(tracked.image.apply(centre)[:, 2])
-            sigma = np.sqrt(tracked.covariance[:, 2, 2].max())
+            length = np.ptp(tracking.image.apply(centre)[:, 2])
+            sigma = np.sqrt(tracking.covariance[:, 2, 2].max())
             rows.setdefault(name, []).append((length / true - 1, sigma / length, (length - true) / sigma))
     print(f"{'':34s} length, % (nan: refused)   rms   claim, %   error over claim")
     for name, values in rows.items():
         error, claim, score = np.array(values)[np.isfinite(values).all(axis=1)].T
-        shown = " ".join(f"{100 * e:+6.1f}" for e, _, _ in values)
+        text = " ".join(f"{100 * e:+6.1f}" for e, _, _ in values)
         if error.size:
             rms = np.sqrt(np.mean(error**2))
-            shown += f"   {100 * rms:5.1f}   {100 * claim.mean():5.1f}   {np.abs(score).max():.1f}"
-        print(f"{name:34s} {shown}")
+            text += f"   {100 * rms:5.1f}   {100 * claim.mean():5.1f}   {np.abs(score).max():.1f}"
+        print(f"{name:34s} {text}")
 
 
 if __name__ == "__main__":

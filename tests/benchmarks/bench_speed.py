@@ -18,8 +18,8 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from bench_accuracy import curves_of
-from cache import DEFAULT, simulated, to_and_fro
-from options import parsed
+from cache import DEFAULT, sweep_file, to_and_fro
+from options import parse_options
 from speed import commands
 from speed.rows import print_table
 
@@ -36,17 +36,17 @@ def main():
     curves = cache(lambda: curves_of(DEFAULT))
 
     def long(frames):
-        return to_and_fro(simulated(SWEEP), frames)
+        return to_and_fro(sweep_file(SWEEP), frames)
 
     inputs = {
-        "tracking": lambda: ([simulated(SWEEP), long(commands.FRAMES[0])], curves()),
-        "patches": lambda: (simulated(SWEEP),),
+        "tracking": lambda: ([sweep_file(SWEEP), long(commands.FRAMES[0])], curves()),
+        "patches": lambda: (sweep_file(SWEEP),),
     }
     parts = ("tracking", "patches", "sensors", "commands", "voxels", "memory")
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--runs", type=int, default=7)
     parser.add_argument("--only", nargs="*", choices=parts, default=parts)
-    options = parsed(parser, runs=1, only=["commands"])
+    options = parse_options(parser, runs=1, only=["commands"])
     print(f"{platform.machine()}, {cores()} cores, {platform.system()}", flush=True)
     table = []
     for part in options.only:

@@ -13,7 +13,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import numpy as np
 from digital_phantom import LEVEL, Ball, Phantom, by_hand, voxel_volume
-from options import parsed
+from options import parse_options
 
 from speckle3d.core.grid import ImageGrid
 from speckle3d.core.volume import Volume
@@ -33,7 +33,7 @@ WAYS = ("nearest", "linear", "backward")
 STEP_MM = 0.25
 
 
-def made(way, images, grid, poses, voxel_grid):
+def volume_by(way, images, grid, poses, voxel_grid):
     if way != "backward":
         return compound(images, grid, poses, voxel_grid=voxel_grid, splat=way)
     voxels, _ = look_up_voxels(PosedImages(images, grid, poses), voxel_grid, 0.5)
@@ -44,7 +44,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--balls", type=int, default=len(BALLS))
     parser.add_argument("--frames", type=int, default=220)
-    options = parsed(parser, balls=1, frames=110)
+    options = parse_options(parser, balls=1, frames=110)
     balls = BALLS[: options.balls]
     phantom = Phantom(balls, ImageGrid(200, 230, 0.1, 0.1))
     poses = by_hand(options.frames, 0.1 * options.frames)
@@ -53,13 +53,13 @@ def main():
     print(f"known poses; voxels of {STEP_MM} mm, images 0.1 mm apart with pixels of 0.1 mm")
     print("            radius   volume, % of voxels   of mesh   vertices off, voxels: most, rms")
     for way in WAYS:
-        volume = made(way, images, grid, poses, voxel_grid)
+        volume = volume_by(way, images, grid, poses, voxel_grid)
         surface = surface_of(volume, LEVEL)
         part, middles = surface.parts(), surface.vertices_mm[surface.triangles].mean(axis=1)
         for ball in balls:
-            own = surface.of_triangles(part == part[np.abs(ball.depth(middles)).argmin()])
-            away = np.abs(ball.depth(own.vertices_mm)) / STEP_MM
-            sizes = [voxel_volume(volume, ball, STEP_MM), own.volume_mm3]
+            sphere = surface.of_triangles(part == part[np.abs(ball.depth(middles)).argmin()])
+            away = np.abs(ball.depth(sphere.vertices_mm)) / STEP_MM
+            sizes = [voxel_volume(volume, ball, STEP_MM), sphere.volume_mm3]
             of_voxels, of_mesh = (100 * (size / ball.volume_mm3 - 1) for size in sizes)
             off = f"{away.max():22.2f}{np.sqrt((away**2).mean()):6.2f}"
             print(f"{way:10}{ball.radius_mm:5.1f} mm{of_voxels:+21.2f}{of_mesh:+10.2f}{off}")

@@ -18,13 +18,13 @@ DEFAULT = Path(__file__).resolve().parents[2] / ".cache" / "sweeps"
 _SIMULATOR = ("simulation/*.py", "kernels/scatter.py", "kernels/diffraction.py", "core/geometry.py")
 
 
-def simulated(settings, folder=DEFAULT, number=0):
+def sweep_file(settings, folder=DEFAULT, number=0):
     """Sweep `number` of `settings` as a file, simulated once; streamed, so that its size does not matter."""
     stem = f"{settings.preset}-{settings.seed}-{key_of(settings.model_dump_json())}"
-    return written(folder / f"{stem}{number * '-crossing'}.h5", lambda: simulate(settings)[number].sweep)
+    return ensure_file(folder / f"{stem}{number * '-crossing'}.h5", lambda: simulate(settings)[number].sweep)
 
 
-def written(path, make):
+def ensure_file(path, make):
     """The path at which the sweep that `make` returns is, written if it was not."""
     if not path.is_file():
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -50,7 +50,7 @@ def to_and_fro(source, frames, folder=DEFAULT):
             path=None,
         )
 
-    return written(folder / f"{source.stem}-{frames}.h5", long)
+    return ensure_file(folder / f"{source.stem}-{frames}.h5", long)
 
 
 class _InOrder:

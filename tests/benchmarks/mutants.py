@@ -23,8 +23,8 @@ import pytest
 from speckle3d.core.errors import Speckle3DError
 
 ROOT = Path(__file__).resolve().parents[2]
-CHOSEN = "SPECKLE3D_MUTANT"
-NOT_APPLIED = 99
+VARIABLE = "SPECKLE3D_MUTANT"
+MISFIT = 99
 """How a run of tests ends in which a mutant's change itself failed."""
 
 
@@ -51,41 +51,41 @@ class Mutant:
         return [f"tests/{self.tests}"] if "/" in self.tests else ["tests/accuracy", "-k", self.tests]
 
 
-def unadapted(function, problem, *others):
+def without_tissue(function, problem, *arguments):
     from speckle3d.motion.coherence import Coherence
     from speckle3d.motion.planes import fully_developed
 
     return Coherence(np.zeros(1), *fully_developed(len(problem.patches)))
 
 
-def bent(function, sweep, curves, *others, **named):
+def bend_curves(function, sweep, curves, *arguments, **keywords):
     """Distances 8 % short at the skin, right at 20 mm, and long below: the curves of another lens."""
     distance, factor = curves.distance_mm, 1.0 + 0.004 * (curves.depth_mm - 20.0)
     rho = [np.interp(distance / f, distance, row) for f, row in zip(factor, curves.correlation, strict=True)]
-    return function(sweep, replace(curves, correlation=np.array(rho)), *others, **named)
+    return function(sweep, replace(curves, correlation=np.array(rho)), *arguments, **keywords)
 
 
-def without_curves(tracked):
+def without_curves(tracking):
     """Claims without what the curves' common error adds to the distance."""
-    covariance = tracked.covariance.copy()
-    z = tracked.image.apply(tracked.grid.centre_mm)[:, 2]
-    covariance[:, 2, 2] -= (tracked.curves_sigma * (z - z[0])) ** 2
-    return replace(tracked, covariance=covariance)
+    covariance = tracking.covariance.copy()
+    z = tracking.image.apply(tracking.grid.centre_mm)[:, 2]
+    covariance[:, 2, 2] -= (tracking.curves_sigma * (z - z[0])) ** 2
+    return replace(tracking, covariance=covariance)
 
 
-def overcorrected(function, tracked, *arguments, **named):
+def overcorrect(function, tracking, *arguments, **keywords):
     """Poses that are as far off the image's on the other side as the correction moved them."""
-    corrections = function(tracked, *arguments, **named)
-    for mode, each in corrections.items():
-        right = each.poses[0].inv() * each.poses
-        corrections[mode] = replace(each, poses=each.poses[0] * tracked.image * right.inv() * tracked.image)
+    corrections = function(tracking, *arguments, **keywords)
+    for mode, m in corrections.items():
+        right = m.poses[0].inv() * m.poses
+        corrections[mode] = replace(m, poses=m.poses[0] * tracking.image * right.inv() * tracking.image)
     return corrections
 
 
 def late(sweep):
     sensors = {"tracker": sweep.tracker, "orientation": sweep.orientation}
-    moved = {k: v and replace(v, time_offset_s=v.time_offset_s + 0.05) for k, v in sensors.items()}
-    return replace(sweep, **moved)
+    shifts = {k: v and replace(v, time_offset_s=v.time_offset_s + 0.05) for k, v in sensors.items()}
+    return replace(sweep, **shifts)
 
 
 def in_metres(read):
@@ -93,26 +93,26 @@ def in_metres(read):
     return read if place_mm is None else replace(read, translation_mm=1e-3 * place_mm)
 
 
-def enlarged(solution):
+def enlarge(solution):
     return replace(solution, chain=replace(solution.chain, pixel_mm=1.03 * solution.chain.pixel_mm))
 
 
-def returned(change):
+def on_return(change):
     """A change of what a function returns."""
-    return lambda function, *arguments, **named: change(function(*arguments, **named))
+    return lambda function, *arguments, **keywords: change(function(*arguments, **keywords))
 
 
 TRACK, DIRECTION = "speckle3d.pipeline:track", "speckle3d.motion.direction:settle_direction"
 COHERENCE = "speckle3d.motion.coherence:estimate_coherence"
 MUTANTS = {
-    "tissue correction off": Mutant(COHERENCE, unadapted, "tilt and tissue and not independent"),
-    "straightening as it is": Mutant(TRACK, bent, "tilt or length"),
-    "claims halved": Mutant(TRACK, returned(lambda t: replace(t, covariance=t.covariance / 4.0)), "claim"),
-    "claim without the curves' part": Mutant(TRACK, returned(without_curves), "claim"),
-    "drift correction in the wrong sense": Mutant("speckle3d.corrections:correct", overcorrected, "tilt"),
+    "tissue correction off": Mutant(COHERENCE, without_tissue, "tilt and tissue and not independent"),
+    "straightening as it is": Mutant(TRACK, bend_curves, "tilt or length"),
+    "claims halved": Mutant(TRACK, on_return(lambda t: replace(t, covariance=t.covariance / 4.0)), "claim"),
+    "claim without the curves' part": Mutant(TRACK, on_return(without_curves), "claim"),
+    "drift correction in the wrong sense": Mutant("speckle3d.corrections:correct", overcorrect, "tilt"),
     "mirror not resolved": Mutant(DIRECTION, lambda *_, **__: (1, "assumed"), "length and phantom"),
-    "sign of the motion": Mutant(DIRECTION, returned(lambda r: (-r[0], r[1])), "length and phantom"),
-    "sensors' clock off by 50 ms": Mutant("speckle3d.io.load:load_sweep", returned(late), "clock"),
+    "sign of the motion": Mutant(DIRECTION, on_return(lambda r: (-r[0], r[1])), "length and phantom"),
+    "sensors' clock off by 50 ms": Mutant("speckle3d.io.load:load_sweep", on_return(late), "clock"),
     "quaternion order swapped": Mutant(
         "speckle3d.core.geometry:rotations_from_quaternions",
         lambda function, wxyz, where: function(np.roll(wxyz, 1, axis=-1), where),
@@ -120,46 +120,46 @@ MUTANTS = {
     ),
     "voxels shifted by one": Mutant(
         "speckle3d.imaging.voxels.volume:compound",
-        returned(lambda volume: replace(volume, voxels=np.roll(volume.voxels, 1, axis=2))),
+        on_return(lambda volume: replace(volume, voxels=np.roll(volume.voxels, 1, axis=2))),
         "imaging/test_digital_phantom.py",
     ),
     "wires mislabelled": Mutant(
         "calibration.detection.labelling:label_by_calibration",
-        returned(lambda seen: replace(seen, wire=np.where(seen.wire < 2, 1 - seen.wire, seen.wire))),
+        on_return(lambda dots: replace(dots, wire=np.where(dots.wire < 2, 1 - dots.wire, dots.wire))),
         "calibration/detection/test_labelling.py",
     ),
     "calibration's scale 3 % off": Mutant(
-        "calibration.plane:calibrate_plane", returned(enlarged), "calibration/test_plane.py"
+        "calibration.plane:calibrate_plane", on_return(enlarge), "calibration/test_plane.py"
     ),
     "frames never flagged": Mutant(
-        "speckle3d.matching.quality:flag_frames", returned(np.zeros_like), "matching/test_quality.py"
+        "speckle3d.matching.quality:flag_frames", on_return(np.zeros_like), "matching/test_quality.py"
     ),
     "patches half a millimetre deeper": Mutant(
         "speckle3d.matching.patches:lay_patches",
-        returned(lambda grid: replace(grid, centre_mm=grid.centre_mm + np.array([0.0, 0.5]))),
+        on_return(lambda grid: replace(grid, centre_mm=grid.centre_mm + np.array([0.0, 0.5]))),
         "matching/test_patches.py",
     ),
     "planes without a side": Mutant(
         "speckle3d.motion.signs:on_path", lambda function, planes, path: planes, "motion/test_signs.py"
     ),
     "a sensor's spikes kept": Mutant(
-        "speckle3d.examine.sensors:spikes", returned(np.zeros_like), "examine/test_sensors.py"
+        "speckle3d.examine.sensors:spikes", on_return(np.zeros_like), "examine/test_sensors.py"
     ),
     "claims of fusion a third": Mutant(
         "speckle3d.correction.fused:fuse",
-        returned(lambda fused: replace(fused, covariance=fused.covariance / 9.0)),
+        on_return(lambda result: replace(result, covariance=result.covariance / 9.0)),
         "claim and fused and not independent",
     ),
     "mounting in metres": Mutant(
         "speckle3d.io.calibrations:read_calibration",
-        returned(in_metres),
+        on_return(in_metres),
         "io/test_calibrations.py",
     ),
     "wrong lines weigh as much": Mutant(
-        "calibration.robust:absolute_weights", returned(np.ones_like), "calibration/test_plane.py"
+        "calibration.robust:absolute_weights", on_return(np.ones_like), "calibration/test_plane.py"
     ),
     "worlds taken the other way": Mutant(
-        "xsens.logs.worlds:nwu_from", returned(lambda turn: turn.inv()), "xsens/logs/test_worlds.py"
+        "xsens.logs.worlds:nwu_from", on_return(lambda turn: turn.inv()), "xsens/logs/test_worlds.py"
     ),
 }
 
@@ -171,25 +171,25 @@ def apply(mutant):
     function = getattr(module, name)
 
     @wraps(function)
-    def changed(*arguments, **named):
+    def mutate(*arguments, **keywords):
         try:
-            return mutant.change(function, *arguments, **named)
+            return mutant.change(function, *arguments, **keywords)
         except Speckle3DError:
             raise  # what the package itself refuses
         except (AttributeError, KeyError, TypeError, ValueError) as error:
-            pytest.exit(f"{type(error).__name__}: {error}", NOT_APPLIED)
+            pytest.exit(f"{type(error).__name__}: {error}", MISFIT)
 
-    setattr(module, name, changed)
-
-
-if os.environ.get(CHOSEN):  # in a process of tests, as their plug-in
-    apply(MUTANTS[os.environ[CHOSEN]])
+    setattr(module, name, mutate)
 
 
-def tested(name, selection, folder):
+if os.environ.get(VARIABLE):  # in a process of tests, as their plug-in
+    apply(MUTANTS[os.environ[VARIABLE]])
+
+
+def run_tests(name, selection, folder):
     """Code with which the tests end, and their output."""
     paths = os.pathsep.join([str(ROOT), str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")])
-    environment = os.environ | {"PYTHONPATH": paths, CHOSEN: name, "SPECKLE3D_ACCURACY_SWEEPS": str(folder)}
+    environment = os.environ | {"PYTHONPATH": paths, VARIABLE: name, "SPECKLE3D_ACCURACY_SWEEPS": str(folder)}
     command = [
         sys.executable,
         "-m",
@@ -202,8 +202,8 @@ def tested(name, selection, folder):
         "-x",
         *selection,
     ]
-    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
-    return done.returncode, done.stdout + done.stderr
+    process = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
+    return process.returncode, process.stdout + process.stderr
 
 
 def main():
@@ -223,10 +223,10 @@ def main():
             folder.mkdir(parents=True)
             simulate_set(folder, ROOT / "data")
         for name in options.names or MUTANTS:
-            code, output = tested("", MUTANTS[name].selection, folder)
+            code, output = run_tests("", MUTANTS[name].selection, folder)
             if code:
                 sys.exit(f"{output}\nexpected tests that pass without a mutant")
-            code, output = tested(name, MUTANTS[name].selection, folder)
+            code, output = run_tests(name, MUTANTS[name].selection, folder)
             killers = re.findall(r"^(?:FAILED|ERROR) (\S.*?)(?: - .*)?$", output, re.MULTILINE)
             if code == 1 and killers:
                 print(f"{name}: killed by {'; '.join(killers)}", flush=True)

@@ -24,7 +24,7 @@ MOTION = "motion"
 """Refused with the true clock, too: the motion does not determine the calibration."""
 
 
-def recorded(seed):
+def simulate_recording(seed):
     """A recording of a plane, its lines, and its clock's true offset, s."""
     floor = Floor([seed, 50])
     rng, frame_s = floor.rng, floor.time_s
@@ -35,36 +35,36 @@ def recorded(seed):
     if kind == 2:
         sensor_s = sensor_s[rng.random(sensor_s.size) > 0.05]
     readings = TimedPoses(sensor_s - offset_s, floor.readings(sensor_s, drifts=bool(seed % 2)))
-    images, given_mm = np.zeros((len(frame_s), 2, 2), np.uint8), floor.pixel_mm * rng.uniform(0.99, 1.01, 2)
-    recording = Recording(images, ImageGrid(2, 2, *given_mm), frame_s, readings)
+    images, pixel_mm = np.zeros((len(frame_s), 2, 2), np.uint8), floor.pixel_mm * rng.uniform(0.99, 1.01, 2)
+    recording = Recording(images, ImageGrid(2, 2, *pixel_mm), frame_s, readings)
     return recording, Seen(np.arange(len(frame_s)), floor.lines(frame_s)), offset_s
 
 
-def judged(seed):
+def judge(seed):
     """Error and claimed error of the offset, s, and why there is none."""
-    recording, seen, offset_s = recorded(seed)
+    recording, lines, offset_s = simulate_recording(seed)
     settings = PlaneSettings(fixed_pixels=seed % 4 < 2, reflector="bar")
     try:
-        found = solved(recording, seen, settings.model_copy(update={"time_offset_s": "estimate"})).offset
+        offset = solved(recording, lines, settings.model_copy(update={"time_offset_s": "estimate"})).offset
     except Speckle3DError as error:
         try:
-            solved(replace(recording, time_offset_s=offset_s), seen, settings)
+            solved(replace(recording, time_offset_s=offset_s), lines, settings)
         except Speckle3DError:
             return np.nan, np.nan, MOTION
         return np.nan, np.nan, str(error)
-    return found.seconds - offset_s, found.standard_error_s, ""
+    return offset.seconds - offset_s, offset.standard_error_s, ""
 
 
 def measure(share, first_seed):
     """RMS of the errors over what is claimed, the worst error, and how many were refused for the clock."""
-    found = trials(judged, range(first_seed, first_seed + max(6, round(share * COUNT))))
-    kept = np.array([one[:2] for one in found if not one[2]])
-    motion = sum(one[2] == MOTION for one in found)
-    rms, worst = np.sqrt(np.mean((kept[:, 0] / kept[:, 1]) ** 2)), np.abs(kept[:, 0]).max()
-    clock = len(found) - len(kept) - motion
+    outcomes = trials(judge, range(first_seed, first_seed + max(6, round(share * COUNT))))
+    pairs = np.array([o[:2] for o in outcomes if not o[2]])
+    motion = sum(o[2] == MOTION for o in outcomes)
+    rms, worst = np.sqrt(np.mean((pairs[:, 0] / pairs[:, 1]) ** 2)), np.abs(pairs[:, 0]).max()
+    clock = len(outcomes) - len(pairs) - motion
     text = (
-        f"RMS z {rms:.2f}, worst {1e3 * worst:.1f} ms, claimed {1e3 * np.median(kept[:, 1]):.2f} (median); "
-        f"of {len(found)} recordings {clock} refused for the clock, {motion} with the true clock too"
+        f"RMS z {rms:.2f}, worst {1e3 * worst:.1f} ms, claimed {1e3 * np.median(pairs[:, 1]):.2f} (median); "
+        f"of {len(outcomes)} recordings {clock} refused for the clock, {motion} with the true clock too"
     )
-    reached = bool(rms <= LARGEST_Z and worst <= WORST_S and clock == 0)
-    return [Row("clock", text, "RMS z <= 1.2, worst <= 4 ms", reached)]
+    is_on_target = bool(rms <= LARGEST_Z and worst <= WORST_S and clock == 0)
+    return [Row("clock", text, "RMS z <= 1.2, worst <= 4 ms", is_on_target)]

@@ -16,34 +16,34 @@ from .rows import Row, trials
 NEAR_MM, WORLDS = 2.0, 60
 
 
-def judged(seed):
+def judge(seed):
     """Share of the crossings found, share of the used that are wrong, and RMS, mm, NaN if refused."""
     world = crossing_world(seed)
     # The size a user reads off the scanner's ruler.
-    given = world.pixel_mm * np.random.default_rng([seed, 1]).uniform(0.95, 1.05, 2)
-    seen = crossings_in_frames(world.images, given)
+    ruler_mm = world.pixel_mm * np.random.default_rng([seed, 1]).uniform(0.95, 1.05, 2)
+    dots = crossings_in_frames(world.images, ruler_mm)
     try:
-        solution = calibrate_cross_wire(seen.points(world.world_from_sensor[seen.frame]), given)
+        solution = calibrate_cross_wire(dots.points(world.world_from_sensor[dots.frame]), ruler_mm)
     except InsufficientDataError:
         return 0.0, 0.0, np.nan
-    picked = solution.points_used
-    off_mm = np.hypot(*((picked.pixels - world.crossing_px[picked.frame]) * world.pixel_mm).T)
+    inliers = solution.points_used
+    off_mm = np.hypot(*((inliers.pixels - world.crossing_px[inliers.frame]) * world.pixel_mm).T)
     right = off_mm < NEAR_MM
-    found = np.isin(np.flatnonzero(world.is_visible), picked.frame[right]).mean()
-    return found, 1.0 - right.mean(), solution.rms
+    share = np.isin(np.flatnonzero(world.is_visible), inliers.frame[right]).mean()
+    return share, 1.0 - right.mean(), solution.rms
 
 
 def measure(share, first_seed):
     """How many crossings are found, and how well the calibration explains them."""
-    found, wrong, rms = np.array(
-        trials(judged, range(first_seed, first_seed + max(2, round(share * WORLDS)))), float
+    detection, wrong, rms = np.array(
+        trials(judge, range(first_seed, first_seed + max(2, round(share * WORLDS)))), float
     ).T
     text = (
-        f"{100 * found.mean():.0f} % ({int(np.isnan(rms).sum())} of {len(rms)} recordings refused), "
+        f"{100 * detection.mean():.0f} % ({int(np.isnan(rms).sum())} of {len(rms)} recordings refused), "
         f"{100 * wrong.mean():.1f} % of those used wrong"
     )
     mean, worst = np.nanmean(rms), np.nanmax(rms)
     return [
-        Row("crossings found", text, ">= 80 %", bool(found.mean() >= 0.8)),
+        Row("crossings found", text, ">= 80 %", bool(detection.mean() >= 0.8)),
         Row("RMS a component", f"mean {mean:.2f}, worst {worst:.2f} mm", "<= 1 mm", bool(worst <= 1.0)),
     ]

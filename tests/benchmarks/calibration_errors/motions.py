@@ -28,13 +28,13 @@ def errors_of(solution, floor):
     chain = solution.chain
     corners = np.array([[0.0, 0.0], [1, 0], [1, 1], [0, 1]]) * floor.size_mm
     flat, scale = np.zeros(4), chain.pixel_mm / floor.pixel_mm
-    found = chain.sensor_from_image.apply(np.column_stack([corners * scale, flat]))
+    estimate = chain.sensor_from_image.apply(np.column_stack([corners * scale, flat]))
     truth = floor.mounting.apply(np.column_stack([corners, flat]))
     turn = (floor.mounting.rotation.inv() * chain.sensor_from_image.rotation).magnitude()
-    return np.linalg.norm(found - truth, axis=1).max(), np.rad2deg(turn)
+    return np.linalg.norm(estimate - truth, axis=1).max(), np.rad2deg(turn)
 
 
-def judged(trial):
+def judge(trial):
     """Errors in mm and degrees, and the motions named if refused."""
     kind, mode, seed = trial
     floor = Floor([seed, list(MISSING).index(kind)], MISSING[kind], level=mode == "directions")
@@ -45,28 +45,28 @@ def judged(trial):
         if mode == "directions":
             solution = calibrate_orientation(lines, floor.pixel_mm, OrientationFit(level=seed % 2 == 0))
             return 0.0, errors_of(solution, floor)[1], None
-        given_mm = floor.pixel_mm * (np.exp(0.01 * rng.standard_normal(2)) if mode == "prior" else 1.0)
-        solution = calibrate_plane(lines, given_mm, PlaneFit(fixed_pixels=mode == "held"))
+        prior_mm = floor.pixel_mm * (np.exp(0.01 * rng.standard_normal(2)) if mode == "prior" else 1.0)
+        solution = calibrate_plane(lines, prior_mm, PlaneFit(fixed_pixels=mode == "held"))
     except InsufficientDataError as refusal:
         return np.nan, np.nan, frozenset(word for word, text in WORDS.items() if text in str(refusal))
     return *errors_of(solution, floor), None
 
 
-def row_of(kind, mode, found):
+def row_of(kind, mode, outcomes):
     """How many were refused and wrong, and whether all that lacks was named."""
-    errors = np.array([one[:2] for one in found])
-    refused = [one[2] for one in found if one[2] is not None]
+    errors = np.array([o[:2] for o in outcomes])
+    refusals = [o[2] for o in outcomes if o[2] is not None]
     worst = np.nanmax(errors, axis=0, initial=0.0)
     wrong = int((errors > WRONG).any(axis=1).sum())
     # A direction has no depth.
-    needed = frozenset(MISSING[kind]) - ({"depth"} if mode == "directions" else set())
-    share = np.mean([one == needed for one in refused]) if refused else 1.0
+    missing = frozenset(MISSING[kind]) - ({"depth"} if mode == "directions" else set())
+    share = np.mean([motions == missing for motions in refusals]) if refusals else 1.0
     text = (
-        f"{len(refused)} of {len(found)} refused, motions named in {100 * share:.0f} %; "
+        f"{len(refusals)} of {len(outcomes)} refused, motions named in {100 * share:.0f} %; "
         f"{wrong} of the others wrong, worst {worst[0]:.1f} mm, {worst[1]:.1f} deg"
     )
     if kind == "good":
-        return Row(f"good scans, {mode}", text, "0 refused", not refused)
+        return Row(f"good scans, {mode}", text, "0 refused", not refusals)
     return Row(f"{kind}, {mode}", text, "0 wrong; 95 % named", wrong == 0 and share >= 0.95)
 
 
@@ -75,4 +75,4 @@ def measure(share, first_seed):
     seeds = range(first_seed, first_seed + max(1, round(100 * share)))
     cases = [(kind, mode) for mode in ("prior", "held", "directions") for kind in MISSING]
     cases.remove(("constant depth", "directions"))
-    return [row_of(*case, trials(judged, [(*case, seed) for seed in seeds])) for case in cases]
+    return [row_of(*case, trials(judge, [(*case, seed) for seed in seeds])) for case in cases]

@@ -14,16 +14,16 @@ from .rows import Row, coverage_row, trials
 COUNT = 150
 
 
-def judged(smoothly, drifts, seed):
+def judge(smoothly, drifts, seed):
     """Errors over claims of pose and pixel size in the image's frame, or None if refused."""
     floor = Floor([seed, 1997])
     at = floor.time_s if smoothly else floor.rng.permutation(floor.time_s)
     readings = floor.readings(floor.time_s, drifts)
     if not smoothly:  # the errors' times are the frames', the poses are in any order
-        exact, other = (
+        exact, pose = (
             floor.world_from_floor * floor.image(t) * floor.mounting.inv() for t in (floor.time_s, at)
         )
-        readings = readings * exact.inv() * other
+        readings = readings * exact.inv() * pose
     points = ImagePoints.of_lines(np.arange(len(at)), floor.lines(at), readings, floor.time_s)
     try:
         solution = calibrate_plane(points)
@@ -41,12 +41,12 @@ def measure(share, first_seed):
     seeds = range(first_seed, first_seed + max(4, round(COUNT * share)))
     for drifts in (False, True):
         for smoothly in (True, False):
-            found = trials(partial(judged, smoothly, drifts), seeds)
-            scores = np.array([one for one in found if one is not None])
+            outcomes = trials(partial(judge, smoothly, drifts), seeds)
+            scores = np.array([o for o in outcomes if o is not None])
             case = (
                 f"plane, {'drift' if drifts else 'white noise'}, {'smooth' if smoothly else 'random poses'}"
             )
             row = coverage_row(case, scores)
-            refused = sum(one is None for one in found)
-            rows.append(Row(case, f"{row.found}, {refused} refused", row.target, row.reached))
+            refusals = sum(o is None for o in outcomes)
+            rows.append(Row(case, f"{row.figures}, {refusals} refused", row.target, row.is_on_target))
     return rows

@@ -14,9 +14,9 @@ class Row:
     """One line of the table: figures with their units, beside what they should reach."""
 
     case: str
-    found: str
+    figures: str
     target: str
-    reached: bool
+    is_on_target: bool
 
 
 def coverage_row(case, ratio):
@@ -26,11 +26,11 @@ def coverage_row(case, ratio):
     """
     shares = np.array([np.mean(np.abs(ratio) < limit) for limit in (1.0, 1.96)])
     slack = 2.0 * np.sqrt(np.array([0.68 * 0.32, 0.95 * 0.05]) / ratio.size)
-    found = "{:.0f} / {:.0f} %".format(*(100.0 * shares))
-    found += f", RMS z {np.sqrt(np.mean(ratio**2)):.2f}, {ratio.size} figures of {len(ratio)} trials"
-    reached = (shares >= np.array([0.62, 0.92]) - slack) & (shares <= np.array([0.74, 0.98]) + slack)
+    figures = "{:.0f} / {:.0f} %".format(*(100.0 * shares))
+    figures += f", RMS z {np.sqrt(np.mean(ratio**2)):.2f}, {ratio.size} figures of {len(ratio)} trials"
+    is_on_target = (shares >= np.array([0.62, 0.92]) - slack) & (shares <= np.array([0.74, 0.98]) + slack)
     target = "62-74 / 92-98 %, +- {:.0f} / {:.0f} % for so many figures".format(*(100.0 * slack))
-    return Row(case, found, target, bool(reached.all()))
+    return Row(case, figures, target, bool(is_on_target.all()))
 
 
 def trials(run, todo):

@@ -35,21 +35,21 @@ def measure(share, first_seed):
     everything = []
     for number, (name, settings) in enumerate(GROUPS.items()):
         seeds = range(first_seed + 100 * number, first_seed + 100 * number + max(1, round(share * PAIRS)))
-        found = [side for seed in seeds for side in solved(PairCase(seed, **settings))]
-        everything += found
-        yield name, figures(found)
+        sides = [side for seed in seeds for side in sides_of(PairCase(seed, **settings))]
+        everything += sides
+        yield name, figures(sides)
     yield "all", figures(everything)
 
 
-def solved(case):
+def sides_of(case):
     """Of both sweeps: log of the length's error, tilt in degrees, and the length's claim; or why not."""
     pair = tissue_pair(case)
     try:
-        found = crossed(pair.first, pair.second)
+        correction = crossed(pair.first, pair.second)
     except (InsufficientDataError, MismatchError) as error:
         return [str(error)] * 2
     sides = []
-    for side, truth in zip((found.first, found.second), pair.truth, strict=True):
+    for side, truth in zip((correction.first, correction.second), pair.truth, strict=True):
         length, true = (
             np.linalg.norm(np.ptp(poses[[0, -1]].apply(GRID.centre_mm), axis=0))
             for poses in (side.poses, truth)

@@ -20,12 +20,12 @@ LIBRARIES = "import numpy, scipy.optimize, scipy.spatial.transform, numba, h5py,
 def rows(runs):
     """Help, and the sweep that comes with the project reconstructed in two modes."""
     bare = seconds(["-c", "import typer, rich.console"], runs)
-    helped = seconds(["-m", "speckle3d.cli", "--help"], runs)
+    help_s = seconds(["-m", "speckle3d.cli", "--help"], runs)
     libraries = seconds(["-c", LIBRARIES], runs)
-    whole = statistics.median([reconstructed(DATA / "phantom.h5")[0] for _ in range(runs + 1)][1:])
+    whole = statistics.median([reconstruct(DATA / "phantom.h5")[0] for _ in range(runs + 1)][1:])
     beside = {"falling": True, "unit": "s"}
     return [
-        Row("speckle3d --help", helped, peer="importing typer and rich", peer_value=bare,
+        Row("speckle3d --help", help_s, peer="importing typer and rich", peer_value=bare,
             target=HELP_S, **beside),
         Row("speckle3d reconstruct data/phantom.h5, two modes", whole, peer="importing its libraries",
             peer_value=libraries, target=RECONSTRUCT_S, **beside),
@@ -35,29 +35,29 @@ def rows(runs):
 def memory(paths, curves):
     """Peak resident memory of a reconstruction by length of the sweep."""
     for path in paths:
-        spent, peak_gb = reconstructed(path, "--curves", curves)
+        duration_s, peak_gb = reconstruct(path, "--curves", curves)
         size = f"{path.stem.rpartition('-')[2]} frames, {path.stat().st_size / 1e9:.2f} GB"
-        what = f"reconstruct, {size}, in {spent:.1f} s: peak memory"
-        yield Row(what, peak_gb, "GB", target=MEMORY_GB, falling=True)
+        label = f"reconstruct, {size}, in {duration_s:.1f} s: peak memory"
+        yield Row(label, peak_gb, "GB", target=MEMORY_GB, falling=True)
 
 
 def seconds(arguments, runs):
     """Median of several runs, after one in which kernels are compiled and files are read from the disk."""
-    return statistics.median([finished(arguments)[0] for _ in range(runs + 1)][1:])
+    return statistics.median([run_python(arguments)[0] for _ in range(runs + 1)][1:])
 
 
-def reconstructed(path, *options):
+def reconstruct(path, *options):
     with tempfile.TemporaryDirectory() as out:
         modes = ["--drift", "orientation", "--drift", "pose"]
-        return finished(["-m", "speckle3d.cli", "reconstruct", path, *options, "-o", out, *modes])
+        return run_python(["-m", "speckle3d.cli", "reconstruct", path, *options, "-o", out, *modes])
 
 
-def finished(arguments):
+def run_python(arguments):
     """Seconds and the peak memory, GB, of Python with some arguments."""
-    began = time.perf_counter()
+    start_s = time.perf_counter()
     process = subprocess.Popen(
         [sys.executable, *map(str, arguments)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
     )
     _, status, usage = os.wait4(process.pid, 0)
     assert status == 0, f"{arguments}: status {status}"
-    return time.perf_counter() - began, usage.ru_maxrss / 2**20
+    return time.perf_counter() - start_s, usage.ru_maxrss / 2**20

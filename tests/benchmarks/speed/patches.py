@@ -8,7 +8,7 @@ from speckle3d.config import Config
 from speckle3d.core.threads import on_one_thread
 from speckle3d.io.load import load_sweep
 from speckle3d.matching.matcher import FrameMatcher
-from speed.rows import Row, timed
+from speed.rows import Row, time_runs
 
 TIMES_OPENCV = 12.0
 CROSS = [1, 3, 4, 5, 7]
@@ -27,20 +27,20 @@ def rows(path, runs):
         patch_correlations(fixed, moving, patches.first, patches.size, lag, 0.5, rho)
 
     def by_opencv():
-        found = np.full((len(patches), 5), np.nan)
+        coefficients = np.full((len(patches), 5), np.nan)
         wide, high = patches.size
         for p, (v, s) in enumerate(patches.first):
             if min(v, s) >= 1 and v + wide < fixed.shape[0] and s + high < fixed.shape[1]:
                 around = moving[v - 1 : v + wide + 1, s - 1 : s + high + 1]
                 template = fixed[v : v + wide, s : s + high]
-                found[p] = cv2.matchTemplate(around, template, cv2.TM_CCOEFF_NORMED).ravel()[CROSS]
-        return found
+                coefficients[p] = cv2.matchTemplate(around, template, cv2.TM_CCOEFF_NORMED).ravel()[CROSS]
+        return coefficients
 
     cv2.setNumThreads(1)
     with on_one_thread():
         # Far more runs than of the other: a tenth of a millisecond is short beside what interrupts it.
-        ours, theirs = timed(by_kernel, 20 * runs).seconds, timed(by_opencv, runs).seconds
+        ours, peer = time_runs(by_kernel, 20 * runs).seconds, time_runs(by_opencv, runs).seconds
         assert np.nanmax(np.abs(by_opencv() - rho)) < 1e-4
-    what = f"{len(patches)} patches of a pair at 5 lags, 1 core"
-    row = Row(what, 1e3 * ours, "ms", "OpenCV matchTemplate", 1e3 * theirs, falling=True)
+    label = f"{len(patches)} patches of a pair at 5 lags, 1 core"
+    row = Row(label, 1e3 * ours, "ms", "OpenCV matchTemplate", 1e3 * peer, falling=True)
     return [row, Row("patches: times as fast as matchTemplate", row.times_peer, "", target=TIMES_OPENCV)]

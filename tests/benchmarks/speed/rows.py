@@ -21,7 +21,7 @@ class Row:
         How many the work kept busy: processor time over time.
     """
 
-    what: str
+    label: str
     value: float
     unit: str
     peer: str = ""
@@ -36,7 +36,7 @@ class Row:
         return self.peer_value / self.value if self.falling else self.value / self.peer_value
 
     @property
-    def missed(self):
+    def misses_target(self):
         """Whether the target is."""
         if self.target is None:
             return False
@@ -46,8 +46,8 @@ class Row:
         """Text of the table's columns."""
         bound = "" if self.target is None else f"{'<=' if self.falling else '>='} {self.target:g}"
         return (
-            self.what,
-            f"{self.value:.3g} {self.unit}" + (" !" if self.missed else ""),
+            self.label,
+            f"{self.value:.3g} {self.unit}" + (" !" if self.misses_target else ""),
             bound,
             "" if self.cores is None else f"{self.cores:.2f}",
             f"{self.peer}: {self.peer_value:.3g}" if self.peer else "",
@@ -77,13 +77,13 @@ class Timing:
     cores: float
 
 
-def timed(function, runs):
+def time_runs(function, runs):
     """Time a function, after one run in which kernels are loaded."""
     function()
     walls, busy = [], []
     for _ in range(runs):
-        began, spent = time.perf_counter(), time.process_time()
+        start_s, cpu_s = time.perf_counter(), time.process_time()
         function()
-        walls.append(time.perf_counter() - began)
-        busy.append((time.process_time() - spent) / walls[-1])
+        walls.append(time.perf_counter() - start_s)
+        busy.append((time.process_time() - cpu_s) / walls[-1])
     return Timing(statistics.median(walls), statistics.median(busy))
