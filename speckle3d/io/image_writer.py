@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from speckle3d.io.headers import DEFLATE, GZIP, NUMBER_TYPES, ZLIB
+from speckle3d.io.header_fields import NUMBER_TYPES
+from speckle3d.io.headers import DEFLATE, GZIP, ZLIB
 
 
 def meta_header(

@@ -6,7 +6,9 @@ import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -17,7 +19,8 @@ from speckle3d.core.streams import TimedPoses, TimedRotations
 from speckle3d.core.sweep import OrientationSensor, Tracker
 from speckle3d.io.carrier import CARRIED, carried_share
 from speckle3d.io.frames import FileFrames, ReadFrame
-from speckle3d.io.headers import SequenceHeader, is_image, read_header
+from speckle3d.io.header_fields import MOST_FRAMES_A_FIELD, is_image
+from speckle3d.io.headers import SequenceHeader, read_header
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.plus.device_set import DeviceSet, read_device_set
 from speckle3d.io.plus.layout import Layout
@@ -62,8 +65,11 @@ def read_poses(path: PathLike, settings: ImportSettings | None = None) -> Tracke
     InvalidInputError
         If the header names no such transform, or no sample of it is valid.
     """
-    header, given = read_header(path), settings or ImportSettings()
-    readings, notes = _timed(_poses(header, given, _device(given)), _times(header, given.frame_rate_hz))
+    sequence = _Sequence.of(path, settings or ImportSettings())
+    fields, frames = len(sequence.header.frames), sequence.header.frame_count
+    if 0 < MOST_FRAMES_A_FIELD * fields < frames:
+        raise InvalidInputError(f"{path}: expected fields of most frames, got those of {fields} of {frames}")
+    readings, notes = sequence.timed(sequence.poses)
     if readings is None:
         raise InvalidInputError(
             f"{path}: expected tracked poses (fields like ProbeToTrackerTransform), got {lacking_poses(path)}"
@@ -90,212 +96,258 @@ def open_sequence(path: Path, settings: ImportSettings) -> Facts:
     FileError, InvalidInputError
         If it, or the device set beside it, cannot be read or does not make sense.
     """
-    header, device = read_header(path), _device(settings)
-    layout = Layout.of(header, device.text("PortUsImageOrientation") or None)
+    sequence = _Sequence.of(path, settings)
+    header, layout = sequence.header, sequence.layout
     kinds = {"UltrasoundImageType": layout.kind, "UltrasoundImageOrientation": layout.orientation}
     kind, orientation = (
         word if name in header.fields else f"{word} (assumed)" for name, word in kinds.items()
     )
     yield "container", header.container, ""
-    yield "size", _shown(header.size), ""
+    yield "size", _length_text(header.size), ""
     yield "image type", kind, ""
     yield "image orientation", orientation, ""
     yield "transforms", ", ".join(names_of(header)) or "none", ""
     if settings.plus_config is not None:
         yield "device set", settings.plus_config, ""
-    return _recording(header, settings, device, layout)
+    sequence.require_images()
+    return sequence.recording()
 
 
-def _recording(
-    header: SequenceHeader, settings: ImportSettings, device: DeviceSet, layout: Layout
-) -> Recording:
-    path, frames, count = header.path, header.frames, header.frame_count
-    if 0 in header.size or max(header.size[:2]) == 1:
-        what = ": the recording of a tracker, for --poses" if names_of(header) else ""
-        size = _shown(header.size[:2])
-        raise InvalidInputError(f"{path}: expected pixels of images, got images of size {size}{what}")
-    if header.is_volume and not settings.frame_rate_hz:
-        raise InvalidInputError(
-            f"{path}: expected a sequence of images, got a volume, whose third axis is in space "
-            "by its Kinds; if it is time, say so by --frame-rate-hz"
+@dataclass(frozen=True)
+class _Sequence:
+    """A header, and what settings and a device set say over it."""
+
+    header: SequenceHeader
+    settings: ImportSettings
+    device: DeviceSet
+
+    @classmethod
+    def of(cls, path: PathLike, settings: ImportSettings) -> _Sequence:
+        config = settings.plus_config
+        return cls(read_header(path), settings, DeviceSet() if config is None else read_device_set(config))
+
+    @cached_property
+    def layout(self) -> Layout:
+        """Of the images."""
+        return Layout.of(self.header, self.device.text("PortUsImageOrientation") or None)
+
+    @cached_property
+    def poses(self) -> Poses | None:
+        """Of the tracked tool."""
+        settings = self.settings
+        names = settings.tracker_transform, settings.reference_transform, self.device.names
+        return tracked_poses(self.header, *names)
+
+    @cached_property
+    def own_values(self) -> dict[str, Any]:
+        """Values that this package wrote."""
+        return own_values(self.header.path, self.header.fields)
+
+    @cached_property
+    def image_to_probe(self) -> Value | None:
+        """Transform of this image's pixels to mm on the tracked tool."""
+        names, poses = self.device.names, self.poses
+        if (matrix := self.settings.image_to_probe) is not None:
+            return Value(np.asarray(matrix, dtype=float), "image_to_probe", "image_to_probe")
+        if poses is not None and poses.pixels is not None:
+            return Value(poses.pixels, f"{poses.chain[0]}Transform")
+        tool = names.probe if poses is None else poses.tool
+        for name in (f"{names.image}To{tool}", "Calibration"):  # the second is of Ibis
+            if (transform := fixed_transform(self.header, name)) is not None:
+                return Value(transform, f"{name}Transform")
+        # The device set's is for the image that the machine shows, not for the lines it was made of.
+        transform = None if self.layout.is_rf else self.device.transform(names.image, tool)
+        return None if transform is None else Value(transform, f"{names.image}To{tool}", _DEVICE)
+
+    def require_images(self) -> None:
+        """Refuse what are no images of echoes, or a file too short for them."""
+        header, path = self.header, self.header.path
+        if 0 in header.size or max(header.size[:2]) == 1:
+            use = ": the recording of a tracker, for --poses" if names_of(header) else ""
+            size = _length_text(header.size[:2])
+            raise InvalidInputError(f"{path}: expected pixels of images, got images of size {size}{use}")
+        if header.is_volume and not self.settings.frame_rate_hz:
+            raise InvalidInputError(
+                f"{path}: expected a sequence of images, got a volume, whose third axis is in space "
+                "by its Kinds; if it is time, say so by --frame-rate-hz"
+            )
+        self.layout.require_lines(header)
+        header.require_bytes()
+
+    def recording(self) -> Recording:
+        """Images with all that is said of them."""
+        header, settings, layout, own = self.header, self.settings, self.layout, self.own_values
+        values, remarks = self._values()
+        frames, frame_remarks = self._frames(values)
+        tracker, tracker_remarks = self._tracker()
+        poses, names = self.poses, self.device.names
+        chain = [] if poses is None else [*poses.chain]
+        if self.image_to_probe is not None and poses is not None and poses.pixels is None:
+            chain.insert(0, f"{names.image}To{poses.tool}")
+        return Recording(
+            Path(header.path),
+            settings,
+            frames,
+            values,
+            time_s=self._times(header.frame_count),
+            faults=self._image_faults(),
+            tracker=tracker,
+            orientation=self._orientation(),
+            chain=" * ".join(chain),
+            probe=settings.probe or own.get("probe") or self.device.text("TransducerName"),
+            full_scale=own.get("full_scale", 255.0),
+            assumptions=("parallel lines",) if layout.is_rf and not own else (),
+            remarks=(*remarks, *frame_remarks, *tracker_remarks, *self._remarks()),
         )
-    layout.require_lines(header)
-    if header.packing == "raw":
-        header.images()  # maps them, and refuses a file that ends early
-    # Older files of PLUS tell images that are not valid in Status alone.
-    statuses = [{frame.get("ImageStatus"), frame.get("Status")} for frame in frames[:count]]
-    faults = ["" if status <= {None, "OK"} else "not valid by their status" for status in statuses]
-    faults += [""] * (count - len(faults))
-    times, stamps, notes = _times(header, settings.frame_rate_hz), _times(header), list[str]()
-    own, poses = own_values(path, header.fields), _poses(header, settings, device)
-    pixels = _image_to_probe(header, settings, device, layout, poses)
-    spacing, measured = header.spacing_mm, Value()
-    where = path if pixels is None else f"{path}: {pixels.source}"
-    if spacing is not None and layout.has_lines_in_rows:
-        spacing = spacing[::-1]
-    if pixels is not None:
-        measured = replace(pixels, value=pixel_axes(pixels.value, where))
-    if measured.value and spacing and not own and differs(measured.value, spacing):
-        text = f"pixels of {_shown(measured.value)} mm, {measured.source}: the file says {_shown(spacing)}"
-        notes.append(text)
-    # The sampling rate of RF is known better than by a calibration.
-    sizes = [Value(spacing, "ElementSpacing" if spacing else "")]
-    if not layout.is_rf:
-        sizes = [measured, *sizes, Value(device.pixel_mm(header.size), "device set", _DEVICE)]
-    pixel = next((size for size in sizes if size.value is not None), Value())
-    values = _values(header, layout, device, pixel)
-    values |= {name: Value(value, "as this package wrote it") for name, value in own.items() if "_" in name}
-    stacked = _frames(header, layout)
-    if layout.is_complex:
+
+    def timed(self, poses: Poses | None, rate_hz: float | None = None) -> tuple[TimedPoses | None, list[str]]:
+        """Poses that have a time, and a line of those left out."""
+        times = None if poses is None else self._times(len(poses.faults), rate_hz)
+        if poses is None or times is None:
+            return None, []
+        return timed_poses(times, poses.matrices, poses.faults)
+
+    def _times(self, count: int, rate_hz: float | None = None) -> FloatArray | None:
+        """Time of each frame: of a rate, or by its stamp or its axis, NaN where it has none.
+
+        Stamps all the same are none.
+        """
+        if rate_hz is not None:
+            return np.arange(count) / rate_hz
+        stamps = np.full(count, np.nan)
+        for i, frame in enumerate(self.header.frames[:count]):
+            with suppress(ValueError):
+                stamps[i] = float(frame.get("Timestamp", "nan"))
+        if np.unique(stamps[np.isfinite(stamps)]).size >= min(2, count):
+            return stamps
+        return self.header.axis_times_s(count)
+
+    def _image_faults(self) -> list[str]:
+        """Why each image is of no use; older files of PLUS tell it in Status alone."""
+        count = self.header.frame_count
+        statuses = [{frame.get("ImageStatus"), frame.get("Status")} for frame in self.header.frames[:count]]
+        faults = ["" if status <= {None, "OK"} else "not valid by their status" for status in statuses]
+        return faults + [""] * (count - len(faults))
+
+    def _values(self) -> tuple[dict[str, Value], list[str]]:
+        """What a sweep of this kind needs, where file or device set have it, and what contradicts."""
+        header, device, layout = self.header, self.device, self.layout
+        pixel, remarks = self._pixel()
+        values = dict[str, Value]()
+        across, down = (replace(pixel, value=size) for size in pixel.value or (None, None))
+        vectors, samples = layout.shape(header.size)
+
+        def scan(numbers: float | tuple[float, ...] | None) -> Value:
+            return Value(numbers, "ScanConversion of the device set", _DEVICE)
+
+        width_mm = device.scan("TransducerWidthMm")
+        if device.is_curved and (layout.is_rf or layout.has_lines_in_rows):
+            near, far = device.scan("RadiusStartMm", "RadiusStopMm") or (None, 0.0)
+            angles = device.scan("ThetaStartDeg", "ThetaStopDeg")
+            values |= {"line_angles_deg": scan(angles), "array_radius_mm": scan(near)}
+            if near is not None and samples > 1:
+                values["row_spacing_mm"] = scan((far - near) / (samples - 1))
+        elif not layout.is_rf or down.value is not None:
+            values |= {f"{'vector' if layout.is_rf else 'column'}_pitch_mm": across, "row_spacing_mm": down}
+        elif width_mm is not None:
+            values["vector_pitch_mm"] = scan(width_mm[0] / vectors)
+        own = {name: number for name, number in self.own_values.items() if "_" in name}
+        return values | {
+            name: Value(number, "as this package wrote it") for name, number in own.items()
+        }, remarks
+
+    def _pixel(self) -> tuple[Value, list[str]]:
+        """Distances of columns and rows, and what contradicts them."""
+        header, transform = self.header, self.image_to_probe
+        spacing, calibration, remarks = header.spacing_mm, Value(), list[str]()
+        if spacing is not None and self.layout.has_lines_in_rows:
+            spacing = spacing[::-1]
+        if transform is not None:
+            where = f"{header.path}: {transform.source}"
+            calibration = replace(transform, value=pixel_axes(transform.value, where))
+            if spacing and not self.own_values and differs(calibration.value, spacing):
+                text = f"{_length_text(calibration.value)} mm, {calibration.source}"
+                remarks = [f"pixels of {text}: the file says {_length_text(spacing)}"]
+        # The sampling rate of RF is known better than by a calibration.
+        sizes = [Value(spacing, "ElementSpacing" if spacing else "")]
+        if not self.layout.is_rf:
+            device_mm = self.device.pixel_mm(header.size)
+            sizes = [calibration, *sizes, Value(device_mm, "device set", _DEVICE)]
+        return next((size for size in sizes if size.value is not None), Value()), remarks
+
+    def _frames(self, values: dict[str, Value]) -> tuple[FileFrames, list[str]]:
+        """Frames, whose Q is turned where its phase runs backwards, which is told."""
+        frames, settings = _file_frames(self.header, self.layout), self.settings
+        if not self.layout.is_complex:
+            return frames, []
         demodulation, centre, rate = (
             getattr(settings, name) or values.get(name, Value()).value for name in _CARRIER
         )
         # Depth runs backwards in lines that are stored from the far end on, and so does their phase.
-        share = None if demodulation or not (centre and rate) else carried_share(stacked, centre, rate)
-        if share is not None and share <= -CARRIED[0]:
-            stacked = _frames(header, replace(layout, conjugated=True))
-            notes.append("Q has the other sign in the file, as its phase tells: turned")
-    readings, lost = _timed(poses, times)
-    tracker = None if readings is None else Tracker(readings)
-    chain = [] if poses is None else [*poses.chain]
-    if pixels is not None and poses is not None and poses.pixels is None:
-        chain.insert(0, f"{device.names.image}To{poses.tool}")
-    if tracker is not None and pixels is not None:
-        given_mm = settings.first_sample_depth_mm
-        first_mm = own.get("first_sample_depth_mm", 0.0) if given_mm is None else given_mm
-        mounting, skew_rad = sensor_from_image(pixels.value, first_mm, where)
-        tracker = replace(tracker, sensor_from_image=mounting, image_skew_rad=skew_rad)
-    orientation, name = None, f"{ORIENTATION}ToWorld"
-    if name in names_of(header):  # the stream that this package writes
-        turns, _ = _timed(tracked_poses(header, name, "none", Names()), times)
+        share = None if demodulation or not (centre and rate) else carried_share(frames, centre, rate)
+        if share is None or share > -CARRIED[0]:
+            return frames, []
+        conjugate = replace(self.layout, conjugate=True)
+        return _file_frames(self.header, conjugate), [
+            "Q has the other sign in the file, as its phase tells: turned"
+        ]
+
+    def _tracker(self) -> tuple[Tracker | None, list[str]]:
+        """The tracker, with the image's place on it, and a line of poses left out."""
+        readings, remarks = self.timed(self.poses, self.settings.frame_rate_hz)
+        if readings is None or (transform := self.image_to_probe) is None:
+            return None if readings is None else Tracker(readings), remarks
+        first_mm = self.settings.first_sample_depth_mm
+        if first_mm is None:
+            first_mm = self.own_values.get("first_sample_depth_mm", 0.0)
+        where = f"{self.header.path}: {transform.source}"
+        mounting, skew_rad = sensor_from_image(transform.value, first_mm, where)
+        return Tracker(readings, mounting, image_skew_rad=skew_rad), remarks
+
+    def _orientation(self) -> OrientationSensor | None:
+        """The orientation sensor, as this package writes it."""
+        header, name = self.header, f"{ORIENTATION}ToWorld"
+        if name not in names_of(header):
+            return None
+        poses = tracked_poses(header, name, "none", Names())
+        readings, _ = self.timed(poses, self.settings.frame_rate_hz)
+        if readings is None:
+            return None
         matrix = fixed_transform(header, f"{IMAGE}To{ORIENTATION}")
-        turn = None if matrix is None else sensor_from_image(matrix, 0.0, path)[0].rotation
-        if turns is not None:
-            orientation = OrientationSensor(
-                TimedRotations(turns.time_s, turns.world_from_sensor.rotation), turn
-            )
-    return Recording(
-        Path(path),
-        settings,
-        stacked,
-        values,
-        time_s=None if stamps is None else stamps[:count],
-        faults=faults,
-        tracker=tracker,
-        orientation=orientation,
-        chain=" * ".join(chain),
-        probe=settings.probe or own.get("probe") or device.text("TransducerName"),
-        full_scale=own.get("full_scale", 255.0),
-        assumptions=("parallel lines",) if layout.is_rf and not own else (),
-        remarks=(*notes, *lost, *_remarks(header, settings, device, layout, poses)),
-    )
+        mounting = None if matrix is None else sensor_from_image(matrix, 0.0, header.path)[0].rotation
+        rotations = readings.world_from_sensor.rotation
+        return OrientationSensor(TimedRotations(readings.time_s, rotations), mounting)
+
+    def _remarks(self) -> Iterator[str]:
+        """Tell what contradicts, and which poses were not used."""
+        header, device, layout = self.header, self.device, self.layout
+        if self.poses is None and names_of(header) and self.settings.tracker_transform is None:
+            yield f"no tracker: the header's transforms are {lacking_poses(header.path)}"
+        if len(header.frames) not in (0, header.frame_count):
+            yield f"the header has fields of {len(header.frames)} frames for {header.frame_count} images"
+        if device.is_curved:
+            is_picture = not (layout.is_rf or layout.has_lines_in_rows)
+            meaning = "images are taken for scan-converted" if is_picture else "its lines spread"
+            yield f"the device set calls the transducer {device.geometry}: {meaning}"
+        if device.clip is not None and device.clip.is_part_of(header.size):
+            yield f"the device set clips images for volumes, as `speckle3d volume` does: {device.clip}"
+        if header.is_volume:
+            yield "third axis is time, as the frame rate that is given says: by its Kinds it is in space"
 
 
-def _device(settings: ImportSettings) -> DeviceSet:
-    return DeviceSet() if settings.plus_config is None else read_device_set(settings.plus_config)
-
-
-def _poses(header: SequenceHeader, settings: ImportSettings, device: DeviceSet) -> Poses | None:
-    return tracked_poses(header, settings.tracker_transform, settings.reference_transform, device.names)
-
-
-def _timed(poses: Poses | None, times: FloatArray | None) -> tuple[TimedPoses | None, list[str]]:
-    """Poses that have a time, and a line of those left out."""
-    if poses is None or times is None:
-        return None, []
-    return timed_poses(times[: len(poses.faults)], poses.matrices, poses.faults)
-
-
-def _times(header: SequenceHeader, rate_hz: float | None = None) -> FloatArray | None:
-    """Time of every frame: of a rate, or by its stamp or its axis, NaN where it has none.
-
-    Stamps all the same are none.
-    """
-    count = max(header.frame_count if 0 not in header.stored else 0, len(header.frames))
-    if rate_hz is not None:
-        return np.arange(count) / rate_hz
-    stamps = np.full(count, np.nan)
-    for i, frame in enumerate(header.frames):
-        with suppress(ValueError):
-            stamps[i] = float(frame.get("Timestamp", "nan"))
-    different = np.unique(stamps[np.isfinite(stamps)]).size
-    return header.index_s if different < min(2, count) else stamps
-
-
-def _frames(header: SequenceHeader, layout: Layout) -> FileFrames:
+def _file_frames(header: SequenceHeader, layout: Layout) -> FileFrames:
     """Frames of the pixels' type; RF of wider numbers than int16 as float32."""
-    dtype, stored = header.dtype.newbyteorder("="), None
+    dtype, narrow = header.dtype.newbyteorder("="), None
     if layout.is_complex:
-        is_narrow = dtype == np.int16 and not layout.conjugated  # the opposite of -32768 is none
-        dtype, stored = np.dtype(np.complex64), dtype if is_narrow else None
+        is_narrow = dtype == np.int16 and not layout.conjugate  # the opposite of -32768 is none
+        dtype, narrow = np.dtype(np.complex64), dtype if is_narrow else None
     elif layout.is_rf and dtype != np.int16:
         dtype = np.dtype(np.float32)
     shape = (header.frame_count, *layout.shape(header.size))
-    return FileFrames(header.path, SequenceFile(header, layout), shape, dtype, stored)
+    return FileFrames(header.path, SequenceFile(header, layout), shape, dtype, narrow)
 
 
-def _values(header: SequenceHeader, layout: Layout, device: DeviceSet, pixel: Value) -> dict[str, Value]:
-    """What a sweep of this kind needs, and where file or device set have it."""
-    values = dict[str, Value]()
-    across, down = (replace(pixel, value=size) for size in pixel.value or (None, None))
-    vectors, samples = layout.shape(header.size)
-
-    def scanned(numbers: float | tuple[float, ...] | None) -> Value:
-        return Value(numbers, "ScanConversion of the device set", _DEVICE)
-
-    width_mm = device.scan("TransducerWidthMm")
-    if device.is_curved and (layout.is_rf or layout.has_lines_in_rows):
-        near, far = device.scan("RadiusStartMm", "RadiusStopMm") or (None, 0.0)
-        angles = device.scan("ThetaStartDeg", "ThetaStopDeg")
-        values |= {"line_angles_deg": scanned(angles), "array_radius_mm": scanned(near)}
-        if near is not None and samples > 1:
-            values["row_spacing_mm"] = scanned((far - near) / (samples - 1))
-    elif not layout.is_rf or down.value is not None:
-        values |= {f"{'vector' if layout.is_rf else 'column'}_pitch_mm": across, "row_spacing_mm": down}
-    elif width_mm is not None:
-        values["vector_pitch_mm"] = scanned(width_mm[0] / vectors)
-    return values
-
-
-def _image_to_probe(
-    header: SequenceHeader, settings: ImportSettings, device: DeviceSet, layout: Layout, poses: Poses | None
-) -> Value | None:
-    """Transform of this image's pixels to mm on the tracked tool."""
-    names = device.names
-    if settings.image_to_probe is not None:
-        return Value(np.asarray(settings.image_to_probe, dtype=float), "image_to_probe", "image_to_probe")
-    if poses is not None and poses.pixels is not None:
-        return Value(poses.pixels, f"{poses.chain[0]}Transform")
-    tool = names.probe if poses is None else poses.tool
-    for name in (f"{names.image}To{tool}", "Calibration"):  # the second is of Ibis
-        matrix = fixed_transform(header, name)
-        if matrix is not None:
-            return Value(matrix, f"{name}Transform")
-    # The device set's is for the image that the machine shows, not for the lines it was made of.
-    matrix = None if layout.is_rf else device.transform(names.image, tool)
-    return None if matrix is None else Value(matrix, f"{names.image}To{tool}", _DEVICE)
-
-
-def _remarks(
-    header: SequenceHeader, settings: ImportSettings, device: DeviceSet, layout: Layout, poses: Poses | None
-) -> Iterator[str]:
-    """Tell what contradicts, and which poses were not used."""
-    count = header.frame_count
-    if poses is None and names_of(header) and settings.tracker_transform is None:
-        yield f"no tracker: the header's transforms are {lacking_poses(header.path)}"
-    if len(header.frames) not in (0, count):
-        yield f"the header has fields of {len(header.frames)} frames for {count} images"
-    if device.is_curved:
-        is_picture = not (layout.is_rf or layout.has_lines_in_rows)
-        what = "images are taken for scan-converted" if is_picture else "its lines spread"
-        yield f"the device set calls the transducer {device.geometry}: {what}"
-    if device.clip is not None and device.clip.is_part_of(header.size):
-        yield f"the device set clips images for volumes, as `speckle3d volume` does: {device.clip}"
-    if header.is_volume:
-        yield "third axis is time, as the frame rate that is given says: by its Kinds it is in space"
-
-
-def _shown(lengths: Sequence[float]) -> str:
+def _length_text(lengths: Sequence[float]) -> str:
     return " x ".join(f"{length:g}" for length in lengths)
 
 

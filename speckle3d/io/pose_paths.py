@@ -24,6 +24,9 @@ _FASTEST_MM_S, _SLACK_MM = 300.0, 3.0
 sweeps of PLUS have at most 28; a jump of 22 mm in 50 ms is beyond. The slack is a tracker's noise and uneven
 time stamps."""
 
+_FARTHEST_MM = 1e5
+"""From a tracker's origin. NDI writes a lost tool at -3.7e28 mm."""
+
 _LEVER_MM = 50.0
 """From the sensor to points whose displacement stands for a rotation: half a probe's length."""
 
@@ -49,20 +52,20 @@ def rising(times: FloatArray) -> IntArray:
         if place == len(tails) or times[i] < tails[place]:
             before[i] = last[place - 1] if place else -1
             tails[place : place + 1], last[place : place + 1] = [times[i]], [i]
-    chosen, i = list[int](), last[-1] if last else -1
+    rows, i = list[int](), last[-1] if last else -1
     while i >= 0:
-        chosen.append(i)
+        rows.append(i)
         i = before[i]
-    return np.array(chosen[::-1], dtype=int)
+    return np.array(rows[::-1], dtype=int)
 
 
-def usable(what: str, time_s: FloatArray, faults: Sequence[str] | None = None) -> tuple[IntArray, list[str]]:
+def usable(noun: str, time_s: FloatArray, faults: Sequence[str] | None = None) -> tuple[IntArray, list[str]]:
     """Choose the rows of a recording that are of use, and tell what is left out and why.
 
     Parameters
     ----------
-    what : str
-        Rows of what, as "poses".
+    noun : str
+        What a row is, as "poses".
     time_s : ndarray, shape (n,)
         NaN where a row has none.
     faults : sequence of str, length n, optional
@@ -80,15 +83,15 @@ def usable(what: str, time_s: FloatArray, faults: Sequence[str] | None = None) -
     late = np.setdiff1d(np.flatnonzero(reasons == ""), rows)
     is_repeat = np.isin(time_s[late], time_s[rows])
     reasons[late] = np.where(is_repeat, "with a repeated time", "with a time out of order")
-    return rows, _left_out(what, time_s.size, Counter(filter(None, reasons)), time_s[rows])
+    return rows, _loss(noun, time_s.size, Counter(filter(None, reasons)), time_s[rows])
 
 
 def timed_poses(
     time_s: FloatArray, matrices: FloatArray, faults: Sequence[str] | None = None
 ) -> tuple[TimedPoses | None, list[str]]:
     """Poses of use among matrices, shape (n, 4, 4), in mm, and a line of those left out; None of none."""
-    exact, own = rigid(matrices)
-    reasons = [given or fault for given, fault in zip(faults or own, own, strict=True)]
+    exact, deviations = rigid(matrices)
+    reasons = [fault or deviation for fault, deviation in zip(faults or deviations, deviations, strict=True)]
     rows, notes = usable("poses", time_s, reasons)
     if not rows.size:
         return None, notes
@@ -110,12 +113,12 @@ def rigid(matrices: FloatArray) -> tuple[FloatArray, list[str]]:
     return exact, reasons.tolist()
 
 
-def _left_out(what: str, total: int, reasons: Mapping[str, int], time_s: FloatArray) -> list[str]:
+def _loss(noun: str, total: int, reasons: Mapping[str, int], time_s: FloatArray) -> list[str]:
     """Tell how many rows are left out and why, and the longest gap between those that stay."""
     if not any(reasons.values()):
         return []
-    listed = ", ".join(f"{count} {reason}" for reason, count in reasons.items() if count)
-    text = f"{what}: {sum(reasons.values())} of {total} left out ({listed})"
+    counts = ", ".join(f"{count} {reason}" for reason, count in reasons.items() if count)
+    text = f"{noun}: {sum(reasons.values())} of {total} left out ({counts})"
     if time_s.size > 1:
         i = int(np.argmax(np.diff(time_s)))
         text += f"; the longest gap is {time_s[i + 1] - time_s[i]:.3g} s, after {time_s[i]:.3f} s"
@@ -135,8 +138,8 @@ def checked_path(sweep: Sweep, chain: str) -> tuple[Sweep, list[str]]:
         return sweep, []
     readings, notes = _without_jumps(tracker.readings)
     times = sweep.frame_time_s - tracker.time_offset_s
-    covered = readings.covers(times)
-    between = np.count_nonzero(covered & ~np.isin(times, readings.time_s))
+    reach = readings.covers(times)
+    between = np.count_nonzero(reach & ~np.isin(times, readings.time_s))
     notes += _repeats(readings, sweep, times)
     extent = float(np.linalg.norm(np.ptp(readings.world_from_sensor.translation, axis=0)))
     width = sweep.grid.width_mm
@@ -145,47 +148,53 @@ def checked_path(sweep: Sweep, chain: str) -> tuple[Sweep, list[str]]:
             f"poses: the path spans {extent:.3g} mm and the image is {width:.4g} mm wide: the probe stood "
             "still, or the poses are in metres"
         )
-    matched = (
-        f"poses of {chain}, mm: {len(readings)} poses, {len(sweep)} images, {np.count_nonzero(covered)} "
+    notes.append(
+        f"poses of {chain}, mm: {len(readings)} poses, {len(sweep)} images, {np.count_nonzero(reach)} "
         "matched" + (f", {between} of them between two poses" if between else "")
     )
-    return replace(sweep, tracker=replace(tracker, readings=readings)), [*notes, matched]
+    return replace(sweep, tracker=replace(tracker, readings=readings)), notes
 
 
 def _without_jumps(readings: TimedPoses) -> tuple[TimedPoses, list[str]]:
     """Keep the largest part of a path in which a hand reaches each pose from the one before.
 
-    Where that leaves out more than a fifth, poses are single placements and not a path: all stay.
+    Where that leaves out more than a fifth of what a tool in sight can have, poses are single placements and
+    not a path: all stay.
     """
     poses, time_s, numbers = readings.world_from_sensor, readings.time_s, np.arange(len(readings))
 
-    def moved_mm(i: IntArray, k: IntArray) -> FloatArray:
-        step = poses[i].inv() * poses[k]
-        shift_mm = np.linalg.norm(step.translation, axis=-1)
-        return np.asarray(np.maximum(shift_mm, _LEVER_MM * step.rotation.magnitude()))
+    def step_mm(i: IntArray, k: IntArray) -> FloatArray:
+        motion = poses[i].inv() * poses[k]
+        shift_mm = np.linalg.norm(motion.translation, axis=-1)
+        return np.asarray(np.maximum(shift_mm, _LEVER_MM * motion.rotation.magnitude()))
 
     def is_jump(i: IntArray, k: IntArray) -> BoolArray:
-        return moved_mm(i, k) > _SLACK_MM + _FASTEST_MM_S * np.abs(time_s[i] - time_s[k])
+        return step_mm(i, k) > _SLACK_MM + _FASTEST_MM_S * np.abs(time_s[i] - time_s[k])
 
     jumps = numbers[1:][is_jump(numbers[:-1], numbers[1:])]
     if not jumps.size:
         return readings, []
-    # A tool that is lost is often written as the identity: such pieces count for nothing.
-    is_seen = (poses.as_matrix() != np.eye(4)).any(axis=(1, 2))
-    pieces = [piece for piece in np.split(numbers, jumps) if is_seen[piece].any()]
+    # Places of a lost tool count for nothing: the identity, one far away, one again and again.
+    is_lost = (poses.as_matrix() == np.eye(4)).all(axis=(1, 2))
+    is_lost |= np.abs(poses.translation).max(axis=1) > _FARTHEST_MM
+    places = np.unique(poses.as_matrix(), axis=0, return_inverse=True)[1].ravel()
+    pieces = np.split(numbers, jumps)
+    constants = Counter(places[piece[0]] for piece in pieces if np.ptp(places[piece]) == 0)
+    is_lost |= [constants[place] > 1 for place in places]
+    pieces = [piece for piece in pieces if not is_lost[piece].all()] or pieces
     largest = int(np.argmax([piece.size for piece in pieces]))
     rows = pieces[largest]
     for piece in pieces[largest + 1 :]:
         rows = rows if is_jump(rows[-1:], piece[:1]) else np.append(rows, piece)
     for piece in pieces[:largest][::-1]:
         rows = rows if is_jump(piece[-1:], rows[:1]) else np.append(piece, rows)
-    worst = jumps[:1]
-    moved, took_s = moved_mm(worst - 1, worst)[0], np.diff(time_s)[worst - 1][0]
-    jump = f"{moved:.3g} mm in {1e3 * took_s:.3g} ms at {time_s[worst][0]:.3f} s"
-    if rows.size < (1.0 - _MOST_JUMPING) * len(readings):
+    first = jumps[:1]
+    length_mm, took_s = step_mm(first - 1, first)[0], np.diff(time_s)[first - 1][0]
+    jump = f"{length_mm:.3g} mm in {1e3 * took_s:.3g} ms at {time_s[first][0]:.3f} s"
+    if rows.size < (1.0 - _MOST_JUMPING) * sum(piece.size for piece in pieces):
         return readings, [f"poses: {jumps.size} jumps that no hand makes, as {jump}: all are kept"]
     reasons = {f"after jumps, as {jump}": len(readings) - rows.size}
-    notes = _left_out("poses", len(readings), reasons, time_s[rows])
+    notes = _loss("poses", len(readings), reasons, time_s[rows])
     return replace(readings, time_s=time_s[rows], world_from_sensor=poses[rows]), notes
 
 

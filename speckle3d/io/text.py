@@ -40,8 +40,8 @@ def numbers(text: str, count: int | None, where: str) -> tuple[float, ...]:
     except ValueError:
         values = ()
     if not values or (count is not None and len(values) != count) or not np.isfinite(values).all():
-        shown = text if len(text) <= 40 else f"{text[:37]}..."
-        raise InvalidInputError(f"{where}: expected {count or 'some'} finite number(s), got {shown!r}")
+        start = text if len(text) <= 40 else f"{text[:37]}..."
+        raise InvalidInputError(f"{where}: expected {count or 'some'} finite number(s), got {start!r}")
     return values
 
 
@@ -75,6 +75,6 @@ def table(path: PathLike, columns: Sequence[str]) -> Iterator[tuple[str, dict[st
         yield where, dict(zip(heading, cells, strict=True))
 
 
-def unescaped(text: str) -> str:
+def unescape(text: str) -> str:
     r"""Text with the line breaks and backslashes that NRRD's fields have as ``\n`` and ``\\``."""
     return re.sub(r"\\([n\\])", lambda match: "\n" if match[1] == "n" else "\\", text)

@@ -6,7 +6,7 @@ from image_examples import frame_fields, grey, text_of, write_mha
 from scipy.spatial.transform import RigidTransform, Rotation
 from sweep_examples import frames_of
 
-from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.sweep import BModeSettings
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.load import load_sweep, open_recording
@@ -19,8 +19,8 @@ RF = ImportSettings(
 LEVELS = ImportSettings(dynamic_range_db=60.0)
 
 
-def given_over(base, **more):
-    return base.model_copy(update=more)
+def given_over(base, **changes):
+    return base.model_copy(update=changes)
 
 
 @pytest.mark.parametrize(
@@ -54,14 +54,14 @@ def test_spacing_of_rf_gives_pitch_and_sampling_rate(tmp_path):
     ("orientation", "kind", "sign"), [("FM", "RF_I_LINE_Q_LINE", -1), ("NM", "RF_IQ_LINE", 1)]
 )
 def test_i_and_q_become_an_analytic_signal_of_positive_frequency(tmp_path, orientation, kind, sign):
-    given_ = given_over(RF, demodulation_frequency_hz=0.0)
+    settings = given_over(RF, demodulation_frequency_hz=0.0)
     signal = np.round(1000 * np.exp(0.6j * np.arange(64)) * np.arange(1, 4)[:, None])
-    stored = signal[:, ::-1] if orientation == "NM" else signal
+    lines = signal[:, ::-1] if orientation == "NM" else signal
     axis = 1 if kind == "RF_I_LINE_Q_LINE" else 2
-    pairs = np.stack([stored.real, sign * stored.imag], axis)
+    pairs = np.stack([lines.real, sign * lines.imag], axis)
     pixels = pairs.reshape(1, *((6, 64) if axis == 1 else (3, 128))).astype(np.int16)
     fields = {"UltrasoundImageOrientation": orientation, "UltrasoundImageType": kind}
-    sweep = load_sweep(write_mha(tmp_path / "a.mha", pixels, fields), given_)
+    sweep = load_sweep(write_mha(tmp_path / "a.mha", pixels, fields), settings)
     assert sweep.frames.dtype == np.complex64
     np.testing.assert_array_equal(frames_of(sweep)[0], signal)
 
@@ -83,12 +83,18 @@ def path_of(n, step_mm=0.2):
     return poses, frames
 
 
-def opened(tmp_path, frames, pixels=None, fields=(), settings_=BMODE):
+def recording_of(tmp_path, frames, pixels=None, fields=(), settings_=BMODE):
     pixels = grey(len(frames)) if pixels is None else pixels
     return open_recording(write_mha(tmp_path / "a.mha", pixels, fields, frames), settings_)
 
 
-def placed(sweep):
+def matrix_at(place_mm):
+    matrix = np.eye(4)
+    matrix[2, 3] = place_mm
+    return matrix
+
+
+def pose_matrices(sweep):
     return sweep.tracker.readings.world_from_sensor.as_matrix()
 
 
@@ -100,40 +106,71 @@ def placed(sweep):
         ({"ProbeToTrackerTransform": text_of(2 * np.eye(4))}, 12, 11),
     ],
 )
-def test_one_bad_row_is_left_out_and_counted(tmp_path, change, images, poses):
+def test_a_bad_row_costs_that_row(tmp_path, change, images, poses):
     true, frames = path_of(12)
     frames[5] |= change
-    recording = opened(tmp_path, frames)
+    recording = recording_of(tmp_path, frames)
     assert (len(recording.sweep), len(recording.sweep.tracker.readings)) == (images, poses)
-    kept = [i for i in range(12) if i != 5 or poses == 12]
-    np.testing.assert_allclose(placed(recording.sweep), true.as_matrix()[kept], atol=1e-9)
+    rows = [i for i in range(12) if i != 5 or poses == 12]
+    np.testing.assert_allclose(pose_matrices(recording.sweep), true.as_matrix()[rows], atol=1e-9)
     assert any("of 12 left out" in note for note in recording.notes)
 
 
 def test_a_given_rate_counts_images_that_are_left_out(tmp_path):
     true, frames = path_of(12)
     frames[5]["ImageStatus"] = "INVALID"
-    sweep = opened(tmp_path, frames, settings_=given_over(BMODE, frame_rate_hz=10.0)).sweep
+    sweep = recording_of(tmp_path, frames, settings_=given_over(BMODE, frame_rate_hz=10.0)).sweep
     np.testing.assert_allclose(sweep.frame_time_s, np.delete(np.arange(12), 5) / 10.0)
     at_images = sweep.tracker.readings.at(sweep.frame_time_s).as_matrix()
     np.testing.assert_allclose(at_images, np.delete(true.as_matrix(), 5, axis=0), atol=1e-9)
 
 
-@pytest.mark.parametrize("lost", [[5, 6], [0, 1]])
-def test_a_lost_tool_that_is_written_as_the_identity_is_left_out(tmp_path, lost):
+@pytest.mark.parametrize("rows", [[5, 6], [0, 1], [3, 4, 7, 8, 10]])
+@pytest.mark.parametrize("place_mm", [0.0, -3.697314e28, 50.0])
+def test_poses_of_a_lost_tool_are_no_readings_wherever_they_lie(tmp_path, rows, place_mm):
+    """As the identity, or far away as by NDI, at any share; at another place again and again."""
     true, frames = path_of(12)
-    for i in lost:
-        frames[i]["ProbeToTrackerTransform"] = text_of(np.eye(4))
-    kept = np.delete(np.arange(12), lost)
-    np.testing.assert_allclose(placed(opened(tmp_path, frames).sweep), true.as_matrix()[kept], atol=1e-9)
+    for i in rows:
+        frames[i]["ProbeToTrackerTransform"] = text_of(matrix_at(place_mm))
+    expected = np.delete(true.as_matrix(), rows, axis=0)
+    np.testing.assert_allclose(pose_matrices(recording_of(tmp_path, frames).sweep), expected, atol=1e-9)
+
+
+def test_the_tool_is_what_the_image_is_on(tmp_path):
+    true, frames = path_of(12)
+    for frame in frames:
+        frame["ArmToTrackerTransform"] = frame.pop("ProbeToTrackerTransform")
+        frame["ImageToArmTransform"] = text_of(np.diag([0.1, 0.2, 0.2, 1.0]))
+    recording = recording_of(tmp_path, frames)
+    assert recording.chain == "ImageToArm * ArmToTracker"
+    np.testing.assert_allclose(pose_matrices(recording.sweep), true.as_matrix(), atol=1e-9)
+
+
+@pytest.mark.parametrize("size", [b"5 4", b"0 0"])
+@pytest.mark.parametrize("packed", [b"False", b"True"])
+def test_frames_that_a_header_claims_beyond_its_bytes_are_refused_in_one_line(tmp_path, size, packed):
+    path = write_mha(tmp_path / "a.mha", grey(), frames=tracked(3)[2])
+    content = path.read_bytes().replace(b"DimSize = 5 4 3", b"DimSize = " + size + b" 100000000000000")
+    path.write_bytes(content.replace(b"CompressedData = False", b"CompressedData = " + packed))
+    for read in (read_poses, lambda path: load_sweep(path, BMODE)):
+        with pytest.raises((FileError, InvalidInputError)) as error:
+            read(path)
+        assert "\n" not in str(error.value)
+
+
+def test_a_number_of_a_frame_that_no_header_has_is_refused_at_once(tmp_path):
+    path = write_mha(tmp_path / "a.mha", grey(), frames=tracked(3)[2])
+    path.write_bytes(path.read_bytes().replace(b"Seq_Frame0002", b"Seq_Frame9999999"))
+    with pytest.raises(InvalidInputError, match="most frames"):
+        read_poses(path)
 
 
 def test_transforms_are_chosen_by_name(tmp_path):
     probe, reference, frames = frame_fields(3)
     path = write_mha(tmp_path / "a.mha", grey(), frames=frames)
-    both = read_poses(path).readings.world_from_sensor
+    relative = read_poses(path).readings.world_from_sensor
     # Six digits were written: 1e-6 of a rotation, 1e-3 of hundreds of mm.
-    np.testing.assert_allclose(both.as_matrix(), (reference.inv() * probe).as_matrix(), atol=3e-3)
+    np.testing.assert_allclose(relative.as_matrix(), (reference.inv() * probe).as_matrix(), atol=3e-3)
     alone = read_poses(path, ImportSettings(reference_transform="none")).readings.world_from_sensor
     np.testing.assert_allclose(alone.as_matrix(), probe.as_matrix(), atol=1e-3)
     assert load_sweep(path, given_over(BMODE, tracker_transform="none")).tracker is None
@@ -172,9 +209,9 @@ def test_recordings_of_others(realdata):
     assert sweep.frames.shape == (4, 128, 1536)
     # The header's 0.0128417 mm per sample at 1540 m/s is 60 MHz to 0.1 %.
     assert sweep.signal.sampling_rate_hz == pytest.approx(60e6, rel=2e-3)
-    spaced = given_over(BMODE, column_pitch_mm=0.085, row_spacing_mm=0.085)
+    settings = given_over(BMODE, column_pitch_mm=0.085, row_spacing_mm=0.085)
     for name, count in (("BoneUltrasound_L14.igs.mha", 21), ("NwirePhantomFreehand.igs.nrrd", 97)):
-        sweep = load_sweep(realdata / "plus" / name, spaced)
+        sweep = load_sweep(realdata / "plus" / name, settings)
         assert sweep.frames.shape == (count, 820, 616)
         assert sweep.tracker.covers(sweep.frame_time_s).all()
         assert 20 < sweep.frames[0].max() <= 255

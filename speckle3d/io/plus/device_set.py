@@ -208,22 +208,22 @@ class DeviceSet:
 
     def transform(self, start: str, end: str) -> FloatArray | None:
         """Product of the transforms, or their inverses, on the shortest way between two frames, if any."""
-        reached, waiting = {start: np.eye(4)}, [start]
-        for place in waiting:
+        products, queue = {start: np.eye(4)}, [start]
+        for frame in queue:
             for (a, b), matrix in self.transforms.items():
-                target = b if a == place else a
-                if place in (a, b) and target not in reached:
-                    reached[target] = (matrix if a == place else np.linalg.inv(matrix)) @ reached[place]
-                    waiting.append(target)
-        return reached.get(end)
+                target = b if a == frame else a
+                if frame in (a, b) and target not in products:
+                    products[target] = (matrix if a == frame else np.linalg.inv(matrix)) @ products[frame]
+                    queue.append(target)
+        return products.get(end)
 
     def pixel_mm(self, size: tuple[float, ...] | None = None) -> tuple[float, ...] | None:
         """Distances of columns and rows of the image, by default the machine's, mm; None if unknown."""
         for end in (self.names.probe, self.text("TransducerOriginCoordinateFrame", "TransducerOrigin")):
             if (matrix := self.transform(self.names.image, end)) is not None:
                 return pixel_axes(matrix, f"{self.path}: {self.names.image} to {end}")
-        own = self.numbers("ScanConversion", 2, "OutputImageSizePixel")
-        is_of_size = own is None or size is None or size[:2] == own
+        machine_size = self.numbers("ScanConversion", 2, "OutputImageSizePixel")
+        is_of_size = machine_size is None or size is None or size[:2] == machine_size
         return self.numbers("ScanConversion", 2, "OutputImageSpacingMmPerPixel") if is_of_size else None
 
 
@@ -251,11 +251,11 @@ def _open(path: Path, _: ImportSettings) -> Facts:
     device = DeviceSet(str(path), read_xml(path))
     root = device.root
     if root.tag not in _DOCUMENTS:
-        known = ", ".join(_DOCUMENTS)
-        raise InvalidInputError(f"{path}: expected a document of PLUS ({known}), got {root.tag}")
-    what, use = _DOCUMENTS[root.tag]
+        tags = ", ".join(_DOCUMENTS)
+        raise InvalidInputError(f"{path}: expected a document of PLUS ({tags}), got {root.tag}")
+    content, use = _DOCUMENTS[root.tag]
     pixel, clip = device.pixel_mm(), str(device.clip or "none")  # a fault in them is one of the document
-    yield "content", what, ""
+    yield "content", content, ""
     if root.tag == "TemporalCalibrationResults":  # whose sign is the other way round: a lag is negative there
         yield "time offset of the tracker", f"{-vector(root, 'TrackerLagSec', 1)[0]:+.4f}", "s"
     if use == _CONFIG:
@@ -268,7 +268,7 @@ def _open(path: Path, _: ImportSettings) -> Facts:
         if root.find(".//PhantomDefinition/Geometry/Pattern/Wire") is not None:
             use += ", --phantom of calibrate wires"
     yield "for", use, ""
-    raise InvalidInputError(f"{path}: expected a recording, got {what} of PLUS, which is for {use}")
+    raise InvalidInputError(f"{path}: expected a recording, got {content} of PLUS, which is for {use}")
 
 
 def _claims(_: Path, start: bytes) -> bool:

@@ -34,13 +34,13 @@ class Layout:
         (a line of I, a line of Q).
     orientation : str
         As MF: columns to the marked side, rows away from the probe.
-    conjugated : bool
+    conjugate : bool
         Whether Q has the other sign in the file.
     """
 
     kind: str
     orientation: str
-    conjugated: bool = False
+    conjugate: bool = False
 
     @classmethod
     def of(cls, header: SequenceHeader, machine: str | None = None) -> Layout:
@@ -80,9 +80,11 @@ class Layout:
         """
         path, size, dtype = header.path, header.size, header.dtype.newbyteorder("=")
         if header.channels > 1 or self.kind not in (*RF_TYPES, "BRIGHTNESS"):
-            got = f"colour, {header.channels} numbers a pixel" if header.channels > 1 else f"type {self.kind}"
+            kind = (
+                f"colour, {header.channels} numbers a pixel" if header.channels > 1 else f"type {self.kind}"
+            )
             raise InvalidInputError(
-                f"{path}: expected grey B-mode or RF images, got {got}: export them as grey"
+                f"{path}: expected grey B-mode or RF images, got {kind}: export them as grey"
             )
         if self.kind == "BRIGHTNESS" and dtype != np.uint8:
             raise InvalidInputError(f"{path}: expected B-mode of type uint8, got {dtype}")
@@ -98,9 +100,9 @@ class Layout:
         lines = pixels if self.has_lines_in_rows else pixels.T
         if self.is_complex:
             pairs = np.moveaxis(lines, self._pair_axis, 0)
-            joined = pairs[0::2].astype(np.complex64)
-            joined.imag = pairs[1::2]
-            lines = np.moveaxis(joined.conj() if self.conjugated else joined, 0, self._pair_axis)
+            analytic = pairs[0::2].astype(np.complex64)
+            analytic.imag = pairs[1::2]
+            lines = np.moveaxis(analytic.conj() if self.conjugate else analytic, 0, self._pair_axis)
         lines = lines[:, ::-1] if "N" in self.orientation[:2] else lines
         return lines[::-1] if "U" in self.orientation[:2] else lines
 

@@ -67,7 +67,7 @@ class Names:
 
 
 def tracked_poses(
-    header: SequenceHeader, asked: str | None, reference: str | None, names: Names
+    header: SequenceHeader, tool_pose: str | None, reference: str | None, names: Names
 ) -> Poses | None:
     """Read the poses of a tool, seen from the reference if there is one.
 
@@ -75,9 +75,10 @@ def tracked_poses(
 
     Parameters
     ----------
-    asked, reference : str, optional
+    tool_pose, reference : str, optional
         Names of transforms, or ``"none"``; by default the probe's, in the tracker or in the only frame that
-        it is tracked in, else the image's; and that of ``Reference`` in the same world.
+        it is tracked in, else that of what the image is on, else the image's; and that of ``Reference`` in
+        the same world.
 
     Returns
     -------
@@ -89,29 +90,30 @@ def tracked_poses(
     InvalidInputError
         If a transform that was asked for is not there.
     """
-    stored = names_of(header)
-    name = _usual(stored, names) if asked is None else asked.removesuffix("Transform")
+    transforms = names_of(header)
+    name = _usual_pose(transforms, names) if tool_pose is None else tool_pose.removesuffix("Transform")
     if name is None or name == "none":
         return None
     tool, world = ends(name)
     # A reference counts if both are tracked in the same world.
     fixed = f"ReferenceTo{world}" if reference is None else reference.removesuffix("Transform")
-    if reference is None and (tool == "Reference" or not {fixed, _back(fixed)} & {*stored}):
+    if reference is None and (tool == "Reference" or not {fixed, _back(fixed)} & {*transforms}):
         fixed = "none"
-    for one in {name, fixed} - {"none"}:
-        if one not in stored and _back(one) not in stored:
+    for transform in {name, fixed} - {"none"}:
+        if not {transform, _back(transform)} & {*transforms}:
             raise InvalidInputError(
-                f"{header.path}: expected a transform {one}, got {', '.join(stored) or 'none'}"
+                f"{header.path}: expected a transform {transform}, got {', '.join(transforms) or 'none'}"
             )
     matrices, faults = _column(header, name)
     pixels, chain = None, [name]
     if tool == names.image:
         matrices, pixels = _image_poses(matrices, faults, f"{header.path}: {name}Transform")
     if fixed != "none":
-        world_from_reference, others = _column(header, fixed)
-        world_from_reference, odd = rigid(world_from_reference)
+        world_from_reference, reference_faults = _column(header, fixed)
+        world_from_reference, deviations = rigid(world_from_reference)
         matrices = np.asarray(np.linalg.inv(world_from_reference) @ matrices)
-        faults = [next(filter(None, reasons), "") for reasons in zip(faults, others, odd, strict=True)]
+        reasons = zip(faults, reference_faults, deviations, strict=True)
+        faults = [next(filter(None, of_frame), "") for of_frame in reasons]
         chain.append(_back(fixed))
     return Poses(tool, tuple(chain), matrices, faults, pixels)
 
@@ -183,9 +185,9 @@ def sensor_from_image(
             f"y), got mirrored ones (determinant {volume:.3g}): an axis has the wrong sign, or images were "
             "flipped before they were calibrated; if the third column was never measured, make it zeros"
         )
-    turned = nearest_rotation(axes)
-    place = matrix[:3, 3] - turned[:, 1] * first_sample_depth_mm
-    return RigidTransform.from_components(place, Rotation.from_matrix(turned)), float(np.arcsin(cosine))
+    rotation = nearest_rotation(axes)
+    place = matrix[:3, 3] - rotation[:, 1] * first_sample_depth_mm
+    return RigidTransform.from_components(place, Rotation.from_matrix(rotation)), float(np.arcsin(cosine))
 
 
 def image_matrix(
@@ -222,12 +224,18 @@ def _back(name: str) -> str:
     return "To".join(reversed(ends(name)))
 
 
-def _usual(there: Sequence[str], names: Names) -> str | None:
-    """The probe's pose, else the image's, in the tracker, or in the only frame where it is tracked."""
-    for tool in (names.probe, names.image):
-        worlds = {b if a == tool else a for a, b in map(ends, there) if tool in (a, b)}
-        worlds -= {names.probe, names.image, "TransducerOrigin", "TransducerOriginPixel", ""}
-        for world in (names.tracker, "Reference", *(worlds if len(worlds) == 1 else ())):
+def _usual_pose(transforms: Sequence[str], names: Names) -> str | None:
+    """The pose of the probe, of what the image is on, or of the image, in the tracker or the only world."""
+
+    def partners(tool: str) -> set[str]:
+        frames = {b if a == tool else a for a, b in map(ends, transforms) if tool in (a, b)}
+        return frames - {names.probe, names.image, "TransducerOrigin", "TransducerOriginPixel", ""}
+
+    usual_worlds = names.tracker, "Reference"
+    carriers = sorted(partners(names.image) - {*usual_worlds})
+    for tool in (names.probe, *carriers, names.image):
+        worlds = partners(tool)
+        for world in (*usual_worlds, *(worlds if len(worlds) == 1 else ())):
             if world in worlds:
                 return f"{tool}To{world}"
     return None
@@ -261,8 +269,8 @@ def _image_poses(
     valid = np.flatnonzero([not fault for fault in faults])
     if not valid.size:
         return matrices, None
-    right_handed = valid[np.linalg.det(matrices[valid, :3, :3]) >= 0]
-    rows = right_handed if right_handed.size else valid
+    unmirrored = valid[np.linalg.det(matrices[valid, :3, :3]) >= 0]
+    rows = unmirrored if unmirrored.size else valid
     widths = np.linalg.norm(matrices[rows, :3, 0], axis=1)
     usual = matrices[rows[np.argsort(widths)[widths.size // 2]]]
     _, skew_rad = sensor_from_image(usual, 0.0, where)  # refuses what is no calibration

@@ -22,7 +22,7 @@ from speckle3d.core.files import PathLike
 from speckle3d.core.progress import Progress
 from speckle3d.core.sweep import OrientationSensor, RFSettings, Sweep, Tracker, stored_dtype
 from speckle3d.io.hdf5 import atomic_path, require_suffix
-from speckle3d.io.headers import NRRD_NAMES
+from speckle3d.io.header_fields import NRRD_NAMES
 from speckle3d.io.image_writer import meta_header, nrrd_header, write_image
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.plus.transforms import IMAGE, ORIENTATION, image_matrix
@@ -49,13 +49,15 @@ def own_values(path: str, fields: Mapping[str, str]) -> dict[str, Any]:
     InvalidInputError
         Naming the field that does not make sense.
     """
-    own: dict[str, Any] = {}
+    values: dict[str, Any] = {}
     for name in (*ImportSettings.model_fields, "full_scale"):
-        if (text := fields.get(_PREFIX + name)) is not None:
-            count = 2 if name == "bandwidth_hz" else 1
-            values = text if name == "probe" else numbers(text, count, f"{path}: {_PREFIX}{name}")
-            own[name] = values[0] if len(values) == 1 else values
-    return own
+        text = fields.get(_PREFIX + name)
+        if text is None or name == "probe":
+            values |= {} if text is None else {name: text}
+            continue
+        parts = numbers(text, 2 if name == "bandwidth_hz" else 1, f"{path}: {_PREFIX}{name}")
+        values[name] = parts if len(parts) > 1 else parts[0]
+    return values
 
 
 def write_sequence(
@@ -99,8 +101,8 @@ def write_sequence(
         raise InvalidInputError(
             f"{path}: expected parallel vectors, got a fan's, which a sequence does not hold: write .h5"
         )
-    fields = _standard_fields(sweep) | _timed(sweep.frame_time_s)
-    omitted = [*_add_sensors(fields, sweep)]
+    fields = _standard_fields(sweep) | _time_fields(sweep.frame_time_s)
+    omissions = [*_add_sensors(fields, sweep)]
     for transform, matrices in (transforms or {}).items():
         _add(fields, transform, matrices)
         fields["ElementSpacing"] = "1 1 1"
@@ -123,7 +125,7 @@ def write_sequence(
 
     with atomic_path(path) as part:
         write_image(part, header, planes(), compressed, is_nrrd)
-    return omitted
+    return omissions
 
 
 def _pixels(frame: npt.NDArray[Any]) -> npt.NDArray[Any]:
@@ -149,7 +151,7 @@ def write_transforms(path: PathLike, times_s: FloatArray, transforms: Mapping[st
     FileError
         If the file cannot be written.
     """
-    fields = {"ElementSpacing": "1 1 1", **_timed(times_s)}
+    fields = {"ElementSpacing": "1 1 1", **_time_fields(times_s)}
     for name, matrices in transforms.items():
         _add(fields, name, matrices)
     header = meta_header((0, 0, times_s.size), np.dtype(np.uint8), _KINDS, fields, None)
@@ -157,7 +159,7 @@ def write_transforms(path: PathLike, times_s: FloatArray, transforms: Mapping[st
         write_image(part, lambda _: header, (), False, False)
 
 
-def _timed(times_s: FloatArray) -> dict[str, str]:
+def _time_fields(times_s: FloatArray) -> dict[str, str]:
     """Fields of frames with their times."""
     return {f"Seq_Frame{i:04d}_Timestamp": number_text(time) for i, time in enumerate(times_s)}
 
@@ -178,24 +180,24 @@ def _add_sensors(fields: dict[str, str], sweep: Sweep) -> Iterator[str]:
     sensors: tuple[tuple[Tracker | OrientationSensor | None, str, str], ...] = (
         (sweep.tracker, "Probe", "Tracker"), (sweep.orientation, ORIENTATION, "World")
     )  # fmt: skip
-    for sensor, own, world in sensors:
+    for sensor, tool, world in sensors:
         if sensor is None:
             continue
         at = times - sensor.time_offset_s
-        covered, matrices = sensor.readings.covers(at), np.tile(np.eye(4), (count, 1, 1))
-        if covered.any():
-            matrices[covered] = _rigid(sensor.readings.at(at[covered])).as_matrix()
-        _add(fields, f"{own}To{world}", matrices, covered)
-        if sensor is sweep.orientation or not np.array_equal(sensor.readings.time_s, at[covered]):
+        reach, matrices = sensor.readings.covers(at), np.tile(np.eye(4), (count, 1, 1))
+        if reach.any():
+            matrices[reach] = _rigid(sensor.readings.at(at[reach])).as_matrix()
+        _add(fields, f"{tool}To{world}", matrices, reach)
+        if sensor is sweep.orientation or not np.array_equal(sensor.readings.time_s, at[reach]):
             yield (
                 f"the {sensor.label}'s {len(sensor.readings)} readings with all that it measured: "
-                f"{np.count_nonzero(covered)} interpolated ones are at the times of {count} frames"
+                f"{np.count_nonzero(reach)} interpolated ones are at the times of {count} frames"
             )
         if (mounting := sensor.sensor_from_image) is not None:
             skew_rad = sensor.image_skew_rad if isinstance(sensor, Tracker) else 0.0
             first = RigidTransform.from_translation([grid.first_vector_mm, 0.0, 0.0])
             pixels = image_matrix(_rigid(mounting) * first, *sizes, skew_rad)
-            _add(fields, f"{IMAGE}To{own}", np.tile(pixels, (count, 1, 1)))
+            _add(fields, f"{IMAGE}To{tool}", np.tile(pixels, (count, 1, 1)))
     if sweep.truth is not None:
         yield "the true poses"
 
@@ -213,14 +215,14 @@ def _standard_fields(sweep: Sweep) -> dict[str, str]:
     is_rf = isinstance(signal, RFSettings)
     kind = "BRIGHTNESS" if not is_rf else "RF_IQ_LINE" if sweep.frames.dtype.kind == "c" else "RF_REAL"
     sizes = (grid.vector_pitch_mm, grid.sample_spacing_mm)
-    calibrated = sweep.tracker is not None and sweep.tracker.sensor_from_image is not None
-    spacing = (1.0, 1.0) if calibrated else sizes[::-1] if is_rf else sizes
+    counts_pixels = sweep.tracker is not None and sweep.tracker.sensor_from_image is not None
+    spacing = (1.0, 1.0) if counts_pixels else sizes[::-1] if is_rf else sizes
     names = ("vector_pitch_mm",) if is_rf else ("column_pitch_mm", "row_spacing_mm")
-    own: dict[str, Any] = {name: value for name, value in vars(signal).items() if value is not None}
-    if own.pop("dynamic_range_sigma_db", 0.0):
-        del own["dynamic_range_db"]  # which is estimated from the images as it was
-    own |= {"first_sample_depth_mm": grid.first_sample_depth_mm, **dict(zip(names, sizes, strict=False))}
-    texts = {name: number_text(value) for name, value in own.items()}
+    values: dict[str, Any] = {name: value for name, value in vars(signal).items() if value is not None}
+    if values.pop("dynamic_range_sigma_db", 0.0):
+        del values["dynamic_range_db"]  # which is estimated from the images as it was
+    values |= {"first_sample_depth_mm": grid.first_sample_depth_mm, **dict(zip(names, sizes, strict=False))}
+    texts = {name: number_text(value) for name, value in values.items()}
     if sweep.probe:
         texts["probe"] = " ".join(sweep.probe.split())
     return {
@@ -240,7 +242,7 @@ def _nrrd_header(
     slicer_times_s: FloatArray | None,
     shape: tuple[int, int, int],
     dtype: np.dtype[Any],
-    compressed: bool,
+    compress: bool,
 ) -> str:
     """Header of images with an axis of frames: in a plane, as PLUS writes them, or as Slicer's.
 
@@ -256,7 +258,7 @@ sizes: {width} {height} {count}
 space directions: ({x},0) (0,{y}) none
 kinds: {_KINDS}
 space origin: (0,0)"""
-        return nrrd_header(4, dtype, axes, plain, compressed)
+        return nrrd_header(4, dtype, axes, plain, compress)
     axes = f"""dimension: 4
 space: right-anterior-superior
 sizes: {width} {height} 1 {count}
@@ -272,4 +274,4 @@ space origin: (0,0,0)"""
     plain["DataNodeClassName"] = "vtkMRMLScalarVolumeNode"
     for axis in (3, 0):  # up to version 5.6 Slicer knew the axis of frames as the first
         plain |= {f"axis {axis} index type": "numeric", f"axis {axis} index values": values}
-    return nrrd_header(4, dtype, axes, plain, compressed)
+    return nrrd_header(4, dtype, axes, plain, compress)

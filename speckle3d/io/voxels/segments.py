@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.labels import Segment
-from speckle3d.io.text import numbers, unescaped
+from speckle3d.io.text import numbers, unescape
 
 _FIELD = re.compile(r"Segment(\d{1,5})_(\w+)")
 _REPRESENTATION = "Binary labelmap"
@@ -60,7 +60,7 @@ def read_segments(fields: Mapping[str, str], where: str) -> Iterator[Segment]:
     rows: dict[int, dict[str, str]] = {}
     for name, value in fields.items():
         if match := _FIELD.fullmatch(name):
-            rows.setdefault(int(match[1]), {})[match[2]] = unescaped(value)
+            rows.setdefault(int(match[1]), {})[match[2]] = unescape(value)
     for i, row in sorted(rows.items()):
         place = f"{where}: Segment{i}"
         if row.get("Layer", "0") != "0":

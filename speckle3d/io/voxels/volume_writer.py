@@ -40,7 +40,7 @@ PREFIX = "Speckle3D_"
 
 RAS_FROM_LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
 """World of NIfTI from that of the other formats."""
-LABELS, OWN = "label", "speckle3d"
+LABELS, COMMENT = "label", "speckle3d"
 """NIfTI's intent of an image of labels, and the name of fields in its comment."""
 _LONGEST = 2**15
 """Voxels along an axis that NIfTI-1 does not count."""
@@ -85,7 +85,7 @@ def write_volume(path: PathLike, volume: Volume, compress: bool = True) -> None:
             _write_nifti(part, volume, {**volume.fields, **plain}, is_labels)
             return
         fields = {f"{PREFIX}{name}": value for name, value in volume.fields.items()} | plain
-        fields = {name: _escaped(value) for name, value in fields.items()}
+        fields = {name: _escape(value) for name, value in fields.items()}
         header, is_nrrd = _nrrd_header if suffix == ".nrrd" else _meta_header, suffix == ".nrrd"
         write_image(part, lambda size: header(volume, fields, size), volume.voxels.T, compress, is_nrrd)
 
@@ -184,7 +184,7 @@ def _write_nifti(path: Path, volume: Volume, fields: Mapping[str, str], is_label
     if is_labels:
         image.header.set_intent(LABELS)
     if fields:
-        text = json.dumps({OWN: dict(fields)}, ensure_ascii=False).encode("utf-8", "backslashreplace")
+        text = json.dumps({COMMENT: dict(fields)}, ensure_ascii=False).encode("utf-8", "backslashreplace")
         image.header.extensions.append(nibabel.nifti1.Nifti1Extension("comment", text))
     nibabel.save(image, path)
 
@@ -229,10 +229,10 @@ def volume_suffix(path: PathLike, is_labels: bool = False) -> str:
     return require_suffix(path, SUFFIXES)
 
 
-def _escaped(text: str) -> str:
+def _escape(text: str) -> str:
     r"""Write text on one line, with line breaks and backslashes as NRRD has them: ``\n`` and ``\\``.
 
     Blanks at its ends are lost, and control characters are shown as Python writes them.
     """
-    shown = printable(text.strip().replace("\r\n", "\n"), kept="\n")
-    return shown.replace("\\", "\\\\").replace("\n", "\\n")
+    lines = printable(text.strip().replace("\r\n", "\n"), kept="\n")
+    return lines.replace("\\", "\\\\").replace("\n", "\\n")

@@ -19,11 +19,12 @@ from speckle3d.core.geometry import transforms_from_matrices
 from speckle3d.core.labels import LABEL_TYPES, LabelMap
 from speckle3d.core.volume import VOXEL_TYPES, Volume
 from speckle3d.io.hdf5 import reading
-from speckle3d.io.headers import is_image, mm_per, read_header
+from speckle3d.io.header_fields import is_image, mm_per
+from speckle3d.io.headers import read_header
 from speckle3d.io.readers import first_bytes
-from speckle3d.io.text import unescaped
+from speckle3d.io.text import unescape
 from speckle3d.io.voxels.segments import is_segmentation, read_segments
-from speckle3d.io.voxels.volume_writer import LABELS, OWN, PREFIX, RAS_FROM_LPS
+from speckle3d.io.voxels.volume_writer import COMMENT, LABELS, PREFIX, RAS_FROM_LPS
 
 _SIZES = {size.to_bytes(4, order) for size in (348, 540) for order in ("little", "big")}
 """First bytes of NIfTI-1 and NIfTI-2: the length of the header."""
@@ -82,19 +83,19 @@ def read_volume(path: PathLike) -> Volume:
     start = first_bytes(path)
     if _is_nifti(Path(path), start):
         voxels, matrix, fields, is_labels = _read_nifti(Path(path))
-        own = {name: text for name, text in fields.items() if not is_segmentation({name: text})}
+        remarks = {name: text for name, text in fields.items() if not is_segmentation({name: text})}
     elif is_image(start):
         header = read_header(path)
         fields, is_labels = header.fields, is_segmentation(header.fields)
         texts = {name.removeprefix(PREFIX): text for name, text in fields.items() if name.startswith(PREFIX)}
-        own = {name: unescaped(text) for name, text in texts.items()}
+        remarks = {name: unescape(text) for name, text in texts.items()}
         axes = np.eye(3) if header.axes_mm is None else header.axes_mm
         origin = np.zeros(3) if header.origin_mm is None else header.origin_mm
         if header.channels > 1 or len(header.size) != 3 or axes.shape != (3, 3) or origin.size != 3:
-            got = (
-                f"axes {header.stored}, {header.channels} number(s) a pixel, origin of {origin.size} numbers"
+            raise InvalidInputError(
+                f"{path}: expected a grey image of three axes in space, got axes {header.file_size}, "
+                f"{header.channels} number(s) a pixel, origin of {origin.size} numbers"
             )
-            raise InvalidInputError(f"{path}: expected a grey image of three axes in space, got {got}")
         # The first axis runs fastest in a file; a mapped file may be replaced while voxels are used.
         voxels, matrix = np.array(header.numbers()).reshape(header.size[::-1]).T, np.eye(4)
         matrix[:3, :3], matrix[:3, 3] = axes.T, origin
@@ -103,14 +104,19 @@ def read_volume(path: PathLike) -> Volume:
             f"{path}: expected NRRD, MetaImage or NIfTI (.nii.gz, .nii, .hdr), got something else"
         )
     if voxels.ndim != 3 or not voxels.size or voxels.dtype.kind not in "iuf":
-        got = f"shape {voxels.shape} of {voxels.dtype}"
-        raise InvalidInputError(f"{path}: expected a grey image of three axes, got {got}")
+        raise InvalidInputError(
+            f"{path}: expected a grey image of three axes, got shape {voxels.shape} of {voxels.dtype}"
+        )
     with naming(str(path)):
-        voxels, spacing, pose = _placed(voxels.astype(voxels.dtype.newbyteorder("="), copy=False), matrix)
+        voxels, spacing, pose = _right_handed(
+            voxels.astype(voxels.dtype.newbyteorder("="), copy=False), matrix
+        )
         if is_labels:
-            return LabelMap(_labels(voxels), spacing, pose, own, tuple(read_segments(fields, str(path))))
-        kept = voxels if voxels.dtype.name in VOXEL_TYPES else voxels.astype(np.float32)
-        return Volume(kept, spacing, pose, own)
+            segments = tuple(read_segments(fields, str(path)))
+            return LabelMap(_labels(voxels), spacing, pose, remarks, segments)
+        if voxels.dtype.name not in VOXEL_TYPES:
+            voxels = voxels.astype(np.float32)
+        return Volume(voxels, spacing, pose, remarks)
 
 
 load_volume = read_volume
@@ -137,12 +143,14 @@ def read_states(path: PathLike, volume: Volume) -> ByteArray:
         states.world_from_index, volume.world_from_index, atol=_SAME_PLACE_MM
     )
     if states.voxels.dtype != np.uint8 or not is_there:
-        got = f"{states.voxels.dtype}, shape {states.shape}{'' if is_there else ', elsewhere'}"
-        raise InvalidInputError(f"{path}: expected states (uint8) on the volume's {volume.shape}, got {got}")
+        raise InvalidInputError(
+            f"{path}: expected states (uint8) on the volume's {volume.shape}, got {states.voxels.dtype}, "
+            f"shape {states.shape}{'' if is_there else ', elsewhere'}"
+        )
     return states.voxels
 
 
-def _placed(
+def _right_handed(
     voxels: npt.NDArray[Any], world_from_index: FloatArray
 ) -> tuple[npt.NDArray[Any], tuple[float, float, float], RigidTransform]:
     """Voxels of a right-handed grid, its spacing and its pose."""
@@ -205,5 +213,5 @@ def _read_nifti(path: Path) -> tuple[npt.NDArray[Any], FloatArray, dict[str, str
     fields: dict[str, str] = {}
     for extension in image.header.extensions:
         with suppress(ValueError, LookupError, TypeError, AttributeError):  # of somebody else
-            fields |= json.loads(bytes(extension.get_content()).rstrip(b"\0"))[OWN]
+            fields |= json.loads(bytes(extension.get_content()).rstrip(b"\0"))[COMMENT]
     return voxels, affine, fields, is_labels

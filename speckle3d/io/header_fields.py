@@ -1,0 +1,174 @@
+"""Fields of MetaImage and NRRD headers, both told in NRRD's words, and what their words mean.
+
+pynrrd parses NRRD's headers; a MetaImage's fields are put into NRRD's words.
+
+References
+----------
+.. [1] G. Kindlmann, "Definition of NRRD File Format", teem.sourceforge.net.
+.. [2] ITK, "MetaIO documentation".
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from typing import Any, BinaryIO
+
+import nrrd
+import numpy as np
+
+from speckle3d.core.errors import InvalidInputError
+from speckle3d.io.text import numbers
+
+_FRAME_FIELD = re.compile(r"Seq_Frame0*(\d{1,7})_(\w+)")
+MOST_FRAMES_A_FIELD = 100
+"""Frames, as a header counts them, for each frame that it has fields of."""
+_MM_PER = {
+    "": 1.0, "?": 1.0, "none": 1.0, "unknown": 1.0, "mm": 1.0, "millimeter": 1.0, "cm": 10.0,
+    "centimeter": 10.0, "m": 1e3, "meter": 1e3, "um": 1e-3, "µm": 1e-3, "micrometer": 1e-3, "micron": 1e-3,
+}  # fmt: skip
+_S_PER = {"s": 1.0, "sec": 1.0, "second": 1.0, "ms": 1e-3, "msec": 1e-3, "us": 1e-6}
+"""Units by their names, which may have an s at their end."""
+NUMBER_TYPES = {
+    "i1": "char int8",
+    "u1": "uchar uint8",
+    "i2": "short int16",
+    "u2": "ushort uint16",
+    "i4": "int long int32",
+    "u4": "uint ulong uint32",
+    "i8": "long_long longlong int64",
+    "u8": "ulong_long ulonglong uint64",
+    "f4": "float",
+    "f8": "double",
+}
+"""Types of numbers: first as MetaImage writes them, whose LONG has four bytes, last as NRRD does."""
+
+NRRD_NAMES = {
+    "ultrasound image orientation": "UltrasoundImageOrientation",
+    "ultrasound image type": "UltrasoundImageType",
+}
+"""PLUS's fields by what it calls them in NRRD."""
+
+
+def is_image(start: bytes) -> bool:
+    """Whether a file's first bytes are those of a MetaImage or NRRD header."""
+    first = start.split(b"\n", 1)[0].partition(b"=")[0].strip()
+    return start.startswith(b"NRRD000") or first in (b"ObjectType", b"NDims", b"Comment", b"ObjectSubType")
+
+
+def nrrd_fields(stream: BinaryIO) -> dict[str, Any]:
+    """Fields of NRRD by their names, numbers as numbers; the stream is left behind them."""
+    lines, is_whole = dict[str, str](), False
+    magic = stream.readline().decode()
+    for line in _lines(stream):
+        if is_whole := not line.strip():
+            break
+        name, sign, value = line.partition(":")
+        if not value.startswith("="):
+            # Fields of the format itself, unlike those of its users, may be in letters of any size.
+            name = re.sub("^(data|byte|line)(?=file|skip)", r"\1 ", name.strip().lower())
+        lines[name] = f"{NRRD_NAMES.get(name, name)}{sign}{value}"
+    fields: dict[str, Any] = nrrd.read_header([magic, *lines.values()])
+    if not (is_whole or "data file" in fields):
+        raise InvalidInputError("expected an NRRD header up to an empty line, got a truncated one")
+    return fields
+
+
+def meta_fields(stream: BinaryIO) -> dict[str, Any]:
+    """Fields of a MetaImage, and what they say in NRRD's words; the stream is left behind them."""
+    fields: dict[str, Any] = {}
+    for line in _lines(stream):
+        name, _, value = line.partition("=")
+        fields[name.strip()] = value.strip()
+        if "ElementDataFile" in fields:
+            break
+    else:
+        raise InvalidInputError("expected a MetaImage header up to ElementDataFile, got a truncated one")
+
+    def first(*names: str) -> str:
+        return next((fields[name] for name in names if fields.get(name)), "")
+
+    def is_set(*names: str) -> bool:
+        return first(*names)[:1] in ("T", "t", "1")
+
+    file, header_bytes = first("ElementDataFile"), int(first("HeaderSize") or "0")
+    is_text = "BinaryData" in fields and not is_set("BinaryData")
+    words: dict[str, Any] = {
+        "sizes": [*map(int, first("DimSize").split())],
+        "kinds": first("Kinds").split(),
+        "type": first("ElementType"),
+        "endian": "big" if is_set("BinaryDataByteOrderMSB", "ElementByteOrderMSB") else "little",
+        "encoding": "gzip" if is_set("CompressedData") else "text" if is_text else "raw",
+        "data file": file,
+        "byte skip": header_bytes,
+        "channels": int(first("ElementNumberOfChannels") or "1"),
+        "space units": [first("DistanceUnits")],
+    }
+    if file.upper() == "LOCAL":
+        words |= {"data file": "", "byte skip": min(header_bytes, 0)}
+    if steps := first("ElementSpacing", "ElementSize"):
+        axes = np.diag(np.array(numbers(steps, len(words["sizes"]), "ElementSpacing")))
+        if rotation := first("TransformMatrix", "Rotation", "Orientation"):
+            axes = axes @ np.reshape(numbers(rotation, axes.size, "TransformMatrix"), axes.shape)
+        words["space directions"] = axes
+    if place := first("Offset", "Position", "Origin"):
+        words["space origin"] = np.array(numbers(place, None, "Offset"))
+    return fields | words
+
+
+def frame_fields(lines: dict[str, Any]) -> tuple[dict[str, str], tuple[dict[str, str], ...]]:
+    """Texts of the file, and of each frame; none of a frame that the header leaves out."""
+    frames: dict[int, dict[str, str]] = {}
+    fields = {}
+    for name, value in lines.items():
+        if not isinstance(value, str):
+            continue
+        if match := _FRAME_FIELD.fullmatch(name):
+            frames.setdefault(int(match[1]), {})[match[2]] = value
+        else:
+            fields[name] = value
+    last = max(frames, default=-1)
+    if last > MOST_FRAMES_A_FIELD * len(frames):
+        raise InvalidInputError(f"expected fields of most frames, got those of {len(frames)} up to {last}")
+    return fields, tuple(frames.get(i, {}) for i in range(last + 1))
+
+
+def number_type(word: str, is_big: bool) -> np.dtype[Any]:
+    """Type of numbers by a word of either format, as ``MET_UCHAR`` or ``unsigned char``."""
+    plain = word.lower().removeprefix("met_").removesuffix("_t").replace("unsigned ", "u")
+    plain = plain.replace("signed ", "").removesuffix(" int").replace(" ", "")
+    for kind, words in NUMBER_TYPES.items():
+        if plain in words.split():
+            return np.dtype((">" if is_big else "<") + kind)
+    raise InvalidInputError(f"type: expected a type of numbers as uint8 or MET_UCHAR, got {word!r}")
+
+
+def mm_per(unit: str) -> float:
+    """Millimetres of a unit of length; what names none is in mm.
+
+    Raises
+    ------
+    InvalidInputError
+        If the unit is not known.
+    """
+    factor = _MM_PER.get(_singular(unit))
+    if factor is None:
+        raise InvalidInputError(f"expected a unit as mm, cm, m or um, got {unit}")
+    return factor
+
+
+def s_per(unit: str) -> float | None:
+    """Seconds of a unit of time; None of another."""
+    return _S_PER.get(_singular(unit))
+
+
+def _singular(unit: str) -> str:
+    return unit.lower() if len(unit) < 4 else unit.lower().removesuffix("s")
+
+
+def _lines(stream: BinaryIO) -> Iterator[str]:
+    for line in stream:
+        try:
+            yield line.decode("utf-8").rstrip("\r\n")
+        except UnicodeDecodeError:
+            yield line.decode("latin-1").rstrip("\r\n")
