@@ -24,9 +24,10 @@ from speckle3d.core.reconstruction import CalibrationFile
 from speckle3d.core.sweep import BModeSettings, Sweep
 from speckle3d.io.hdf5 import (
     PathLike,
+    Source,
     has_member,
     locate,
-    opened,
+    open_family,
     read_attribute,
     read_checked,
     read_texts,
@@ -59,8 +60,8 @@ def write_calibration(path: PathLike, calibration: Calibration) -> None:
     frames, rows = calibration.frames, calibration.parameters
     with written(path, FORMAT) as file:
         put_fields(file, calibration, skip=("rotation", "translation_mm", "parameters", "frames"))
-        is_turn = calibration.translation_mm is None
-        put(file, "sensor_from_image", calibration.rotation if is_turn else calibration.sensor_from_image)
+        is_rotation = calibration.translation_mm is None
+        put(file, "sensor_from_image", calibration.rotation if is_rotation else calibration.sensor_from_image)
         columns: dict[str, Any] = {name: [getattr(row, name) for row in rows] for name in _COLUMNS}
         put(file, "parameters", columns | {name: np.array(columns[name], float) for name in _NUMBERS})
         used, dropped = (np.array([*numbers], dtype=np.int64) for numbers in (frames.used, frames.dropped))
@@ -68,12 +69,12 @@ def write_calibration(path: PathLike, calibration: Calibration) -> None:
         put(file, "frames", {"given": frames.given, "used": used, "dropped": dropped, "reason": reasons})
 
 
-def read_calibration(path: PathLike) -> Calibration:
+def read_calibration(path: Source) -> Calibration:
     """Read a calibration, and check it.
 
     Parameters
     ----------
-    path : path
+    path : path or open file
         HDF5 file of `speckle3d calibrate`.
 
     Returns
@@ -92,16 +93,16 @@ def read_calibration(path: PathLike) -> Calibration:
     >>> import tempfile
     >>> import numpy as np
     >>> from scipy.spatial.transform import Rotation
-    >>> made = Calibration(
+    >>> calibration = Calibration(
     ...     "orientation", "orientation", Rotation.from_rotvec([0, 0, 0.1]), None, None, 1e-6 * np.eye(3),
     ...     (), 0.01, "rad", 12.0, FramesUsed(2, (0, 1)),
     ... )
     >>> with tempfile.TemporaryDirectory() as folder:
-    ...     write_calibration(f"{folder}/imu.h5", made)
+    ...     write_calibration(f"{folder}/imu.h5", calibration)
     ...     read_calibration(f"{folder}/imu.h5").rotation.as_rotvec().round(6).tolist()
     [0.0, 0.0, 0.1]
     """
-    with opened(path, FORMAT) as file, naming(str(path)):
+    with open_family(path, FORMAT) as file:
         pose, quaternion = None, None
         if has_member(file, "sensor_from_image"):
             pose = read_transforms(file, "sensor_from_image")
@@ -166,10 +167,10 @@ def resized(sweep: Sweep, sizes: dict[str, float]) -> Sweep:
     row_mm = sizes.get("row_spacing_mm", grid.sample_spacing_mm)
     # Rows count from the probe's face, including those above the first stored row.
     first_mm = grid.first_sample_depth_mm * row_mm / grid.sample_spacing_mm
-    fitted = replace(
+    rescaled_grid = replace(
         grid, vector_pitch_mm=column_mm, sample_spacing_mm=row_mm, first_sample_depth_mm=first_mm
     )
-    return replace(sweep, grid=fitted)
+    return replace(sweep, grid=rescaled_grid)
 
 
 def _read_parameters(group: h5py.Group) -> tuple[Parameter, ...]:

@@ -17,6 +17,7 @@ References
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -80,7 +81,7 @@ def is_challenge_scan(file: h5py.File) -> bool:
     return isinstance(node, h5py.Dataset) and node.dtype == np.uint8 and len(node.shape or ()) == 3
 
 
-def open_scan(scan: Path, _: ImportSettings) -> Recording:
+def open_scan(file: h5py.File, _: ImportSettings) -> Recording:
     """Read a scan with a tracker; without one where there are no transforms.
 
     The image frame's origin is the centre of the first pixel.
@@ -92,20 +93,19 @@ def open_scan(scan: Path, _: ImportSettings) -> Recording:
     FileError
         If a file cannot be read.
     """
+    scan = Path(file.filename)
     size_mm, tool_from_image = read_challenge_calibration(_calibration_file(scan))
-    with open_hdf5(scan) as file:
-        node = require_dataset(file, "frames")
-        n, height, width = node.shape
-        slices = HDF5Slices(scan.absolute(), ("frames",), np.transpose)
-        frames = slices.frames((n, width, height), node.dtype)
+    node = require_dataset(file, "frames")
+    n, height, width = node.shape
+    slices = HDF5Slices(scan.absolute(), ("frames",), np.transpose)
     tracker, remarks = None, list[str]()
-    source = _transforms_file(scan) or scan
-    with open_hdf5(source) as file:
-        if has_member(file, "tforms"):
-            matrices = read_checked(file, "tforms", (n, 4, 4))
+    separate = _transforms_file(scan)
+    with nullcontext(file) if separate is None else open_hdf5(separate) as transforms:
+        if has_member(transforms, "tforms"):
+            matrices = read_checked(transforms, "tforms", (n, 4, 4))
             readings, remarks = timed_poses(np.arange(n) / FRAME_RATE_HZ, matrices)
             tracker = None if readings is None else Tracker(readings, tool_from_image)
-    published = {
+    values = {
         "column_pitch_mm": Value(float(size_mm[0]), _CALIBRATION),
         "row_spacing_mm": Value(float(size_mm[1]), _CALIBRATION),
         "first_sample_depth_mm": Value(0.0, "the first pixel"),
@@ -113,9 +113,15 @@ def open_scan(scan: Path, _: ImportSettings) -> Recording:
         "dynamic_range_db": Value(DYNAMIC_RANGE_DB, "as published"),
     }
     return Recording(
-        scan, frames=frames, values=published, tracker=tracker, chain="tforms", name=scan.stem,
-        rows=(("landmarks", "none" if _landmark_file(scan) is None else "yes", ""),), remarks=tuple(remarks),
-    )  # fmt: skip
+        scan,
+        frames=slices.frames((n, width, height), node.dtype),
+        values=values,
+        tracker=tracker,
+        chain="tforms",
+        name=scan.stem,
+        rows=(("landmarks", "none" if _landmark_file(scan) is None else "yes", ""),),
+        remarks=tuple(remarks),
+    )
 
 
 def read_challenge_calibration(path: PathLike) -> tuple[FloatArray, RigidTransform]:
@@ -135,8 +141,8 @@ def read_challenge_calibration(path: PathLike) -> tuple[FloatArray, RigidTransfo
     size = np.diag(scale)[:2].copy()
     if not (size > 0).all():
         raise InvalidInputError(f"{path}: expected a scaling from pixels to mm, got {size.tolist()}")
-    tool_from_counted = transforms_from_matrices(pose[None], f"{path}: image to tool")[0]
-    return size, tool_from_counted * RigidTransform.from_translation([*size, 0.0])
+    tool_from_corner = transforms_from_matrices(pose[None], f"{path}: image to tool")[0]
+    return size, tool_from_corner * RigidTransform.from_translation([*size, 0.0])
 
 
 def read_landmarks(path: PathLike) -> Landmarks | None:
@@ -165,8 +171,8 @@ def companion_files(scan: Path) -> list[Path]:
 
 def _transforms_file(scan: Path) -> Path | None:
     subject = scan.parent
-    beside = subject.parent.parent / "transfs" / subject.name / scan.name
-    return beside if subject.parent.name == "frames" and beside.is_file() else None
+    path = subject.parent.parent / "transfs" / subject.name / scan.name
+    return path if subject.parent.name == "frames" and path.is_file() else None
 
 
 def _nearby(scan: Path, *names: str) -> Path | None:

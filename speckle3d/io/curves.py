@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 
 from speckle3d.core.curves import CurveKey, DecorrelationCurves
-from speckle3d.core.errors import InvalidInputError, naming
+from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.geometry import require_finite
 from speckle3d.core.sweep import RFSettings
-from speckle3d.io.hdf5 import PathLike, opened, read_text
+from speckle3d.io.hdf5 import PathLike, Source, open_family, read_text
 from speckle3d.io.records import put, put_fields, read_record, written
 from speckle3d.io.sweeps import read_signal
 
@@ -25,13 +25,13 @@ def curves_beside(sweep_file: Path) -> Path:
     InvalidInputError
         If there are none.
     """
-    beside = sweep_file.parent / "curves.h5"
-    if not beside.is_file():
+    path = sweep_file.parent / "curves.h5"
+    if not path.is_file():
         raise InvalidInputError(
-            f"expected decorrelation curves: --curves CURVES.h5 or {beside}, got neither "
+            f"expected decorrelation curves: --curves CURVES.h5 or {path}, got neither "
             "(speckle3d calibrate curves makes them from a phantom sweep)"
         )
-    return beside
+    return path
 
 
 def trust_words(path: Path, curves: DecorrelationCurves, same_probe: bool) -> str:
@@ -62,12 +62,12 @@ def write_curves(path: PathLike, curves: DecorrelationCurves) -> None:
         put(file, "signal", "rf" if isinstance(signal, RFSettings) else "bmode")
 
 
-def read_curves(path: PathLike) -> DecorrelationCurves:
+def read_curves(path: Source) -> DecorrelationCurves:
     """Read decorrelation curves, and check them.
 
     Parameters
     ----------
-    path : path
+    path : path or open file
         HDF5 file of `speckle3d calibrate curves`.
 
     Returns
@@ -89,7 +89,7 @@ def read_curves(path: PathLike) -> DecorrelationCurves:
     >>> curves.key.correlation_of
     'echo'
     """
-    with opened(path, FORMAT, (1, 2)) as file, naming(str(path)):
+    with open_family(path, FORMAT, (1, 2)) as file:
         signal = read_signal(file, read_text(file, "signal"))
         key = read_record(file, CurveKey, signal=signal)
         curves = read_record(file, DecorrelationCurves, key=key)

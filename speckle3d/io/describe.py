@@ -17,9 +17,10 @@ from speckle3d.core.printable import printable
 from speckle3d.core.sweep import BModeSettings, RFSettings, Sweep, stored_dtype
 from speckle3d.io import calibrations, curves, reconstructions
 from speckle3d.io.calibrations import read_calibration
+from speckle3d.io.hdf5 import Source
 from speckle3d.io.import_settings import settings_for
 from speckle3d.io.load import family_format, recording_of
-from speckle3d.io.readers import find_reader
+from speckle3d.io.readers import claim
 from speckle3d.io.reconstructions import read_reconstruction
 from speckle3d.io.recordings import Row, number_row
 from speckle3d.io.voxels.volumes import is_volume, read_volume
@@ -44,13 +45,15 @@ def _rows(path: PathLike) -> Iterator[Row]:
     if Path(path).is_file() and is_volume(path):
         yield "format", "volume", ""
         yield from _volume_rows(path)
-    elif (reader := find_reader(path)) is None:
-        if (tell := _TELL.get(kind := family_format(path))) is None:
-            raise InvalidInputError(f"{path}: expected {' or '.join(_TELL)}, got {kind}")
-        yield "format", kind, ""
-        yield from tell(path)
-    else:
-        recording = recording_of(reader, Path(path), settings_for(path))
+        return
+    with claim(path) as (reader, source):
+        if reader is None:
+            if (tell := _TELL.get(kind := family_format(path, source))) is None:
+                raise InvalidInputError(f"{path}: expected {' or '.join(_TELL)}, got {kind}")
+            yield "format", kind, ""
+            yield from tell(source)
+            return
+        recording = recording_of(reader, source, settings_for(path), Path(path))
         facts = recording.describe()
         yield "format", reader.format, ""
         yield from facts
@@ -65,8 +68,8 @@ def _rows(path: PathLike) -> Iterator[Row]:
 
 
 def _sweep_rows(sweep: Sweep) -> Iterator[Row]:
-    grid, stored = sweep.grid, stored_dtype(sweep.frames)
-    narrow = "" if sweep.frames.dtype == stored else f", stored as pairs of {stored}"
+    grid, kind = sweep.grid, stored_dtype(sweep.frames)
+    narrow = "" if sweep.frames.dtype == kind else f", stored as pairs of {kind}"
     yield "frames", str(len(sweep)), ""
     yield from _rate_rows("", sweep.frame_time_s, "frames/s")
     yield "vectors x samples", f"{grid.vectors} x {grid.samples}", ""
@@ -97,8 +100,8 @@ def _sweep_rows(sweep: Sweep) -> Iterator[Row]:
 def _signal_rows(signal: RFSettings | BModeSettings) -> Iterator[Row]:
     kind = "B-mode"
     if isinstance(signal, RFSettings):
-        is_shifted = bool(signal.demodulation_frequency_hz)
-        kind = "RF" if not signal.are_complex else "I/Q" if is_shifted else "I/Q, the analytic signal"
+        carries = not signal.demodulation_frequency_hz
+        kind = "RF" if not signal.are_complex else "I/Q, the analytic signal" if carries else "I/Q"
     yield "signal", kind, ""
     for name, value in vars(signal).items():
         if value and name != "full_scale":
@@ -111,7 +114,7 @@ def _rate_rows(name: str, times: FloatArray, unit: str) -> Iterator[Row]:
     yield f"{name}rate", f"{(times.size - 1) / span:.2f}" if span else "", unit
 
 
-def _reconstruction_rows(path: PathLike) -> Iterator[Row]:
+def _reconstruction_rows(path: Source) -> Iterator[Row]:
     result = read_reconstruction(path)
     pairs, times = result.pairs, result.frame_time_s
     yield "frames", str(times.size), ""
@@ -122,10 +125,10 @@ def _reconstruction_rows(path: PathLike) -> Iterator[Row]:
     yield "frame pairs", str(0 if pairs is None else len(pairs)), ""
     yield "patches", str(0 if pairs is None else len(pairs.patch_centre_mm)), ""
     yield from _source_rows(result.provenance)
-    for one in result.provenance.calibrations:
-        yield f"calibration of {one.sensor}", one.path, ""
-    if (imported := result.provenance.imported) is not None:
-        yield f"import settings of {imported.name}", imported.settings_json, ""
+    for calibration in result.provenance.calibrations:
+        yield f"calibration of {calibration.sensor}", calibration.path, ""
+    if (settings := result.provenance.imported) is not None:
+        yield f"import settings of {settings.name}", settings.settings_json, ""
 
 
 def _source_rows(source: Any) -> Iterator[Row]:
@@ -134,13 +137,13 @@ def _source_rows(source: Any) -> Iterator[Row]:
     yield "package version", source.package_version, ""
 
 
-def _calibration_rows(path: PathLike) -> Iterator[Row]:
+def _calibration_rows(path: Source) -> Iterator[Row]:
     calibration = read_calibration(path)
     yield from calibration.rows()
     yield from _source_rows(calibration.source)
 
 
-def _listed(values: FloatArray) -> str:
+def _list_text(values: FloatArray) -> str:
     return ", ".join(f"{value:.3f}" for value in values)
 
 
@@ -149,21 +152,21 @@ def _volume_rows(path: PathLike) -> Iterator[Row]:
     yield "voxels", " x ".join(map(str, volume.shape)), ""
     yield "spacing", " x ".join(f"{step:g}" for step in volume.spacing_mm), "mm"
     yield "voxel type", volume.voxels.dtype.name, ""
-    yield "first voxel at x, y, z (LPS)", _listed(volume.world_from_grid.translation), "mm"
+    yield "first voxel at x, y, z (LPS)", _list_text(volume.world_from_grid.translation), "mm"
     for axis, direction in zip("ijk", volume.world_from_grid.rotation.as_matrix().T, strict=True):
-        yield f"direction of {axis} (LPS)", _listed(direction), ""
+        yield f"direction of {axis} (LPS)", _list_text(direction), ""
     for name, text in volume.fields.items():
         yield printable(name), text, ""
     if isinstance(volume, LabelMap):
-        for one in volume.segments:
-            count = np.count_nonzero(volume.voxels == one.value)
-            yield f"label {one.value}", f"{one.name}: {count}", "voxels"
+        for segment in volume.segments:
+            count = np.count_nonzero(volume.voxels == segment.value)
+            yield f"label {segment.value}", f"{segment.name}: {count}", "voxels"
     else:
         levels = volume.voxels[np.isfinite(volume.voxels)]
         yield "levels found", f"{levels.min():g} to {levels.max():g}" if levels.size else "none", ""
 
 
-def _curves_rows(path: PathLike) -> Iterator[Row]:
+def _curves_rows(path: Source) -> Iterator[Row]:
     record = curves.read_curves(path)
     half = [np.interp(-0.5, -row, record.distance_mm) for row in record.correlation]
     yield "probe", record.key.probe or "not named", ""
@@ -179,7 +182,7 @@ def _curves_rows(path: PathLike) -> Iterator[Row]:
     yield "lengths read with them, 95 %", f"+- {196 * record.scale_sigma:.1f}", "%"
 
 
-_TELL: dict[str, Callable[[PathLike], Iterator[Row]]] = {
+_TELL: dict[str, Callable[[Source], Iterator[Row]]] = {
     reconstructions.FORMAT: _reconstruction_rows,
     curves.FORMAT: _curves_rows,
     calibrations.FORMAT: _calibration_rows,

@@ -9,7 +9,7 @@ import struct
 import tarfile
 import zlib
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -19,13 +19,15 @@ import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import FloatArray
-from speckle3d.core.errors import FileError, InvalidInputError, Speckle3DError
+from speckle3d.core.errors import FileError, InvalidInputError, Speckle3DError, naming
 from speckle3d.core.files import PathLike as PathLike
 from speckle3d.core.files import open_regular
 from speckle3d.core.geometry import transforms_from_matrices
 from speckle3d.core.parts import cannot_write, whole_file
 
 Node: TypeAlias = h5py.Group | h5py.Dataset
+Source: TypeAlias = PathLike | h5py.File
+"""A file by its path, or open."""
 
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 """First bytes of an HDF5 file without a user block."""
@@ -54,8 +56,11 @@ _READ_ATTEMPTS = 20
 _CHUNK_CACHE_BYTES = 32 * 2**20
 """Room for files whose chunks span several frames."""
 
-_ACCEPTED_KINDS = {"f": "fiu", "i": "iu", "b": "biu"}
-"""Stored kinds that may become the kind asked for."""
+_KINDS = {"f": "fiu", "i": "iu", "b": "biu"}
+"""Kinds in a file that may become a kind of result."""
+
+_LEAST_BYTES, _BYTES_OF_ONE = 2**24, 1032
+"""Size of data sets that may be unwritten, and what a byte stands for at most, as deflate packs zeros."""
 
 
 @contextmanager
@@ -137,10 +142,10 @@ def open_hdf5(path: PathLike) -> h5py.File:
                 raise FileError(f"{path}: expected an HDF5 file, got one of another kind") from error
             if not any(words in str(error) for words in _HAS_WRITER):
                 raise
-            return _opened_beside_writer(path)
+            return _open_beside_writer(path)
 
 
-def _opened_beside_writer(path: PathLike) -> h5py.File:
+def _open_beside_writer(path: PathLike) -> h5py.File:
     """Open a file as a reader beside its writer.
 
     What is half written HDF5 reads a hundred times, each after twice the time: for ever in a file that was
@@ -155,13 +160,13 @@ def _opened_beside_writer(path: PathLike) -> h5py.File:
 
 
 @contextmanager
-def reading(where: PathLike, *others: type[BaseException]) -> Iterator[None]:
+def reading(where: PathLike, *library_errors: type[BaseException]) -> Iterator[None]:
     """Turn what a damaged or unreadable file raises in the block into a `FileError` of one line.
 
-    Other exceptions are errors of a program and pass. `others` are those of a library that has its own;
-    `Exception` where the block is a call of such a library and nothing else.
+    Other exceptions are errors of a program and pass. A library may have errors of its own; `Exception`
+    stands for them where the block is a call of such a library and nothing else.
     """
-    damage = _DAMAGE + others
+    damage = _DAMAGE + library_errors
     try:
         yield
     except Speckle3DError:
@@ -171,16 +176,19 @@ def reading(where: PathLike, *others: type[BaseException]) -> Iterator[None]:
 
 
 @contextmanager
-def opened(path: PathLike, format_name: str, versions: Sequence[int] = (1,)) -> Iterator[h5py.File]:
-    """Open an HDF5 file of the family for reading and require its format and one of the versions."""
-    with reading(path), open_hdf5(path) as file:
-        got_format = file_format(file)
-        if got_format != format_name:
-            raise InvalidInputError(f"{path}: expected format {format_name!r}, got {got_format or 'none'!r}")
-        version = read_attribute(file, "version")
-        if version not in versions:
-            known = " or ".join(map(str, versions))
-            raise InvalidInputError(f"{path}: expected {format_name} version {known}, got {version:g}")
+def open_family(source: Source, format_name: str, versions: Sequence[int] = (1,)) -> Iterator[h5py.File]:
+    """Open an HDF5 file of the family for reading and require its format and one of the versions.
+
+    A file that is open stays so after the block.
+    """
+    path = source.filename if isinstance(source, h5py.File) else source
+    file_context: Any = nullcontext(source) if isinstance(source, h5py.File) else open_hdf5(source)
+    with reading(path), file_context as file, naming(str(path)):
+        if (kind := file_format(file)) != format_name:
+            raise InvalidInputError(f"expected format {format_name!r}, got {kind or 'none'!r}")
+        if (version := read_attribute(file, "version")) not in versions:
+            numbers = " or ".join(map(str, versions))
+            raise InvalidInputError(f"expected {format_name} version {numbers}, got {version:g}")
         yield file
 
 
@@ -208,8 +216,8 @@ def find_member(group: h5py.Group, name: str) -> Any:
         if not isinstance(group, h5py.Group) or group.get(name, getlink=True) is None:
             return None
         node = group.get(name)
-        is_own = node is not None and node.file.filename == group.file.filename
-        if not is_own or (isinstance(node, h5py.Dataset) and (node.is_virtual or node.external)):
+        is_inside = node is not None and node.file.filename == group.file.filename
+        if not is_inside or (isinstance(node, h5py.Dataset) and (node.is_virtual or node.external)):
             raise InvalidInputError(f"{where}: expected data in the file itself, got a link to none")
         return node
 
@@ -232,8 +240,8 @@ def require_dataset(group: h5py.Group, name: str) -> h5py.Dataset:
 def _require_kind(group: h5py.Group, name: str, kind: type[Node]) -> Any:
     node = find_member(group, name)
     if not isinstance(node, kind):
-        expected, got = kind.__name__.lower(), "none" if node is None else type(node).__name__.lower()
-        raise InvalidInputError(f"{locate(group, name)}: expected a {expected}, got {got}")
+        expected, actual = kind.__name__.lower(), "none" if node is None else type(node).__name__.lower()
+        raise InvalidInputError(f"{locate(group, name)}: expected a {expected}, got {actual}")
     return node
 
 
@@ -256,20 +264,22 @@ def read_checked(
     FileError
         If its bytes cannot be read.
     """
-    node, where, wanted = require_dataset(group, name), locate(group, name), np.dtype(dtype)
-    if node.dtype.kind not in _ACCEPTED_KINDS[wanted.kind]:
-        raise InvalidInputError(f"{where}: expected numbers of type {wanted}, got {node.dtype}")
+    node, where, result = require_dataset(group, name), locate(group, name), np.dtype(dtype)
+    if node.dtype.kind not in _KINDS[result.kind]:
+        raise InvalidInputError(f"{where}: expected numbers of type {result}, got {node.dtype}")
     if shape is not None:
         require_shape(node, shape, where)
+    if node.nbytes > _LEAST_BYTES + _BYTES_OF_ONE * node.id.get_storage_size():
+        raise FileError(f"{where}: ends early: {node.shape} numbers, most of which were never written")
     with reading(where):
-        return np.asarray(node[()], dtype=wanted)
+        return np.asarray(node[()], dtype=result)
 
 
 def require_shape(node: h5py.Dataset, shape: tuple[int | str, ...], where: str) -> None:
     """Raise `InvalidInputError` unless a data set is of a shape; a word stands for a length that is free."""
     pairs = zip(node.shape or (), shape, strict=False)
-    is_other = any(length != wanted for length, wanted in pairs if isinstance(wanted, int))
-    if is_other or node.ndim != len(shape):
+    differs = any(actual != expected for actual, expected in pairs if isinstance(expected, int))
+    if differs or node.ndim != len(shape):
         raise InvalidInputError(f"{where}: expected shape {shape}, got {node.shape}")
 
 
@@ -302,7 +312,7 @@ def read_vector_attribute(node: Node, name: str, size: int) -> FloatArray:
     value = np.asarray(raw)
     if value.dtype.kind not in "fiu" or value.size != size or np.isnan(value).any():
         where = f"{locate(node)} attribute {name}"
-        raise InvalidInputError(f"{where}: expected {size} number(s), got {_shown(raw)}")
+        raise InvalidInputError(f"{where}: expected {size} number(s), got {_excerpt(raw)}")
     return value.astype(np.float64).ravel()
 
 
@@ -312,7 +322,7 @@ def read_text(node: Node, name: str, default: str | None = None) -> str:
     text = raw.decode("utf-8", errors="replace") if isinstance(raw, bytes) else raw
     text = text if isinstance(text, str) else default
     if text is None:
-        raise InvalidInputError(f"{locate(node)} attribute {name}: expected a text, got {_shown(raw)}")
+        raise InvalidInputError(f"{locate(node)} attribute {name}: expected a text, got {_excerpt(raw)}")
     return str(text)
 
 
@@ -328,6 +338,6 @@ def one_line(error: BaseException) -> str:
     return (text.strip() or type(error).__name__).splitlines()[0]
 
 
-def _shown(raw: object) -> str:
+def _excerpt(raw: object) -> str:
     text = "none" if raw is None else " ".join(repr(raw).split())
     return text if len(text) <= 60 else f"{text[:57]}..."

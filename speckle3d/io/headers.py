@@ -126,12 +126,11 @@ class SequenceHeader:
     def axis_times_s(self, count: int) -> FloatArray | None:
         """Times of so many frames by their axis, NaN where it has none; None where it is no axis of time."""
         if self.axis_step_s is not None:
-            return np.arange(count) * self.axis_step_s
-        return (
-            None
-            if self.axis_index_s is None
-            else np.append(self.axis_index_s, np.full(count, np.nan))[:count]
-        )
+            return self.axis_step_s * np.arange(count, dtype=np.float64)
+        if self.axis_index_s is None:
+            return None
+        times: FloatArray = np.append(self.axis_index_s, np.full(count, np.nan))[:count]
+        return times
 
     def require_bytes(self) -> None:
         """Refuse a file too short for its images, before anything is made in their number.

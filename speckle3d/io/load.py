@@ -6,6 +6,9 @@ import hashlib
 from collections.abc import Generator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
+
+import h5py
 
 from speckle3d.core.errors import FileError, InvalidInputError, Speckle3DError, naming
 from speckle3d.core.files import PathLike
@@ -14,14 +17,16 @@ from speckle3d.core.reconstruction import ImportRecord
 from speckle3d.core.sweep import Sweep
 from speckle3d.io import challenge, sweeps
 from speckle3d.io.challenge import Landmarks
-from speckle3d.io.hdf5 import SIGNATURE, file_format, one_line, open_hdf5, sha256_of
+from speckle3d.io.hdf5 import file_format, one_line, sha256_of
 from speckle3d.io.import_settings import ImportSettings, settings_file, settings_for
 from speckle3d.io.metaimage import READER as _IMAGES
-from speckle3d.io.readers import Reader, find_reader, first_bytes, readers
+from speckle3d.io.readers import Reader, claim, find_reader, first_bytes, readers
 from speckle3d.io.recordings import Recording, Row
 
 IMAGE = _IMAGES.format
 """Kind of MetaImage and NRRD files."""
+
+_VOLUMES = (".nii", ".nii.gz", ".hdr")
 
 SIZED = (sweeps.FORMAT, challenge.FORMAT)
 """Kinds that always say how large their pixels are."""
@@ -69,22 +74,22 @@ def open_recording(path: PathLike, settings: ImportSettings | None = None) -> Re
     FileError, InvalidInputError
         As of `load_sweep`; what a recording lacks is asked for when its sweep is.
     """
-    reader = find_reader(path)
-    if reader is None:
-        kind = family_format(path)
-        raise InvalidInputError(f"{path}: expected format {sweeps.FORMAT!r}, got {kind!r}")
-    return recording_of(reader, Path(path), settings_for(path, settings))
+    with claim(path) as (reader, source):
+        if reader is None:
+            kind = family_format(path, source)
+            raise InvalidInputError(f"{path}: expected format {sweeps.FORMAT!r}, got {kind!r}")
+        return recording_of(reader, source, settings_for(path, settings), Path(path))
 
 
-def recording_of(reader: Reader, path: Path, settings: ImportSettings) -> Recording:
-    """Open a recording that a reader claims; its errors name the recording."""
-    if not reader.takes_settings and (own := settings_file(path)) is not None and own.stem == path.name:
+def recording_of(reader: Reader, source: Any, settings: ImportSettings, path: Path) -> Recording:
+    """Open a recording that a reader claims, by its path or open file; its errors name the recording."""
+    if not reader.takes_settings and (file := settings_file(path)) is not None and file.stem == path.name:
         raise InvalidInputError(
-            f"{own}: expected none beside a {reader.format}, which says all itself: it would not be read"
+            f"{file}: expected none beside a {reader.format}, which says all itself: it would not be read"
         )
     try:
         with naming(str(path)):
-            recording = _read(reader, path, settings)
+            recording = _read(reader, source, settings, path)
     except Speckle3DError:
         raise
     except (OSError, RuntimeError, MemoryError) as error:  # of damage where nothing else is asked for
@@ -92,9 +97,9 @@ def recording_of(reader: Reader, path: Path, settings: ImportSettings) -> Record
     return recording if isinstance(recording, Recording) else Recording(path, settings, ready=recording)
 
 
-def _read(reader: Reader, path: Path, settings: ImportSettings) -> Sweep | Recording:
+def _read(reader: Reader, source: Any, settings: ImportSettings, path: Path) -> Sweep | Recording:
     """What a reader makes; where it cannot, the facts that it told before, and why."""
-    facts = reader.read(path, settings)
+    facts = reader.read(source, settings)
     if not isinstance(facts, Generator):
         return facts
     rows = list[Row]()
@@ -161,31 +166,32 @@ def kind_of(path: PathLike) -> str:
     InvalidInputError
         If it is of no known kind.
     """
-    reader = find_reader(path)
-    return family_format(path) if reader is None else reader.format
+    with claim(path) as (reader, source):
+        return family_format(path, source) if reader is None else reader.format
 
 
-def family_format(path: PathLike) -> str:
-    """Format of a file of the family that no reader claims.
+def family_format(path: PathLike, source: Path | h5py.File) -> str:
+    """Format of a file of the family that no reader claims, by its path or, of HDF5, the open file.
 
     Raises
     ------
     InvalidInputError
         If it is of no known kind.
     """
-    known = ", ".join(reader.format for reader in readers())
-    start = first_bytes(path)
-    if start.startswith(SIGNATURE):
-        with open_hdf5(path) as file:
-            kind = file_format(file)
-            if kind.startswith("speckle3d."):
-                return kind
-            got = f"HDF5 of another kind, with {', '.join(map(str, file)) or 'nothing'}"[:200]
-    elif start.startswith(b"\x1f\x8b"):
-        got = "a file packed by gzip: unpack it first"
+    place, formats = Path(path), ", ".join(reader.format for reader in readers())
+    if isinstance(source, h5py.File):
+        if (kind := file_format(source)).startswith("speckle3d."):
+            return kind
+        content = f"HDF5 of another kind, with {', '.join(map(str, source)) or 'nothing'}"[:200]
+    elif place.is_dir():
+        content = "a folder that none of them is in"
+    elif place.name.lower().endswith(_VOLUMES):
+        content = "a volume (NIfTI)"
+    elif (start := first_bytes(path)).startswith(b"\x1f\x8b"):
+        content = "a file packed by gzip: unpack it first"
     else:
-        got = "another file" if Path(path).is_file() else "a folder that none of them is in"
+        content = "another file" if start else "an empty file"
     raise InvalidInputError(
-        f"{path}: expected a recording ({known}), got {got}. Logs of sensors are for `speckle3d imu info`, "
-        "paths of poses for `speckle3d trajectory score`"
+        f"{path}: expected a recording ({formats}), got {content}. Logs of sensors are for "
+        "`speckle3d imu info`, paths of poses for `speckle3d trajectory score`"
     )

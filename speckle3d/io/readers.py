@@ -6,8 +6,8 @@ A package adds a format by an entry point of the group ``speckle3d.readers`` tha
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
-from contextlib import nullcontext
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
@@ -28,7 +28,7 @@ from speckle3d.io.recordings import Row as Row
 GROUP = "speckle3d.readers"
 START_BYTES = 4096
 
-_OWN = (
+_MODULES = (
     "sweeps", "challenge", "formats.uff", "formats.zea", "formats.dicom", "formats.matlab", "metaimage",
     "plus.device_set", "formats.ultrasonix", "clarius", "formats.pictures",
 )  # fmt: skip
@@ -47,9 +47,10 @@ class Reader:
         Whether a recording is of this format, from its path and its first `START_BYTES` bytes, which are
         none for a folder. It raises nothing.
     read : callable
-        The sweep of a recording, with `ImportSettings` for what it does not say; or a `Recording`, which
-        makes the sweep, describes itself and tells what was assumed or left out. A generator yields rows of
-        facts before it returns a `Recording`: they are told also where there is none.
+        The sweep of a recording, by its path or, of `claims_hdf5`, by the open file, with `ImportSettings`
+        for what it does not say; or a `Recording`, which makes the sweep, describes itself and tells what was
+        assumed or left out. A generator yields rows of facts before it returns a `Recording`: they are told
+        also where there is none.
     companions : callable
         Other files that the sweep's content depends on.
     takes_settings : bool
@@ -60,14 +61,15 @@ class Reader:
 
     format: str
     claims: Callable[[Path, bytes], bool] | None
-    read: Callable[[Path, ImportSettings], Sweep | Recording | Facts]
+    read: Callable[[Any, ImportSettings], Sweep | Recording | Facts]
     companions: Callable[[Path], Sequence[Path]] = lambda _: ()
     takes_settings: bool = True
     claims_hdf5: Callable[[h5py.File], bool] | None = None
 
 
-def find_reader(path: PathLike) -> Reader | None:
-    """Find the reader that claims a recording, a file or a folder; None where none does.
+@contextmanager
+def claim(path: PathLike) -> Iterator[tuple[Reader | None, Path | h5py.File]]:
+    """Yield the reader that claims a recording, None where none does, and its path or open HDF5 file.
 
     Raises
     ------
@@ -75,14 +77,23 @@ def find_reader(path: PathLike) -> Reader | None:
         If there is no such file or folder, or it cannot be read.
     """
     place, start = Path(path), first_bytes(path)
-    opened: Any = open_hdf5(path) if start.startswith(SIGNATURE) else nullcontext()
-    with reading(path), opened as file:
-        for reader in readers():
-            if reader.claims is not None and reader.claims(place, start):
-                return reader
-            if reader.claims_hdf5 is not None and file is not None and reader.claims_hdf5(file):
-                return reader
-    return None
+    with open_hdf5(path) if start.startswith(SIGNATURE) else nullcontext() as file:
+        with reading(path):
+            claims = (
+                reader
+                for reader in readers()
+                if (reader.claims is not None and reader.claims(place, start))
+                or (reader.claims_hdf5 is not None and file is not None and reader.claims_hdf5(file))
+            )
+            reader = next(claims, None)
+        is_hdf5 = file is not None and (reader is None or reader.claims_hdf5 is not None)
+        yield reader, file if is_hdf5 else place
+
+
+def find_reader(path: PathLike) -> Reader | None:
+    """Find the reader that claims a recording, as `claim` does."""
+    with claim(path) as (reader, _):
+        return reader
 
 
 def first_bytes(path: PathLike) -> bytes:
@@ -104,16 +115,16 @@ def first_bytes(path: PathLike) -> bytes:
 @cache
 def readers() -> tuple[Reader, ...]:
     """All readers, those of other packages first."""
-    return *_others(), *(import_module(f"speckle3d.io.{name}").READER for name in _OWN)
+    return *_plugins(), *(import_module(f"speckle3d.io.{name}").READER for name in _MODULES)
 
 
-def _others() -> tuple[Reader, ...]:
+def _plugins() -> tuple[Reader, ...]:
     """Readers of other packages; one that cannot be loaded is told of and left out."""
-    loaded = []
+    plugins = []
     for entry in sorted(entry_points(group=GROUP), key=lambda entry: entry.name):
         try:
-            loaded.append(entry.load())
+            plugins.append(entry.load())
         except Exception as error:  # noqa: BLE001 - a lab's own code must not stop all others
             fault = f"it cannot be loaded: {type(error).__name__}: {error}"
             warnings.warn(f"entry point {entry.name} of {GROUP}: left out: {fault}", stacklevel=2)
-    return tuple(loaded)
+    return tuple(plugins)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import h5py
 import numpy as np
 
-from speckle3d.core.errors import InvalidInputError, naming
+from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.geometry import require_finite, require_increasing, transforms_from_matrices
 from speckle3d.core.grid import ImageGrid
 from speckle3d.core.reconstruction import (
@@ -24,9 +24,10 @@ from speckle3d.core.reconstruction import (
 )
 from speckle3d.io.hdf5 import (
     PathLike,
+    Source,
     has_member,
     locate,
-    opened,
+    open_family,
     read_attribute,
     read_checked,
     read_text,
@@ -56,7 +57,7 @@ def write_reconstruction(path: PathLike, result: Reconstruction, pairs: Sequence
     FileError
         If the file cannot be written.
     """
-    made, trust = result.provenance, result.trust
+    origin, trust = result.provenance, result.trust
     parts = pairs or ([] if result.pairs is None else [result.pairs])
     with written(path, FORMAT) as file:
         put(file, "frame_time_s", result.frame_time_s)
@@ -70,26 +71,27 @@ def write_reconstruction(path: PathLike, result: Reconstruction, pairs: Sequence
                 file["pose_covariance/image"].attrs.update(vars(trust.shared))
             for mode, errors in trust.modes.items():
                 file[f"pose_covariance/{mode}"].attrs["length_sigma"] = errors.length_sigma
-        put_fields(file, made, skip=["calibrations", "imported"])
-        for used in made.calibrations:
-            put(file, f"calibrations/{used.sensor}", SourceFile(used.path, used.sha256))
-        if made.imported is not None:
-            put(file, "import", {"name": made.imported.name})
-            put_text(file["import"], "settings_json", made.imported.settings_json)
+        put_fields(file, origin, skip=["calibrations", "imported"])
+        for calibration in origin.calibrations:
+            source = SourceFile(calibration.path, calibration.sha256)
+            put(file, f"calibrations/{calibration.sensor}", source)
+        if origin.imported is not None:
+            put(file, "import", {"name": origin.imported.name})
+            put_text(file["import"], "settings_json", origin.imported.settings_json)
         put_text(file, "config_toml", result.config_toml)
         if parts:
             rows = {name: np.concatenate([vars(part)[name] for part in parts]) for name in vars(parts[0])}
             put(file, "pairs", rows | {"patch_centre_mm": parts[0].patch_centre_mm})
 
 
-def read_reconstruction(path: PathLike, with_pairs: bool = True) -> Reconstruction:
+def read_reconstruction(path: Source, with_pairs: bool = True) -> Reconstruction:
     """Read a reconstruction file.
 
     Parameters
     ----------
     with_pairs : bool
         Whether to read the frame pairs, by far the larger part.
-    path : path
+    path : path or open file
         ``reconstruction.h5`` of a results folder.
 
     Returns
@@ -103,19 +105,18 @@ def read_reconstruction(path: PathLike, with_pairs: bool = True) -> Reconstructi
     InvalidInputError
         Naming the file, the data set and the first bad index.
     """
-    with opened(path, FORMAT) as file:
+    with open_family(path, FORMAT) as file:
         times, group = read_checked(file, "frame_time_s", ("frame",)), require_group(file, "poses")
         modes = [mode for mode in MODES if has_member(group, mode)]
-        with naming(str(path)):
-            return Reconstruction(
-                frame_time_s=require_increasing(times, locate(file, "frame_time_s")),
-                grid=read_record(file, ImageGrid),
-                poses={mode: read_transforms(group, mode, times.size) for mode in modes},
-                provenance=_read_provenance(file),
-                config_toml=read_texts(file, "config_toml", ()),
-                pairs=_read_pairs(file, times.size) if with_pairs else None,
-                trust=_read_trust(file, times.size),
-            )
+        return Reconstruction(
+            frame_time_s=require_increasing(times, locate(file, "frame_time_s")),
+            grid=read_record(file, ImageGrid),
+            poses={mode: read_transforms(group, mode, times.size) for mode in modes},
+            provenance=_read_provenance(file),
+            config_toml=read_texts(file, "config_toml", ()),
+            pairs=_read_pairs(file, times.size) if with_pairs else None,
+            trust=_read_trust(file, times.size),
+        )
 
 
 load_reconstruction = read_reconstruction
@@ -125,12 +126,14 @@ load_reconstruction = read_reconstruction
 def _read_provenance(file: h5py.File) -> Provenance:
     """Where a reconstruction came from; files of versions before 0.1 lack some groups."""
     files = require_group(file, "calibrations") if has_member(file, "calibrations") else {}
-    used = [read_record(require_group(files, sensor), CalibrationFile, sensor=sensor) for sensor in files]
-    imported = None
+    calibrations = tuple(
+        read_record(require_group(files, sensor), CalibrationFile, sensor=sensor) for sensor in files
+    )
+    settings = None
     if has_member(file, "import"):
         group = require_group(file, "import")
-        imported = ImportRecord(read_text(group, "name"), read_texts(group, "settings_json", ()))
-    return read_record(file, Provenance, calibrations=tuple(used), imported=imported)
+        settings = ImportRecord(read_text(group, "name"), read_texts(group, "settings_json", ()))
+    return read_record(file, Provenance, calibrations=calibrations, imported=settings)
 
 
 def _read_trust(file: h5py.File, frames: int) -> Trust | None:
@@ -142,16 +145,16 @@ def _read_trust(file: h5py.File, frames: int) -> Trust | None:
     }
     for mode, values in covariances.items():
         require_finite(values, locate(group, mode))
-    image, shared = require_dataset(group, "image"), None
+    image, common_errors = require_dataset(group, "image"), None
     if "turn_sigma_per_mm" in image.attrs:
         turn = read_vector_attribute(image, "turn_sigma_per_mm", 2)
-        shared = read_record(image, SharedErrors, turn_sigma_per_mm=turn)
+        common_errors = read_record(image, SharedErrors, turn_sigma_per_mm=turn)
     covariance = covariances.pop("image")
     modes = {
         mode: ModeErrors(values, read_attribute(group[mode], "length_sigma"))
         for mode, values in covariances.items()
     }
-    return Trust(covariance, read_checked(file, "frame_flags", (frames,), np.int64), shared, modes)
+    return Trust(covariance, read_checked(file, "frame_flags", (frames,), np.int64), common_errors, modes)
 
 
 def _read_pairs(file: h5py.File, frames: int) -> FramePairs | None:

@@ -11,7 +11,6 @@ import json
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
-from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, Self
 
@@ -197,7 +196,7 @@ def attach_orientation(path: PathLike, sensor: OrientationSensor) -> None:
     InvalidInputError
         If it is no sweep file.
     """
-    sweep = open_sweep(Path(path)).ready
+    sweep = open_sweep(path).ready
     assert sweep is not None
     write_sweep(path, replace(sweep, orientation=sensor))
 

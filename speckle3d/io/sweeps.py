@@ -27,11 +27,12 @@ from speckle3d.core.sweep import INERTIAL, BModeSettings, OrientationSensor, RFS
 from speckle3d.io.frames import FileFrames, HDF5Slices
 from speckle3d.io.hdf5 import (
     Node,
+    Source,
     file_format,
     find_member,
     has_member,
     locate,
-    opened,
+    open_family,
     read_attribute,
     read_checked,
     read_text,
@@ -75,9 +76,10 @@ def from_pairs(pairs: npt.NDArray[np.int16]) -> npt.NDArray[np.complex64]:
     return pairs.astype(np.float32).view(np.complex64)[..., 0]
 
 
-def open_sweep(path: Path, _: ImportSettings | None = None) -> Recording:
+def open_sweep(source: Source, _: ImportSettings | None = None) -> Recording:
     """Read a sweep file; its frames stay on disk until they are asked for."""
-    with opened(path, FORMAT, (VERSION, IQ_VERSION, FAN_VERSION)) as file:
+    with open_family(source, FORMAT, (VERSION, IQ_VERSION, FAN_VERSION)) as file:
+        path = Path(file.filename)
         clock = _Clock.of(file, "frame_time_s")
         count = clock.time_s.size
         if not count:

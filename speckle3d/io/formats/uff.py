@@ -41,7 +41,6 @@ from speckle3d.io.hdf5 import (
     file_format,
     find_member,
     locate,
-    open_hdf5,
     require_dataset,
     require_group,
 )
@@ -51,19 +50,13 @@ from speckle3d.io.recordings import Facts, Recording, Value, grid_values, rate_b
 
 FORMAT = "USTB .uff"
 
-_BEAMFORMED, _CHANNELS = "uff.beamformed_data", "uff.channel_data"
+_IMAGE_CLASS, _CHANNEL_CLASS = "uff.beamformed_data", "uff.channel_data"
 _LINEAR, _SECTOR = "uff.linear_scan", "uff.sector_scan"
 
 
 def is_uff(file: h5py.File) -> bool:
     """Whether an open file holds objects of USTB."""
     return not file_format(file) and any(kind.startswith("uff.") for kind in _objects(file).values())
-
-
-def open_uff(path: Path, settings: ImportSettings) -> Facts:
-    """Read beamformed RF or I/Q on a linear or a sector scan; real data of one sign become grey levels."""
-    with open_hdf5(path) as file:
-        return (yield from _recording(path, settings, file))
 
 
 def _objects(file: h5py.File) -> dict[str, str]:
@@ -73,14 +66,15 @@ def _objects(file: h5py.File) -> dict[str, str]:
     return {name: kind for name, kind in kinds.items() if kind}
 
 
-def _recording(path: Path, settings: ImportSettings, file: h5py.File) -> Facts:
-    asked, objects = settings.arrays.get("data"), _objects(file)
+def open_uff(file: h5py.File, settings: ImportSettings) -> Facts:
+    """Read beamformed RF or I/Q on a linear or a sector scan; real data of one sign become grey levels."""
+    path, choice, objects = Path(file.filename), settings.arrays.get("data"), _objects(file)
     yield from (("object", f"{name}: {kind}", "") for name, kind in objects.items())
-    names = [one for one, kind in objects.items() if kind == _BEAMFORMED and asked in (None, one)]
+    names = [name for name, kind in objects.items() if kind == _IMAGE_CLASS and choice in (None, name)]
     if len(names) != 1:
-        got = ", ".join(names or objects.values()) or "none"
+        candidates = ", ".join(names or objects.values()) or "none"
         raise InvalidInputError(
-            f"expected one {_BEAMFORMED}, got {got}: say which by arrays = {{ data = NAME }} in "
+            f"expected one {_IMAGE_CLASS}, got {candidates}: say which by arrays = {{ data = NAME }} in "
             f"{path.name}.toml beside it, or beamform channels by USTB's das on a {_LINEAR}"
         )
     name = names[0]
@@ -96,11 +90,11 @@ def _recording(path: Path, settings: ImportSettings, file: h5py.File) -> Facts:
     values["demodulation_frequency_hz"] = modulation
     if modulation_hz:
         values["centre_frequency_hz"] = replace(modulation, source=f"assumed: {modulation.source[3:]}")
-    if sent := values_of(group, {"centre_frequency_hz": "pulse/center_frequency"}):
+    if pulse := values_of(group, {"centre_frequency_hz": "pulse/center_frequency"}):
         share = single(group, "pulse/fractional_bandwidth")
-        values |= sent | band_about(sent, share, f"in {name}/pulse/fractional_bandwidth")
-    for other in (other for other, kind in objects.items() if kind == _CHANNELS):
-        values |= values_of(file, {"speed_of_sound_m_s": f"{other}/sound_speed"})
+        values |= pulse | band_about(pulse, share, f"in {name}/pulse/fractional_bandwidth")
+    for channels in (channels for channels, kind in objects.items() if kind == _CHANNEL_CLASS):
+        values |= values_of(file, {"speed_of_sound_m_s": f"{channels}/sound_speed"})
     shape = count, lines, samples
     source = HDF5Slices(path, parts, partial(frame_of, shape=shape[1:]), axis)
     frames = source.frames(shape, np.complex64 if is_complex else np.float32)
@@ -125,24 +119,24 @@ def _require_phase(
     frames: FileFrames, values: dict[str, Value], settings: ImportSettings, modulation_hz: float
 ) -> None:
     """Refuse a modulation frequency that contradicts how the phase of the data turns."""
-    carried_hz = modulation_hz or values.get("centre_frequency_hz", Value()).value or 0.0
+    carrier_hz = modulation_hz or values.get("centre_frequency_hz", Value()).value or 0.0
     rate_hz = rate_by_spacing(values["row_spacing_mm"], settings, values).value
-    shift_hz = demodulation_of(frames, carried_hz, rate_hz) if carried_hz else None
+    shift_hz = demodulation_of(frames, carrier_hz, rate_hz) if carrier_hz else None
     if shift_hz is not None and shift_hz != modulation_hz:
         raise InvalidInputError(
             f"modulation_frequency: expected {shift_hz:g} Hz, as the phase of the data tells (they "
-            f"{'are shifted down by' if shift_hz else 'still carry'} {carried_hz:g}), got {modulation_hz:g}: "
+            f"{'are shifted down by' if shift_hz else 'still carry'} {carrier_hz:g}), got {modulation_hz:g}: "
             "give --demodulation-frequency-hz, 0 where it is still carried"
         )
 
 
-def _scan(group: h5py.Group, said: str) -> tuple[int, int, dict[str, Value]]:
+def _scan(group: h5py.Group, source: str) -> tuple[int, int, dict[str, Value]]:
     """Lines and samples of a scan, and where they lie."""
     scan, where = require_group(group, "scan"), locate(group, "scan")
     kind = text_of(scan.attrs.get("class"))
     if kind == _LINEAR:
         x_mm, z_mm = 1e3 * flat(scan, "x_axis"), 1e3 * flat(scan, "z_axis")
-        return x_mm.size, z_mm.size, grid_values(x_mm, z_mm, where, said)
+        return x_mm.size, z_mm.size, grid_values(x_mm, z_mm, where, source)
     if kind != _SECTOR:
         raise InvalidInputError(
             f"{where}: expected a {_LINEAR} or {_SECTOR}, got {kind or 'none'}: beamform onto one of them"
@@ -150,7 +144,7 @@ def _scan(group: h5py.Group, said: str) -> tuple[int, int, dict[str, Value]]:
     angle, radius_mm = flat(scan, "azimuth_axis"), 1e3 * flat(scan, "depth_axis")
     # Depths are from where the lines meet, which is above the array's face if it is curved.
     face_mm = radius_mm[0] * np.cos(angle[0]) - 1e3 * flat(scan, "z")[0]
-    return angle.size, radius_mm.size, fan_values(angle, radius_mm, float(face_mm), where, said)
+    return angle.size, radius_mm.size, fan_values(angle, radius_mm, float(face_mm), where, source)
 
 
 def _frame_axis(node: h5py.Dataset, pixels: int) -> tuple[int | None, int]:

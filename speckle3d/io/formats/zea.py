@@ -46,7 +46,6 @@ from speckle3d.io.hdf5 import (
     find_member,
     has_member,
     locate,
-    open_hdf5,
     read_checked,
     require_dataset,
 )
@@ -58,7 +57,7 @@ from speckle3d.io.recordings import Facts, Recording, Value, grid_values, rate_b
 FORMAT = "zea"
 
 _READ = ("beamformed_data", "envelope_data", "image_sc", "image")
-_NOT_BEAMFORMED = ("raw_data", "aligned_data")
+_CHANNEL_DATA = ("raw_data", "aligned_data")
 _POSES = "metadata/probe_pose"
 _TOLERANCE_MM = 1e-3
 """Of a pixel's place: single precision in metres keeps 1e-5 mm of a depth of 150 mm."""
@@ -69,13 +68,7 @@ _ROTATIONS = ("quaternion_wxyz", "quaternion_xyzw", "euler_xyz")
 
 def is_zea(file: h5py.File) -> bool:
     """Whether an open file has zea's groups, and no format of this package's family."""
-    return not file_format(file) and bool(_arrays(file, (*_READ, *_NOT_BEAMFORMED)))
-
-
-def open_zea(path: Path, settings: ImportSettings) -> Facts:
-    """Read beamformed RF or I/Q, else an envelope, else images; with the probe's poses."""
-    with open_hdf5(path) as file:
-        return (yield from _recording(path, settings, file))
+    return not file_format(file) and bool(_arrays(file, (*_READ, *_CHANNEL_DATA)))
 
 
 def _homes(file: h5py.File) -> list[str]:
@@ -89,21 +82,23 @@ def _homes(file: h5py.File) -> list[str]:
 def _arrays(file: h5py.File, kinds: Sequence[str]) -> list[tuple[str, str, str]]:
     """Names of arrays of some kinds, their kinds, and what stands before their ``data``."""
     names = ((f"{home}data/{kind}", kind, home) for kind in kinds for home in _homes(file))
-    return [one for one in names if has_member(file, one[0])]
+    return [row for row in names if has_member(file, row[0])]
 
 
-def _recording(path: Path, settings: ImportSettings, file: h5py.File) -> Facts:
+def open_zea(file: h5py.File, settings: ImportSettings) -> Facts:
+    """Read beamformed RF or I/Q, else an envelope, else images; with the probe's poses."""
+    path = Path(file.filename)
     members = [f"{home}data/{printable(name)}" for home in _homes(file) for name in file[f"{home}data"]]
     contents = ", ".join(members)
-    if any(name.endswith(_NOT_BEAMFORMED) for name in members):
+    if any(name.endswith(_CHANNEL_DATA) for name in members):
         contents += ": channel data need beamforming, by zea's Pipeline, and its result written"
     yield "holds", contents, ""
-    asked = settings.arrays.get("data", "").strip("/").removesuffix("/values")
-    arrays = [one for one in _arrays(file, _READ) if asked in ("", one[0])]
+    choice = settings.arrays.get("data", "").strip("/").removesuffix("/values")
+    arrays = [row for row in _arrays(file, _READ) if choice in ("", row[0])]
     if not arrays:
         raise InvalidInputError(f"expected {' or '.join(_READ)}, got {contents}")
     name, kind, home = arrays[0]
-    if any(same == kind for _, same, _ in arrays[1:]):
+    if kind in [row[1] for row in arrays[1:]]:
         raise InvalidInputError(
             f"expected one track, got {contents}: say which by arrays = {{ data = NAME }} in "
             f"{path.name}.toml beside it"
@@ -115,16 +110,16 @@ def _recording(path: Path, settings: ImportSettings, file: h5py.File) -> Facts:
     values = values_of(file, places)
     percent = single(file, f"{scan}/bandwidth_percent") or 0.0
     values |= band_about(values, percent / 100.0, f"in {scan}/bandwidth_percent")
-    is_image, is_beamformed = node.dtype == np.uint8, kind == "beamformed_data"
+    is_image, has_channels = node.dtype == np.uint8, kind == "beamformed_data"
     is_sound = node.dtype.kind == "f" or (is_image and kind.startswith("image"))
     sizes, channels = node.shape[:3], node.shape[3:]
-    if not is_sound or len(sizes) < 3 or channels not in ([(1,), (2,)] if is_beamformed else [()]):
+    if not is_sound or len(sizes) < 3 or channels not in ([(1,), (2,)] if has_channels else [()]):
         raise InvalidInputError(
             f"{locate(node)}: expected echoes of shape (frame, z, x), of beamformed_data (frame, z, x, 1 or "
             f"2), got {node.shape} {node.dtype}"
         )
-    left_mm, x_first, is_placed = None, False, has_member(group, "coordinates")
-    if is_placed:
+    left_mm, x_first, has_places = None, False, has_member(group, "coordinates")
+    if has_places:
         numbers, left_mm, x_first = _pixels(require_dataset(group, "coordinates"), sizes)
         values |= numbers
     lines, samples = sizes[1:] if x_first else sizes[:0:-1]
@@ -132,13 +127,13 @@ def _recording(path: Path, settings: ImportSettings, file: h5py.File) -> Facts:
     source = HDF5Slices(
         path, (str(node.name),), partial(frame_of, shape=shape[1:], across=not x_first, pairs=is_complex)
     )
-    if is_beamformed or is_image:
+    if has_channels or is_image:
         frames = source.frames(shape, np.uint8 if is_image else np.complex64 if is_complex else np.float32)
     else:
         is_db, given_db = kind != "envelope_data", settings.dynamic_range_db
         frames, values["dynamic_range_db"] = grey_frames(source, shape, is_db, given_db)
     shift_hz = single(file, f"{scan}/demodulation_frequency")
-    if is_complex and shift_hz and is_placed and settings.demodulation_frequency_hz is None:
+    if is_complex and shift_hz and has_places and settings.demodulation_frequency_hz is None:
         rate_hz = rate_by_spacing(values["row_spacing_mm"], settings, values).value
         words = "of scan/demodulation_frequency and the phase of the data"
         values["demodulation_frequency_hz"] = Value(demodulation_of(frames, shift_hz, rate_hz), words)
@@ -152,7 +147,7 @@ def _recording(path: Path, settings: ImportSettings, file: h5py.File) -> Facts:
         tracker=tracker,
         chain=_POSES,
         probe=settings.probe or text_of(file.attrs.get("probe_name", file.attrs.get("probe"))),
-        assumptions=() if is_placed else ("parallel lines",),
+        assumptions=() if has_places else ("parallel lines",),
         remarks=tuple(remarks),
     )
 
@@ -171,7 +166,7 @@ def _pixels(node: h5py.Dataset, shape: tuple[int, ...]) -> tuple[dict[str, Value
     if node.shape != (*shape, 3) or 0 in shape:
         raise InvalidInputError(f"{locate(node)}: expected shape {(*shape, 3)}, got {node.shape}")
     start, middle, end = (1e3 * node[i].astype(np.float64) for i in (0, shape[0] // 2, shape[0] - 1))
-    said, where = "of the coordinates", locate(node)
+    source, where = "of the coordinates", locate(node)
 
     def is_zero(*off: FloatArray) -> bool:
         return bool(max(np.abs(array).max() for array in off) <= _TOLERANCE_MM)
@@ -181,7 +176,7 @@ def _pixels(node: h5py.Dataset, shape: tuple[int, ...]) -> tuple[dict[str, Value
         if not is_zero(y - y[0, 0], middle - start, end - start):
             break
         if is_zero(x - x[:, :1], z - z[:1]) and np.ptp(x) * np.ptp(z) > 0:
-            return grid_values(x[:, 0], z[0], where, said), float(x[0, 0]), x_first
+            return grid_values(x[:, 0], z[0], where, source), float(x[0, 0]), x_first
         # Lines meet where the distance from all of them is least.
         angle = np.arctan2(x[:, -1] - x[:, 0], z[:, -1] - z[:, 0])
         normals = np.column_stack([np.cos(angle), -np.sin(angle)])
@@ -189,7 +184,7 @@ def _pixels(node: h5py.Dataset, shape: tuple[int, ...]) -> tuple[dict[str, Value
         radius = np.hypot(x[0] - apex[0], z[0] - apex[1])
         across, down = np.outer(np.sin(angle), radius), np.outer(np.cos(angle), radius)
         if is_zero(x - apex[0] - across, z - apex[1] - down) and np.ptp(angle) > 0:
-            return fan_values(angle, radius, -float(apex[1]), where, said), None, x_first
+            return fan_values(angle, radius, -float(apex[1]), where, source), None, x_first
     raise InvalidInputError(
         f"{locate(node)}: expected pixels on a Cartesian or polar grid in one plane, the same in all frames, "
         "got others: beamform onto zea's cartesian_pixel_grid, or scan-convert them"
@@ -210,11 +205,11 @@ def _times(file: h5py.File, group: h5py.Group, scan: str, count: int) -> FloatAr
         return None
     # The last transmission of all has no next one.
     lengths = read_checked(file, name, (count, "transmission"))[:-1].sum(axis=1)
-    known = np.isfinite(lengths)
-    if not known.any():
+    is_finite = np.isfinite(lengths)
+    if not is_finite.any():
         return None
-    times = np.cumsum([0.0, *np.where(known, lengths, np.median(lengths[known]))])
-    times[1:][~known] = np.nan
+    times = np.cumsum([0.0, *np.where(is_finite, lengths, np.median(lengths[is_finite]))])
+    times[1:][~is_finite] = np.nan
     return times
 
 
@@ -232,11 +227,11 @@ def _tracker(file: h5py.File, left_mm: float | None) -> tuple[Tracker | None, li
     sound = np.isfinite(turns).all(axis=1) & (turns.any(axis=1) | is_euler)
     turns[~sound] = 1.0
     if is_euler:
-        turned = Rotation.from_euler("xyz", turns)
+        rotations = Rotation.from_euler("xyz", turns)
     else:
-        turned = Rotation.from_quat(turns, scalar_first=kind == "quaternion_wxyz")
+        rotations = Rotation.from_quat(turns, scalar_first=kind == "quaternion_wxyz")
     matrices = np.tile(np.eye(4), (count, 1, 1))
-    matrices[:, :3, :3], matrices[:, :3, 3] = turned.as_matrix(), 1e3 * places_m
+    matrices[:, :3, :3], matrices[:, :3, 3] = rotations.as_matrix(), 1e3 * places_m
     matrices[~sound] = np.nan
     readings, notes = timed_poses(stamps + (single(node, "start_time_offset") or 0.0), matrices)
     if readings is None:
