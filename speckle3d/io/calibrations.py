@@ -28,8 +28,8 @@ from speckle3d.io.hdf5 import (
     has_member,
     locate,
     open_family,
+    read_array,
     read_attribute,
-    read_checked,
     read_texts,
     read_transforms,
     require_group,
@@ -108,14 +108,14 @@ def read_calibration(path: Source) -> Calibration:
             pose = read_transforms(file, "sensor_from_image")
         else:
             where = locate(file, "sensor_from_image_wxyz")
-            wxyz = read_checked(file, "sensor_from_image_wxyz", (4,))
+            wxyz = read_array(file, "sensor_from_image_wxyz", (4,))
             quaternion = rotations_from_quaternions(wxyz[None], where)[0]
         calibration = read_record(
             file,
             Calibration,
             rotation=quaternion if pose is None else pose.rotation,
             translation_mm=None if pose is None else np.asarray(pose.translation),
-            pixel_mm=read_checked(file, "pixel_mm", (2,)) if has_member(file, "pixel_mm") else None,
+            pixel_mm=read_array(file, "pixel_mm", (2,)) if has_member(file, "pixel_mm") else None,
             parameters=_read_parameters(require_group(file, "parameters")),
             frames=_read_frames(require_group(file, "frames")),
         )
@@ -174,13 +174,13 @@ def resized(sweep: Sweep, sizes: dict[str, float]) -> Sweep:
 
 
 def _read_parameters(group: h5py.Group) -> tuple[Parameter, ...]:
-    value, error = (read_checked(group, name, ("p",)) for name in _NUMBERS)
+    value, error = (read_array(group, name, ("p",)) for name in _NUMBERS)
     names, units = (read_texts(group, name, value.shape) for name in ("name", "unit"))
     return tuple(map(Parameter, names, value.tolist(), error.tolist(), units))
 
 
 def _read_frames(group: h5py.Group) -> FramesUsed:
-    used, dropped = (read_checked(group, name, ("n",), np.int64) for name in ("used", "dropped"))
+    used, dropped = (read_array(group, name, ("n",), np.int64) for name in ("used", "dropped"))
     reasons = read_texts(group, "reason", dropped.shape)
     given = int(read_attribute(group, "given"))
     return FramesUsed(given, tuple(used.tolist()), dict(zip(dropped.tolist(), reasons, strict=True)))

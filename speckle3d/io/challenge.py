@@ -37,7 +37,7 @@ from speckle3d.io.hdf5 import (
     has_member,
     locate,
     open_hdf5,
-    read_checked,
+    read_array,
     reading,
     require_dataset,
 )
@@ -102,7 +102,7 @@ def open_scan(file: h5py.File, _: ImportSettings) -> Recording:
     separate = _transforms_file(scan)
     with nullcontext(file) if separate is None else open_hdf5(separate) as transforms:
         if has_member(transforms, "tforms"):
-            matrices = read_checked(transforms, "tforms", (n, 4, 4))
+            matrices = read_array(transforms, "tforms", (n, 4, 4))
             readings, remarks = timed_poses(np.arange(n) / FRAME_RATE_HZ, matrices)
             tracker = None if readings is None else Tracker(readings, tool_from_image)
     values = {
@@ -155,7 +155,7 @@ def read_landmarks(path: PathLike) -> Landmarks | None:
     with reading(source), open_hdf5(source) as file:
         if not has_member(file, scan.stem):
             return None
-        rows = read_checked(file, scan.stem, ("landmark", 3))
+        rows = read_array(file, scan.stem, ("landmark", 3))
         where = locate(file, scan.stem)
     if not np.isfinite(rows).all() or (rows[:, 0] != np.abs(np.rint(rows[:, 0]))).any():
         raise InvalidInputError(f"{where}: expected a frame and two finite coordinates in every row")

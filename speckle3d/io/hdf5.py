@@ -245,7 +245,7 @@ def _require_kind(group: h5py.Group, name: str, kind: type[Node]) -> Any:
     return node
 
 
-def read_checked(
+def read_array(
     group: h5py.Group, name: str, shape: tuple[int | str, ...] | None, dtype: npt.DTypeLike = np.float64
 ) -> npt.NDArray[Any]:
     """Read a data set whose shape and kind are known.
@@ -286,7 +286,7 @@ def require_shape(node: h5py.Dataset, shape: tuple[int | str, ...], where: str) 
 def read_transforms(group: h5py.Group, name: str, count: int | None = None) -> RigidTransform:
     """Read a data set of so many rigid 4x4 matrices, or of a single one."""
     shape = (4, 4) if count is None else (count, 4, 4)
-    matrices = read_checked(group, name, shape).reshape(-1, 4, 4)
+    matrices = read_array(group, name, shape).reshape(-1, 4, 4)
     poses = transforms_from_matrices(matrices, locate(group, name))
     return poses if count is not None else poses[0]
 

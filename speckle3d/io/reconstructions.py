@@ -28,8 +28,8 @@ from speckle3d.io.hdf5 import (
     has_member,
     locate,
     open_family,
+    read_array,
     read_attribute,
-    read_checked,
     read_text,
     read_texts,
     read_transforms,
@@ -106,7 +106,7 @@ def read_reconstruction(path: Source, with_pairs: bool = True) -> Reconstruction
         Naming the file, the data set and the first bad index.
     """
     with open_family(path, FORMAT) as file:
-        times, group = read_checked(file, "frame_time_s", ("frame",)), require_group(file, "poses")
+        times, group = read_array(file, "frame_time_s", ("frame",)), require_group(file, "poses")
         modes = [mode for mode in MODES if has_member(group, mode)]
         return Reconstruction(
             frame_time_s=require_increasing(times, locate(file, "frame_time_s")),
@@ -140,9 +140,7 @@ def _read_trust(file: h5py.File, frames: int) -> Trust | None:
     if not (has_member(file, "pose_covariance") and has_member(file, "frame_flags")):
         return None
     group = require_group(file, "pose_covariance")
-    covariances = {
-        mode: read_checked(group, mode, (frames, 6, 6)) for mode in MODES if has_member(group, mode)
-    }
+    covariances = {mode: read_array(group, mode, (frames, 6, 6)) for mode in MODES if has_member(group, mode)}
     for mode, values in covariances.items():
         require_finite(values, locate(group, mode))
     image, common_errors = require_dataset(group, "image"), None
@@ -154,7 +152,7 @@ def _read_trust(file: h5py.File, frames: int) -> Trust | None:
         mode: ModeErrors(values, read_attribute(group[mode], "length_sigma"))
         for mode, values in covariances.items()
     }
-    return Trust(covariance, read_checked(file, "frame_flags", (frames,), np.int64), common_errors, modes)
+    return Trust(covariance, read_array(file, "frame_flags", (frames,), np.int64), common_errors, modes)
 
 
 def _read_pairs(file: h5py.File, frames: int) -> FramePairs | None:

@@ -53,7 +53,7 @@ _UNITS = {
     "s": (1.0, "m/s"),
 }
 """What numbers are divided by where they are shown, and the unit then."""
-_ASSUMED = "assumed"
+_ASSUMPTION = "assumed"
 
 
 @dataclass(frozen=True)
@@ -73,14 +73,14 @@ class Value:
     said_by: str = "the file"
 
     @property
-    def is_assumed(self) -> bool:
+    def is_assumption(self) -> bool:
         """Whether nobody says it."""
-        return self.source.startswith(_ASSUMED)
+        return self.source.startswith(_ASSUMPTION)
 
 
-ASSUMED = {
-    "speed_of_sound_m_s": Value(SPEED_OF_SOUND_M_S, _ASSUMED),
-    "first_sample_depth_mm": Value(0.0, _ASSUMED),
+ASSUMPTIONS = {
+    "speed_of_sound_m_s": Value(SPEED_OF_SOUND_M_S, _ASSUMPTION),
+    "first_sample_depth_mm": Value(0.0, _ASSUMPTION),
 }
 
 
@@ -104,7 +104,7 @@ class Recording:
         Why a frame is of no use, empty where it is; by default all are.
     chain : str
         Transforms that the tracker's poses were made of.
-    asked : mapping of str to str
+    substitutes : mapping of str to str
         Settings to ask for in place of others, as the probe's model for a distance.
     assumptions : tuple of str
         What no file says and is taken for granted.
@@ -130,7 +130,7 @@ class Recording:
     probe: str = ""
     name: str = ""
     full_scale: float = 255.0
-    asked: Mapping[str, str] = field(default_factory=dict)
+    substitutes: Mapping[str, str] = field(default_factory=dict)
     assumptions: tuple[str, ...] = ()
     rows: tuple[Row, ...] = ()
     remarks: tuple[str, ...] = ()
@@ -148,76 +148,86 @@ class Recording:
         FileError, InvalidInputError
             If there is none, or its numbers cannot be those of echoes.
         """
-        return self._checked[0]
+        return self._sweep_and_notes[0]
 
     @property
     def notes(self) -> list[str]:
         """What a user should know of how the sweep was made."""
-        words = {name: number_row(name, one.value) for name, one in self.needed.items() if one.is_assumed}
-        assumed = [" ".join(row) for name, row in words.items() if getattr(self.settings, name) is None]
-        assumed += self.assumptions
-        told = [f"assumed, as the file does not say: {', '.join(assumed)}"] if assumed else []
-        return [*self.contradictions(), *self._used[2], *self.remarks, *self._checked[1], *told]
+        assumptions = [
+            " ".join(number_row(name, value.value))
+            for name, value in self.numbers.items()
+            if value.is_assumption and getattr(self.settings, name) is None
+        ]
+        assumptions += self.assumptions
+        words = [f"assumed, as the file does not say: {', '.join(assumptions)}"] if assumptions else []
+        return [
+            *self.contradictions(),
+            *self._frame_times[2],
+            *self.remarks,
+            *self._sweep_and_notes[1],
+            *words,
+        ]
 
     def describe(self) -> list[Row]:
         """Rows of what the file says, where each number is from, and what is odd."""
-        remarks = [*self._used[2], *self.remarks]
+        remarks = [*self._frame_times[2], *self.remarks]
         with suppress(InvalidInputError, FileError):  # which is told by who asks for the sweep
-            remarks += self._checked[1]
-        numbers = () if self.fault else (self._told(name, one)[0] for name, one in self.needed.items())
+            remarks += self._sweep_and_notes[1]
+        numbers = () if self.fault else (self._number(name)[0] for name in self.numbers)
         return [*self.rows, *numbers, *(("note", text, "") for text in remarks)]
 
     def contradictions(self) -> list[str]:
         """Tell each number that is given and is another than the recording says, by more than 1 %."""
-        return [*filter(None, (self._told(name, one)[1] for name, one in self.needed.items()))]
+        return [*filter(None, (self._number(name)[1] for name in self.numbers))]
 
-    def _told(self, name: str, one: Value) -> tuple[Row, str]:
+    def _number(self, name: str) -> tuple[Row, str]:
         """A number's row, and what contradicts it if it is given."""
-        given, source = getattr(self.settings, name), f" ({one.source})" if one.source else ""
-        words, own, unit = number_row(name, () if one.value is None else one.value)
-        if given is None:
-            asked = f"missing: --{self.asked.get(name, name).replace('_', '-')}"
-            return ((words, f"{own}{source}", unit) if own else (words, asked, "")), ""
-        shown, by = number_row(name, given)[1], "given"
-        if (file := settings_file(self.path)) and getattr(settings_for(self.path), name) == given:
-            by = f"given by {file.name}"
-        if not own or one.is_assumed or shown == own:
-            return (words, f"{shown} ({by})", unit), ""
-        against = f"{one.said_by} says {own}"
-        contradiction = f"{words} {shown} {unit}, {by}: {against}{source}"
-        return (words, f"{shown} ({by}, {against})", unit), contradiction * differs(given, one.value)
+        value, setting = self.numbers[name], getattr(self.settings, name)
+        words, number, unit = number_row(name, () if value.value is None else value.value)
+        source = f" ({value.source})" if value.source else ""
+        if setting is None:
+            option = f"missing: --{self.substitutes.get(name, name).replace('_', '-')}"
+            return ((words, f"{number}{source}", unit) if number else (words, option, "")), ""
+        text, giver = number_row(name, setting)[1], "given"
+        if (file := settings_file(self.path)) and getattr(settings_for(self.path), name) == setting:
+            giver = f"given by {file.name}"
+        if not number or value.is_assumption or text == number:
+            return (words, f"{text} ({giver})", unit), ""
+        against = f"{value.said_by} says {number}"
+        contradiction = f"{words} {text} {unit}, {giver}: {against}{source}"
+        return (words, f"{text} ({giver}, {against})", unit), contradiction * differs(setting, value.value)
 
     @cached_property
-    def needed(self) -> dict[str, Value]:
+    def numbers(self) -> dict[str, Value]:
         """The numbers that a sweep of these frames needs, by the names of their settings."""
         if self.frames is None:
             return {}
         dtype = np.dtype(self.frames.dtype)
-        known = {*self.values, *(name for name, value in self.settings if value is not None)}
-        is_grey, is_fan = dtype == np.uint8, not known.isdisjoint(_SPREADING)
+        names_given = {*self.values, *(name for name, value in self.settings if value is not None)}
+        is_grey, is_fan = dtype == np.uint8, not names_given.isdisjoint(_SPREADING)
         pitch = "column_pitch_mm" if is_grey else "vector_pitch_mm"
         names = ["first_sample_depth_mm", *(_SPREADING if is_fan else [pitch])]
         names += ["row_spacing_mm", "dynamic_range_db"] if is_grey else ["speed_of_sound_m_s", *_RATES]
         if dtype.kind == "c":
             names.append("demodulation_frequency_hz")
-        own, times = self._own, self._used[0]
+        values, times = self._file_values, self._frame_times[0]
         if self.settings.frame_rate_hz is not None or (times is None and self.frames.shape[0] > 1):
             names.append("frame_rate_hz")
         if times is not None:
-            own.setdefault("frame_rate_hz", Value(rate_of(times), "of its times"))
-        if "dynamic_range_db" in names and own["dynamic_range_db"].value is None and self._range:
-            source = f"{_ASSUMED}, +- {self._range[1]:.1f} by its speckle"
-            own["dynamic_range_db"] = Value(round(self._range[0], 1), source)
-        return {name: own[name] for name in names}
+            values.setdefault("frame_rate_hz", Value(rate_of(times), "of its times"))
+        if "dynamic_range_db" in names and values["dynamic_range_db"].value is None and self._range:
+            source = f"{_ASSUMPTION}, +- {self._range[1]:.1f} by its speckle"
+            values["dynamic_range_db"] = Value(round(self._range[0], 1), source)
+        return {name: values[name] for name in names}
 
     @cached_property
-    def _own(self) -> defaultdict[str, Value]:
+    def _file_values(self) -> defaultdict[str, Value]:
         """Numbers that the recording gives, or all scanners have."""
-        own = defaultdict(Value, ASSUMED | {**self.values})
-        own.setdefault("column_pitch_mm", own["vector_pitch_mm"])
-        if (spacing := own["row_spacing_mm"]).value is not None and "sampling_rate_hz" not in own:
-            own["sampling_rate_hz"] = rate_by_spacing(spacing, self.settings, own)
-        return own
+        values = defaultdict(Value, ASSUMPTIONS | {**self.values})
+        values.setdefault("column_pitch_mm", values["vector_pitch_mm"])
+        if (spacing := values["row_spacing_mm"]).value is not None and "sampling_rate_hz" not in values:
+            values["sampling_rate_hz"] = rate_by_spacing(spacing, self.settings, values)
+        return values
 
     @cached_property
     def _range(self) -> tuple[float, float] | None:
@@ -225,58 +235,58 @@ class Recording:
         if self.settings.dynamic_range_db is not None:
             return None
         pitch_mm, spacing_mm = (
-            getattr(self.settings, name) or self._own[name].value or USUAL_PIXEL_MM
+            getattr(self.settings, name) or self._file_values[name].value or USUAL_PIXEL_MM
             for name in ("column_pitch_mm", "row_spacing_mm")
         )
         return estimate_dynamic_range(self._images, pitch_mm, spacing_mm, self.full_scale)
 
     @cached_property
-    def _used(self) -> tuple[FloatArray | None, IntArray, list[str]]:
-        """The file's own times of the frames, if it has them, the frames in use, and a line of the others."""
+    def _frame_times(self) -> tuple[FloatArray | None, IntArray, list[str]]:
+        """The file's times of frames, if it has them, the frames of use, and a line of the others."""
         if self.frames is None:
             return None, np.arange(0), []
-        own_s, rate_hz, count = None, self.settings.frame_rate_hz, self.frames.shape[0]
+        times, rate_hz, count = None, self.settings.frame_rate_hz, self.frames.shape[0]
         faults = self.faults or [""] * count
         if self.time_s is not None:
             rows, notes = usable("images", self.time_s, faults)
-            own_s = self.time_s[rows] if rows.size >= min(2, count) else None
-        if own_s is None or rate_hz is not None:
+            times = self.time_s[rows] if rows.size >= min(2, count) else None
+        if times is None or rate_hz is not None:
             rows, notes = usable("images", np.arange(count) / (rate_hz or 1.0), faults)
-        return own_s, rows, notes
+        return times, rows, notes
 
     @cached_property
     def _images(self) -> Any:
-        """The frames in use."""
-        rows = self._used[1]
+        """The frames of use."""
+        rows = self._frame_times[1]
         return self.frames if rows.size == self.frames.shape[0] else self.frames.take(rows, 0)
 
     @cached_property
-    def _checked(self) -> tuple[Sweep, list[str]]:
+    def _sweep_and_notes(self) -> tuple[Sweep, list[str]]:
         with naming(str(self.path)):
-            sweep = self._made() if self.ready is None else self.ready
+            sweep = self._build() if self.ready is None else self.ready
             require_plausible(sweep)
-            checked, notes = checked_path(sweep, self.chain)
+            sweep, notes = checked_path(sweep, self.chain)
         # Of a format that says all, its poses are told where something is odd of them.
-        return checked, notes if self.ready is None or len(notes) > 1 else []
+        return sweep, notes if self.ready is None or len(notes) > 1 else []
 
-    def _made(self) -> Sweep:
+    def _build(self) -> Sweep:
         if self.fault is not None:
             raise self.fault
-        times, rows, _ = self._used
+        times, rows, _ = self._frame_times
         if self.frames is None or 0 in (rows.size, *self.frames.shape):
             shape = None if self.frames is None else (rows.size, *self.frames.shape[1:])
             raise InvalidInputError(f"{self.path}: expected frames, got shape {shape}")
         frames = self._images
-        own = {name: one.value for name, one in self.needed.items()}
-        values = own | {name: one for name, one in self.settings if name in own and one is not None}
-        if lacking := [self.asked.get(name, name) for name, one in values.items() if one is None]:
-            raise MissingSettingsError(self.path, tuple(lacking))
+        values = {name: value.value for name, value in self.numbers.items()}
+        values |= {name: number for name, number in self.settings if name in values and number is not None}
+        if lacks := [self.substitutes.get(name, name) for name, number in values.items() if number is None]:
+            raise MissingSettingsError(self.path, tuple(lacks))
         if (rate_hz := values.get("frame_rate_hz")) is not None:
             times = rows / float(rate_hz)
         signal: RFSettings | BModeSettings
         if "dynamic_range_db" in values:
-            is_assumed = self.needed["dynamic_range_db"].is_assumed
-            sigma_db = self._range[1] if is_assumed and self._range else 0.0
+            is_assumption = self.numbers["dynamic_range_db"].is_assumption
+            sigma_db = self._range[1] if is_assumption and self._range else 0.0
             signal = BModeSettings(values["dynamic_range_db"], self.full_scale, sigma_db)
             pitch, spacing = values.get("column_pitch_mm"), values["row_spacing_mm"]
         else:
@@ -309,13 +319,13 @@ Facts: TypeAlias = Generator[Row, None, Recording]
 
 def rate_by_spacing(spacing: Value, settings: ImportSettings, values: Mapping[str, Value]) -> Value:
     """Sampling rate of samples so far apart, at the speed of sound that is given, said or assumed."""
-    own = values.get("speed_of_sound_m_s", Value()).value
-    speed = float(settings.speed_of_sound_m_s or own or SPEED_OF_SOUND_M_S)
+    file_speed = values.get("speed_of_sound_m_s", Value()).value
+    speed = float(settings.speed_of_sound_m_s or file_speed or SPEED_OF_SOUND_M_S)
     words = f"of samples {spacing.value:.6g} mm apart, {spacing.source}, at {speed:g} m/s"
     return replace(spacing, value=1e3 * speed / (2.0 * spacing.value), source=words)
 
 
-def grid_values(x_mm: FloatArray, z_mm: FloatArray, where: str, said: str) -> dict[str, Value]:
+def grid_values(x_mm: FloatArray, z_mm: FloatArray, where: str, source: str) -> dict[str, Value]:
     """What lateral positions and depths of samples say.
 
     Raises
@@ -324,15 +334,15 @@ def grid_values(x_mm: FloatArray, z_mm: FloatArray, where: str, said: str) -> di
         If they are not evenly spaced.
     """
     return {
-        "vector_pitch_mm": Value(step_of(x_mm, f"{where}, x"), said),
-        "row_spacing_mm": Value(step_of(z_mm, f"{where}, z"), said),
-        "first_sample_depth_mm": Value(float(z_mm[0]), said),
+        "vector_pitch_mm": Value(step_of(x_mm, f"{where}, x"), source),
+        "row_spacing_mm": Value(step_of(z_mm, f"{where}, z"), source),
+        "first_sample_depth_mm": Value(float(z_mm[0]), source),
     }
 
 
-def differs(given: Any, own: Any) -> bool:
+def differs(a: Any, b: Any) -> bool:
     """Whether two values are further apart than `CONTRADICTION`."""
-    return not np.allclose(given, own, rtol=CONTRADICTION, atol=0)
+    return not np.allclose(a, b, rtol=CONTRADICTION, atol=0)
 
 
 def rate_of(time_s: FloatArray) -> float | None:
@@ -355,9 +365,9 @@ def step_of(axis: FloatArray, where: str) -> float:
     if not step > 0:
         raise InvalidInputError(f"{where}: expected rising positions, got {axis[0]:g} to {axis[-1]:g}")
     # Single precision far from zero rounds to a share of the position, not of the step.
-    allowed = SPREAD * step + 4e-7 * float(np.abs(axis).max())
+    tolerance = SPREAD * step + 4e-7 * float(np.abs(axis).max())
     off = np.abs(np.diff(axis) - step)
-    if off.max() > allowed:
+    if off.max() > tolerance:
         worst = int(np.argmax(off))
         raise InvalidInputError(
             f"{where}[{worst}]: expected even steps of {step:g}, got {np.diff(axis)[worst]:g}"
@@ -368,9 +378,9 @@ def step_of(axis: FloatArray, where: str) -> float:
 def number_row(name: str, value: Any) -> Row:
     """A number, or a low and a high one, by the name of its setting, in words and the unit that is shown."""
     *words, unit = name.split("_")
-    scale, shown = _UNITS[unit if words[0] != "frame" else "frame"]
+    scale, scale_unit = _UNITS[unit if words[0] != "frame" else "frame"]
     numbers = " to ".join(f"{number / scale:.7g}" for number in np.ravel(value))
-    return " ".join(words[:-1] if unit == "s" else words), numbers, shown
+    return " ".join(words[:-1] if unit == "s" else words), numbers, scale_unit
 
 
 _BOUNDS = {

@@ -20,8 +20,8 @@ from speckle3d.io.hdf5 import (
     atomic_path,
     has_member,
     locate,
+    read_array,
     read_attribute,
-    read_checked,
     read_text,
     read_vector_attribute,
     require_group,
@@ -157,4 +157,4 @@ def _read_value(group: h5py.Group, name: str, hint: Any) -> Any:
         return read_text(group, name)
     if origin is tuple:
         return tuple(read_vector_attribute(group, name, len(parts)).tolist())
-    return read_checked(group, name, None, get_args(parts[1])[0])
+    return read_array(group, name, None, get_args(parts[1])[0])

@@ -33,8 +33,8 @@ from speckle3d.io.hdf5 import (
     has_member,
     locate,
     open_family,
+    read_array,
     read_attribute,
-    read_checked,
     read_text,
     read_transforms,
     read_vector_attribute,
@@ -116,9 +116,9 @@ class _Clock:
 
     @classmethod
     def of(cls, group: h5py.Group, name: str = "time_s") -> _Clock:
-        file, times = group.file, read_checked(group, name, ("row",))
+        file, times = group.file, read_array(group, name, ("row",))
         is_growing = file.swmr_mode or (
-            has_member(file, GROWING) and bool(read_checked(file, GROWING, (), np.bool_))
+            has_member(file, GROWING) and bool(read_array(file, GROWING, (), np.bool_))
         )
         if is_growing and np.isnan(times).any():  # of rows that are being written
             times = times[: np.argmax(np.isnan(times))]
@@ -130,7 +130,7 @@ class _Clock:
 
     def rows(self, name: str, *row: int, dtype: npt.DTypeLike = np.float64) -> npt.NDArray[Any]:
         """Read the rows that have a time of a data set."""
-        return read_checked(self.group, name, self.shape(*row), dtype)[: self.time_s.size]
+        return read_array(self.group, name, self.shape(*row), dtype)[: self.time_s.size]
 
 
 def _read_image(clock: _Clock) -> tuple[FileFrames, ImageGrid, RFSettings | BModeSettings]:

@@ -118,18 +118,17 @@ def read_samples(member: Member) -> SensorSamples:
             row[1:] = [float(fields.get(name, "nan")) for name in _NAMES]
             row[0] = int(fields["timestamp"]) / 1e9
     stamps, table = table[:, 0], table[:, 1:]
-    wanted = np.isfinite(table).sum(axis=0) > 0.5 * len(
-        table
-    )  # a magnetometer and a quaternion are in some files alone
-    table[:, ~wanted] = 0.0
+    # A magnetometer and a quaternion are in some files alone.
+    has_column = np.isfinite(table).sum(axis=0) > 0.5 * len(table)
+    table[:, ~has_column] = 0.0
     sound = np.isfinite(table).all(axis=1) & table[:, :3].any(axis=1)
-    if wanted[9:].all():
+    if has_column[9:].all():
         sound &= np.abs(np.linalg.norm(table[:, 9:], axis=1) - 1.0) < RIGID_TOLERANCE
     faults = np.where(sound, "", "without a value, or a quaternion of unit length").astype(object)
     repeats = np.flatnonzero(sound)[1:][(np.diff(table[sound], axis=0) == 0).all(axis=1)]
     faults[repeats] = "with the values of the one before"
     places, remarks = usable("samples of the sensor", stamps, faults.tolist())
-    if not places.size or not wanted[:6].all():
+    if not places.size or not has_column[:6].all():
         raise InvalidInputError(f"{member.where}: expected samples of the sensor, got none of use")
     time_s, parts = stamps[places], np.split(table[places], [3, 6, 9], axis=1)
     measured_g, gyroscope, magnetometer, wxyz = parts
@@ -139,10 +138,10 @@ def read_samples(member: Member) -> SensorSamples:
             f"the accelerometer's median norm is {np.median(norms):.3g} g, and 1 g is felt at rest: its unit "
             "or scale is another than assumed"
         )
-    turned, sign, fault, rows = None, -1.0, "is missing", list[Row]()
-    if wanted[9:].all():
-        turned = Rotation.from_quat(wxyz, scalar_first=True)
-        along = turned.apply(measured_g)[:, 2] / norms
+    rotation, sign, fault, rows = None, -1.0, "is missing", list[Row]()
+    if has_column[9:].all():
+        rotation = Rotation.from_quat(wxyz, scalar_first=True)
+        along = rotation.apply(measured_g)[:, 2] / norms
         sign = 1.0 if along.mean() >= 0 else -1.0
         off = np.rad2deg(np.sqrt(np.mean(np.arccos(np.clip(sign * along, -1.0, 1.0)) ** 2)))
         meaning = "specific force" if sign > 0 else "gravity (against the world's z): negated"
@@ -151,8 +150,8 @@ def read_samples(member: Member) -> SensorSamples:
             ("accelerometer taken as", meaning, ""),
         ]
         if off >= _MOST_OFF_DEG:
-            turned, sign, fault = None, -1.0, "does not agree with gravity"
-    if turned is None:
+            rotation, sign, fault = None, -1.0, "does not agree with gravity"
+    if rotation is None:
         remarks.append(
             f"the sensor's quaternion {fault}: the sweep has no orientation, which `speckle3d imu orient "
             f"{member.path} --into SWEEP.h5` finds"
@@ -160,5 +159,5 @@ def read_samples(member: Member) -> SensorSamples:
     else:
         rows.append(("quaternion", f"{MEANING} (checked against the accelerometer)", ""))
     force = sign * G_M_S2 * measured_g
-    field = magnetometer if wanted[6:9].all() else None
-    return SensorSamples(time_s, force, gyroscope, field, turned, rows, remarks)
+    field = magnetometer if has_column[6:9].all() else None
+    return SensorSamples(time_s, force, gyroscope, field, rotation, rows, remarks)

@@ -19,7 +19,9 @@ from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.files import open_regular
 from speckle3d.io.hdf5 import reading
 
-_NAME = re.compile(r"(?!\.)(?:(?P<name>.*)_)?(?P<kind>rf|iq|env|imu)\.(?P<what>raw|ya?ml)(?:(?<=raw)\.lzo)?")
+_NAME = re.compile(
+    r"(?!\.)(?:(?P<name>.*)_)?(?P<kind>rf|iq|env|imu)\.(?P<content>raw|ya?ml|tgc)(?:(?<=raw)\.lzo)?"
+)
 _FIELD = re.compile(rb"^(?:# raw data parameters|sampling rate:|size:|timestamp:)", re.MULTILINE)
 _START_BYTES = 4096
 
@@ -40,8 +42,8 @@ class Member:
         Folder and name of the recording that it is of.
     kind : str
         rf, iq, env or imu.
-    is_raw : bool
-        Whether it holds samples, and no description (yml).
+    content : str
+        raw of samples, yml or yaml of what describes them, tgc of their gain.
     """
 
     path: Path
@@ -50,7 +52,7 @@ class Member:
     size: int
     recording: str = ""
     kind: str = ""
-    is_raw: bool = False
+    content: str = ""
 
     @property
     def where(self) -> str:
@@ -58,15 +60,15 @@ class Member:
         return str(self.path) if self.path.name == Path(self.name).name else f"{self.path}: {self.name}"
 
     @property
-    def is_own(self) -> bool:
+    def is_of_scanner(self) -> bool:
         """Whether the scanner wrote it, unlike others' ``my_env.yml``."""
-        return self.is_raw or _FIELD.search(self.read(_START_BYTES)) is not None
+        return self.content in ("raw", "tgc") or _FIELD.search(self.read(_START_BYTES)) is not None
 
-    def read(self, most: int | None = None) -> bytes:
+    def read(self, limit: int | None = None) -> bytes:
         """Read all bytes, or the first ones."""
         with open_regular(self.path) as stream:
             stream.seek(self.start)
-            return stream.read(self.size if most is None else min(self.size, most))
+            return stream.read(self.size if limit is None else min(self.size, limit))
 
     def text(self) -> str:
         """All of it as text in UTF-8."""
@@ -91,13 +93,31 @@ class Files:
     raw: dict[str, Member]
     yml: dict[str, Member]
 
+    def require_samples(self) -> None:
+        """Refuse descriptions without raw samples, and samples without a description.
+
+        Raises
+        ------
+        InvalidInputError
+            Naming the files that are lacking.
+        """
+        kinds = self.yml.keys() - {"imu"} if not self.raw else self.raw.keys() - self.yml.keys()
+        if not self.raw or kinds:
+            start = f"{self.name}_" if self.name else ""
+            lacks = " or ".join(f"{start}{kind}.{'yml' if self.raw else 'raw'}" for kind in sorted(kinds))
+            names = [Path(member.name).name for member in (*self.raw.values(), *self.yml.values())]
+            raise InvalidInputError(
+                f"{self.path}: expected {lacks or 'samples (.raw) and their description (.yml)'} beside "
+                f"{', '.join(names) or 'its gain (.tgc)'}, got none"
+            )
+
 
 def is_package(path: Path, start: bytes) -> bool:
     """Whether a file or folder looks like a package, or one file of one."""
     is_part = path.is_file() and _NAME.fullmatch(path.name)
     if is_part or path.is_dir() or path.suffix.lower() == ".tar" or start[257:262] == b"ustar":
         with suppress(OSError, ValueError):
-            return any(member.is_own for member in _members(path))
+            return any(member.is_of_scanner for member in _members(path))
     return path.suffix.lower() == ".tar"  # one that is cut says so when it is read
 
 
@@ -117,17 +137,16 @@ def find_files(path: Path) -> Files:
         If it holds several recordings or none.
     """
     members = _members(path)
-    own = sorted({member.recording for member in members if member.is_own})
-    if len(own) != 1:
+    recordings = sorted({member.recording for member in members if member.is_of_scanner})
+    if len(recordings) != 1:
         raise InvalidInputError(
-            f"{path}: expected files of one recording, as 2024-05-01_rf.raw and _rf.yml, got "
-            f"{len(own)}: {', '.join(own)}: give the raw file of one (of a tar file: unpack it first)"
+            f"{path}: expected files of one recording, as 2024-05-01_rf.raw and _rf.yml, got those of "
+            f"{', '.join(recordings) or 'none'}: give the raw file of one (of a tar file: unpack it first)"
         )
-    raw, yml = (
-        {one.kind: one for one in members if one.recording == own[0] and one.is_raw == is_raw}
-        for is_raw in (True, False)
-    )
-    return Files(path, Path(own[0]).name, raw, yml)
+    members = [member for member in members if member.recording == recordings[0]]
+    raw = {member.kind: member for member in members if member.content == "raw"}
+    yml = {member.kind: member for member in members if member.content.startswith("y")}
+    return Files(path, Path(recordings[0]).name, raw, yml)
 
 
 def _members(path: Path) -> list[Member]:
@@ -137,15 +156,16 @@ def _members(path: Path) -> list[Member]:
             places = [(file, file.name, 0, file.stat().st_size) for file in sorted(path.iterdir())]
         elif part := _NAME.fullmatch(path.name):
             kinds = {"rf", "iq", "env", "imu"} if part["kind"] == "imu" else {part["kind"], "imu"}
-            siblings = _members(path.parent)
-            return [one for one in siblings if one.recording == (part["name"] or "") and one.kind in kinds]
+            members = _members(path.parent)
+            return [file for file in members if file.recording == (part["name"] or "") and file.kind in kinds]
         else:
             # It is read to its end, so that one cut short is refused.
             with open_regular(path) as stream, tarfile.open(fileobj=stream, mode="r:") as archive:
-                places = [(path, one.name, one.offset_data, one.size) for one in archive if one.isfile()]
+                files = [item for item in archive if item.isfile()]
+                places = [(path, item.name, item.offset_data, item.size) for item in files]
     members = []
     for file, name, start, size in places:
         if part := _NAME.fullmatch(Path(name).name):
             recording = str(Path(name).with_name(part["name"])) if part["name"] else str(Path(name).parent)
-            members.append(Member(file, name, start, size, recording, part["kind"], part["what"] == "raw"))
+            members.append(Member(file, name, start, size, recording, part["kind"], part["content"]))
     return members

@@ -47,11 +47,11 @@ def open_raw(member: Member, yml: Description) -> npt.NDArray[Any]:
     content, (dtype, parts, _) = _content(member), SAMPLES[yml.kind]
     size = yml.size.lines, yml.size.samples
     expected = (yml.frames, *size, parts * np.dtype(dtype).itemsize)
-    got = HEADER.unpack(bytes(content[: HEADER.size]).ljust(HEADER.size, b"\0"))[1:]
-    if got != expected or 0 in got:
+    header = HEADER.unpack(bytes(content[: HEADER.size]).ljust(HEADER.size, b"\0"))[1:]
+    if header != expected or 0 in header:
         raise InvalidInputError(
             f"{member.where}: header: expected frames, lines, samples and bytes of a sample of {yml.kind} "
-            f"as in the yml, {expected}, got {got}"
+            f"as in the yml, {expected}, got {header}"
         )
     with reading(member.where):  # of more samples than memory has places for
         record = np.dtype([("time", "<u8"), ("samples", dtype, (*size, parts))])
@@ -77,12 +77,12 @@ def _content(member: Member) -> Any:
     """Bytes of a file, unpacked where it is packed by lzop."""
     with reading(member.where):
         if member.name.endswith(".lzo"):
-            return _unpacked(member, member.path.stat().st_mtime_ns)
+            return _unpack(member, member.path.stat().st_mtime_ns)
         return np.memmap(member.path, np.uint8, "r", member.start, (member.size,))
 
 
 @lru_cache(1)
-def _unpacked(member: Member, _: int) -> bytes:
+def _unpack(member: Member, _: int) -> bytes:
     lzo = extra_module("lzallright", "clarius", "a file packed by lzop (.lzo)").LZOCompressor
     content, parts = member.read(), list[bytes]()
     if not content.startswith(_MAGIC):

@@ -37,7 +37,7 @@ from speckle3d.core.printable import printable
 from speckle3d.io.clarius.imu import SensorSamples, read_samples
 from speckle3d.io.clarius.package import find_files
 from speckle3d.io.clarius.raw import SAMPLES, open_frames, open_raw
-from speckle3d.io.clarius.sidecars import Description, parsed
+from speckle3d.io.clarius.sidecars import Description, yml_fields
 from speckle3d.io.clarius.spectrum import band_hz
 from speckle3d.io.frames import FileFrames
 from speckle3d.io.import_settings import SPEED_OF_SOUND_M_S, ImportSettings
@@ -56,16 +56,18 @@ BEFORE_DEPTH_S = 1e-6
 """Delay that is not depth; see above."""
 
 _ORDER = ("RF", "IQ", "envelope")
-_SAID = (
+_FACTS = (
     "type", "frames", "frame rate", "sampling rate", "delay samples", "transmit frequency", "imaging depth",
     "vsound", "speed of sound",
 )  # fmt: skip
-_OWN = "its yml"
+_YML = "its yml"
 
 
 def open_package(path: Path, settings: ImportSettings) -> Facts:
     """Read a package: RF is preferred, else I/Q, else the envelope. Times are of the scanner's clock."""
     files = find_files(path)
+    if path.suffix == ".tgc":  # which tells nothing without samples
+        files.require_samples()
     yield "recording", printable(files.name) or "without a name", ""
     sensor, remarks = None, list[str]()
     if "imu" in files.yml:
@@ -75,18 +77,15 @@ def open_package(path: Path, settings: ImportSettings) -> Facts:
             remarks += sensor.remarks
         except (InvalidInputError, FileError) as error:
             remarks.append(f"the sensor is left out: {error}")
-    fields = {kind: parsed(one.text(), one.where) for kind, one in files.yml.items() if kind != "imu"}
-    for kind, one in fields.items():
-        yield from (
-            (f"{kind}: {name}", printable(str(one[name])[:60]), "") for name in _SAID if one.get(name)
-        )
-    if not files.raw or not files.raw.keys() <= fields.keys():
-        names = ", ".join(member.name for member in (*files.raw.values(), *files.yml.values()))
-        raise InvalidInputError(f"expected raw files with a yml of each, got {names}")
-    described = {kind: validated(fields[kind], files.yml[kind].where, Description) for kind in files.raw}
-    kind = min(files.raw, key=lambda kind: _ORDER.index(described[kind].kind))
+    fields = {kind: yml_fields(file.text(), file.where) for kind, file in files.yml.items() if kind != "imu"}
+    for kind, texts in fields.items():
+        facts = ((name, texts[name]) for name in _FACTS if texts.get(name))
+        yield from ((f"{kind}: {name}", printable(str(text)[:60]), "") for name, text in facts)
+    files.require_samples()
+    descriptions = {kind: validated(fields[kind], files.yml[kind].where, Description) for kind in files.raw}
+    kind = min(files.raw, key=lambda kind: _ORDER.index(descriptions[kind].kind))
     yield "sweep is made from", kind, ""
-    yml = described[kind]
+    yml = descriptions[kind]
     member, turns = files.raw[kind], None
     records = open_raw(member, yml)
     with naming(files.yml[kind].where):
@@ -103,12 +102,12 @@ def open_package(path: Path, settings: ImportSettings) -> Facts:
     probe, pitch = settings.probe or yml.probe.model, _pitch(yml, per_line, settings)
     spreading = _spreading(yml, elements[[0, -1]], per_line, pitch, probe)
     values = {
-        "first_sample_depth_mm": Value(first_mm, "delay samples, less 1 us before depth 0 (assumed)", _OWN),
+        "first_sample_depth_mm": Value(first_mm, "delay samples, less 1 us before depth 0 (assumed)", _YML),
         "vector_pitch_mm": pitch,
-        "row_spacing_mm": Value(spacing_mm, f"of {rate_hz / 1e6:g} MHz", _OWN),
-        "sampling_rate_hz": Value(yml.rate_hz, "", _OWN),
-        "centre_frequency_hz": Value(yml.sent_hz, "transmit frequency", _OWN),
-        **({} if yml.speed_m_s is None else {"speed_of_sound_m_s": Value(yml.speed_m_s, "", _OWN)}),
+        "row_spacing_mm": Value(spacing_mm, f"of {rate_hz / 1e6:g} MHz", _YML),
+        "sampling_rate_hz": Value(yml.rate_hz, "", _YML),
+        "centre_frequency_hz": Value(yml.transmit_hz, "transmit frequency", _YML),
+        **({} if yml.speed_m_s is None else {"speed_of_sound_m_s": Value(yml.speed_m_s, "", _YML)}),
         **spreading,
     }
     shift_hz = settings.demodulation_frequency_hz if yml.kind == "IQ" else None
@@ -116,16 +115,16 @@ def open_package(path: Path, settings: ImportSettings) -> Facts:
         shallow_hz, deep_hz, filter_mm = yml.receive
         start_mm = first_mm or settings.first_sample_depth_mm or 0.0
         depths_mm = start_mm + spacing_mm * np.arange(yml.size.samples)
-        slid_hz = np.interp(depths_mm, [0.0, filter_mm], [shallow_hz, deep_hz])
-        middle_hz = float(np.interp(depths_mm[[0, -1]].mean(), depths_mm, slid_hz))
-        values["demodulation_frequency_hz"] = Value(middle_hz, "of the lines' middle", _OWN)
+        oscillator_hz = np.interp(depths_mm, [0.0, filter_mm], [shallow_hz, deep_hz])
+        middle_hz = float(np.interp(depths_mm[[0, -1]].mean(), depths_mm, oscillator_hz))
+        values["demodulation_frequency_hz"] = Value(middle_hz, "of the lines' middle", _YML)
         if shift_hz is None and shallow_hz != deep_hz:
             # The frequency falls along a straight line with depth, as from 11 to 8 MHz; a sweep has one.
             # Samples are turned as if the oscillator had stayed at that of the line's middle, which takes
             # its phase to be the integral of its frequency: so it is where a frequency is swept, but it
             # is not documented. Left as they are, simulated I/Q shifted down by 9 to 6 MHz gave lengths
             # 10 % off, and turned back 0.001 % from those of RF.
-            turns = np.exp(2j * np.pi * cumulative_trapezoid(slid_hz - middle_hz, initial=0) / rate_hz)
+            turns = np.exp(2j * np.pi * cumulative_trapezoid(oscillator_hz - middle_hz, initial=0) / rate_hz)
             remarks.append(
                 f"demodulation frequency from its yml: {shallow_hz / 1e6:g} to {deep_hz / 1e6:g} MHz "
                 f"over {filter_mm:g} mm, turned to that of the line's middle"
@@ -134,10 +133,10 @@ def open_package(path: Path, settings: ImportSettings) -> Facts:
     narrow = np.int16 if yml.kind == "IQ" and turns is None else None
     source, shape = partial(open_frames, member, yml, turns), records["samples"].shape[:3]
     frames = FileFrames(member.path, source, shape, SAMPLES[yml.kind][2], narrow)
-    sent_hz, band = settings.centre_frequency_hz or yml.sent_hz, None
-    is_known = yml.kind == "RF" or (yml.kind == "IQ" and shift_hz is not None)
-    if settings.bandwidth_hz is None and sent_hz and is_known:
-        band = band_hz(frames, rate_hz, sent_hz, shift_hz)
+    centre_hz, band = settings.centre_frequency_hz or yml.transmit_hz, None
+    has_spectrum = yml.kind == "RF" or (yml.kind == "IQ" and shift_hz is not None)
+    if settings.bandwidth_hz is None and centre_hz and has_spectrum:
+        band = band_hz(frames, rate_hz, centre_hz, shift_hz)
     if band is not None:
         values["bandwidth_hz"] = Value(band, "measured at -6 dB in this recording", "the spectrum")
         remarks.append(
@@ -154,7 +153,9 @@ def open_package(path: Path, settings: ImportSettings) -> Facts:
         # In one spelling, so that curves and calibrations of a probe are found to be of it.
         probe=f"Clarius {_model(probe)}" if _model(probe) in ELEMENT_PITCH_MM else probe,
         name=files.name or path.stem,
-        asked=dict.fromkeys(("vector_pitch_mm", "column_pitch_mm"), "element_pitch_mm" if probe else "probe"),
+        substitutes=dict.fromkeys(
+            ("vector_pitch_mm", "column_pitch_mm"), "element_pitch_mm" if probe else "probe"
+        ),
         assumptions=() if spreading else ("parallel lines of a linear array",),
         remarks=tuple(remarks),
     )
@@ -182,10 +183,10 @@ def package_files(path: Path) -> Sequence[Path]:
 def _elements(yml: Description) -> FloatArray:
     """Elements at which the lines are received; lines that are steered are refused."""
     elements, angle_deg = yml.places.T
-    if (steered := np.flatnonzero(angle_deg)).size:
+    if (oblique := np.flatnonzero(angle_deg)).size:
         raise InvalidInputError(
-            f"lines[{steered[0]}]: angle: expected 0 (lines that are not steered), got "
-            f"{angle_deg[steered[0]]:g} deg, and {steered.size} of {angle_deg.size} lines steered: record "
+            f"lines[{oblique[0]}]: angle: expected 0 (lines that are not steered), got "
+            f"{angle_deg[oblique[0]]:g} deg, and {oblique.size} of {angle_deg.size} lines steered: record "
             "without steering and Doppler, or give another of its raw files"
         )
     return np.asarray(elements)
@@ -196,13 +197,13 @@ def _pitch(yml: Description, per_line: float, settings: ImportSettings) -> Value
     model = _model(settings.probe or yml.probe.model)
     pitches = {
         "as given": settings.element_pitch_mm,
-        _OWN: yml.probe.pitch,
+        _YML: yml.probe.pitch,
         f"the maker's table, {model}": ELEMENT_PITCH_MM.get(model),
     }
     for source, element_mm in pitches.items():
         if element_mm is not None:
             words = f"{per_line:g} elements a line (yml) x {element_mm:g} mm ({source})"
-            return Value(element_mm * per_line, words, _OWN)
+            return Value(element_mm * per_line, words, _YML)
     return Value(settings.vector_pitch_mm, "--vector-pitch-mm")  # also between columns of an envelope
 
 
@@ -217,9 +218,9 @@ def _spreading(
     if radius_mm and pitch.value is not None:
         off = ends - ((elements - 1) / 2 if elements else ends.mean())
         degrees = np.rad2deg(off * pitch.value / per_line / radius_mm)
-        angles = Value(tuple(degrees.tolist()), f"of lines {pitch.source}", _OWN)
-    return {"array_radius_mm": Value(radius_mm, "", _OWN), "line_angles_deg": angles}
+        angles = Value(tuple(degrees.tolist()), f"of lines {pitch.source}", _YML)
+    return {"array_radius_mm": Value(radius_mm, "", _YML), "line_angles_deg": angles}
 
 
-def _model(named: str) -> str:
-    return re.sub(r"[^A-Z0-9]", "", named.upper()).removeprefix("CLARIUS")
+def _model(probe: str) -> str:
+    return re.sub(r"[^A-Z0-9]", "", probe.upper()).removeprefix("CLARIUS")

@@ -32,7 +32,7 @@ _SIZES = {"khz": 1e3, "mhz": 1e6, "cm": 10.0, "um": 1e-3, "µm": 1e-3}
 _UNITS = {**dict.fromkeys(("", "hz", "mm", "m/s", "°", "deg"), 1.0), **_SIZES}
 
 
-def parsed(text: str, where: str) -> dict[str, Any]:
+def yml_fields(text: str, where: str) -> dict[str, Any]:
     """Parse a YAML document of fields; their values are text, lists, or mappings.
 
     Raises
@@ -65,7 +65,7 @@ def _quantity(text: object) -> float | None:
 Quantity = Annotated[float, BeforeValidator(_quantity)]
 Count = Annotated[int, BeforeValidator(_quantity)]
 Optional = Annotated[float | None, BeforeValidator(_quantity)]
-_LISTED = BeforeValidator(lambda value: value or [])
+_OR_EMPTY = BeforeValidator(lambda value: value or [])
 
 
 class _Size(BaseModel):
@@ -85,7 +85,7 @@ class _Filter(BaseModel):
 
 
 class _Focus(BaseModel):
-    receive: Annotated[list[_Filter], _LISTED] = []
+    receive: Annotated[list[_Filter], _OR_EMPTY] = []
 
 
 class _Probe(BaseModel):
@@ -116,9 +116,9 @@ class Description(BaseModel):
     lines: list[_Line]
     rate_hz: Quantity = Field(alias="sampling rate", ge=LEAST_HZ)
     delay: Optional = Field(None, alias="delay samples")
-    sent_hz: Optional = Field(None, alias="transmit frequency")
+    transmit_hz: Optional = Field(None, alias="transmit frequency")
     speed_m_s: Optional = Field(None, validation_alias=AliasChoices("vsound", "speed of sound"))
-    focus: Annotated[list[_Focus], _LISTED] = []
+    focus: Annotated[list[_Focus], _OR_EMPTY] = []
     probe: Annotated[
         _Probe, BeforeValidator(lambda value: {"model": value} if isinstance(value, str) else value)
     ] = _Probe()
@@ -142,6 +142,6 @@ class Description(BaseModel):
 
         None in older files, and where it differs between foci or filters.
         """
-        filters = (one for focus in self.focus for one in focus.receive)
-        ends = {(one.shallowfreq, one.deepfreq, one.filterdepth) for one in filters}
+        filters = (part for focus in self.focus for part in focus.receive)
+        ends = {(part.shallowfreq, part.deepfreq, part.filterdepth) for part in filters}
         return ends.pop() if len(ends) == 1 else None

@@ -41,21 +41,21 @@ def band_hz(
     """
     count, vectors, samples = frames.shape
     width = max(round(_RESOLUTION_HZ * samples / sampling_rate_hz), 1)
-    shared, power, chosen = np.zeros(samples), np.zeros(samples), {0, count // 2, count - 1}
-    for i in chosen:
+    common, power, numbers = np.zeros(samples), np.zeros(samples), {0, count // 2, count - 1}
+    for i in numbers:
         lines = 1.0 * frames[i]
         level = np.sqrt(uniform_filter1d(np.mean(np.abs(lines) ** 2, axis=0), samples // width))
         spectra = np.fft.fft(lines / (level + (level == 0)))
-        shared += (spectra[:-1].conj() * spectra[1:]).real.sum(axis=0)
+        common += (spectra[:-1].conj() * spectra[1:]).real.sum(axis=0)
         power += (np.abs(spectra) ** 2).sum(axis=0)
     frequency = np.fft.fftshift(np.fft.fftfreq(samples, 1 / sampling_rate_hz)) + (shift_hz or 0.0)
-    shared, power = (uniform_filter1d(np.fft.fftshift(one), width, mode="wrap") for one in (shared, power))
+    common, power = (uniform_filter1d(np.fft.fftshift(of), width, mode="wrap") for of in (common, power))
     near = (frequency > 0.5 * transmit_hz) & (frequency < 2 * transmit_hz)
-    top = int(np.argmax(np.where(near, shared, -np.inf)))
-    outside = np.flatnonzero(shared < shared[top] / 4)
+    top = int(np.argmax(np.where(near, common, -np.inf)))
+    outside = np.flatnonzero(common < common[top] / 4)
     sides = outside[outside < top][-1:], outside[outside > top][:1]
-    least = _CLEAR / np.sqrt(max(len(chosen) * (vectors - 1) * width, 1)) * power[top]
-    if not near[top] or not all(side.size for side in sides) or shared[top] <= least:
+    least = _CLEAR / np.sqrt(max(len(numbers) * (vectors - 1) * width, 1)) * power[top]
+    if not near[top] or not all(side.size for side in sides) or common[top] <= least:
         return None
     low, high = (_STEP_HZ * round(float(frequency[side[0]]) / _STEP_HZ) for side in sides)
     return (low, high) if low > 0 else None

@@ -15,7 +15,7 @@ from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.printable import printable
 from speckle3d.io.frames import FileFrames, HDF5Slices
-from speckle3d.io.hdf5 import has_member, locate, read_checked
+from speckle3d.io.hdf5 import has_member, locate, read_array
 from speckle3d.io.recordings import Value, step_of
 
 Turn: TypeAlias = Callable[..., npt.NDArray[Any]]
@@ -28,7 +28,7 @@ dB."""
 
 def flat(group: h5py.Group, name: str) -> FloatArray:
     """Read finite numbers along one axis, whatever other axes of length 1 there are."""
-    values: FloatArray = read_checked(group, name, None)
+    values: FloatArray = read_array(group, name, None)
     if sum(n > 1 for n in values.shape) > 1 or not np.isfinite(values).all():
         raise InvalidInputError(
             f"{locate(group, name)}: expected finite numbers along one axis, got others, {values.shape}"

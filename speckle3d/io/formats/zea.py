@@ -46,7 +46,7 @@ from speckle3d.io.hdf5 import (
     find_member,
     has_member,
     locate,
-    read_checked,
+    read_array,
     require_dataset,
 )
 from speckle3d.io.import_settings import ImportSettings
@@ -198,13 +198,13 @@ def _times(file: h5py.File, group: h5py.Group, scan: str, count: int) -> FloatAr
     """
     if has_member(group, "timestamps"):
         return np.asarray(
-            read_checked(group, "timestamps", (count,)) + (single(group, "start_time_offset") or 0)
+            read_array(group, "timestamps", (count,)) + (single(group, "start_time_offset") or 0)
         )
     name = f"{scan}/time_to_next_transmit"
     if len(_homes(file)) > 1 or not has_member(file, name):
         return None
     # The last transmission of all has no next one.
-    lengths = read_checked(file, name, (count, "transmission"))[:-1].sum(axis=1)
+    lengths = read_array(file, name, (count, "transmission"))[:-1].sum(axis=1)
     is_finite = np.isfinite(lengths)
     if not is_finite.any():
         return None
@@ -220,10 +220,10 @@ def _tracker(file: h5py.File, left_mm: float | None) -> tuple[Tracker | None, li
     kind = text_of(node["rotation_representation"][()]) if "rotation_representation" in node else ""
     if kind not in _ROTATIONS:
         return None, [f"{_POSES}: not read: expected a rotation_representation among {', '.join(_ROTATIONS)}"]
-    is_euler, places_m = kind == "euler_xyz", read_checked(node, "translation", ("pose", 3))
+    is_euler, places_m = kind == "euler_xyz", read_array(node, "translation", ("pose", 3))
     rate, count = single(node, "sampling_frequency"), len(places_m)
-    turns = read_checked(node, "rotation", (count, 3 if is_euler else 4))
-    stamps = np.arange(count) / rate if rate else read_checked(node, "timestamps", (count,))
+    turns = read_array(node, "rotation", (count, 3 if is_euler else 4))
+    stamps = np.arange(count) / rate if rate else read_array(node, "timestamps", (count,))
     sound = np.isfinite(turns).all(axis=1) & (turns.any(axis=1) | is_euler)
     turns[~sound] = 1.0
     if is_euler:

@@ -60,6 +60,17 @@ def test_rf_is_preferred_and_a_raw_file_gives_its_own_kind(tmp_path):
     require_equal(load_sweep(folder / f"{examples.NAME}_iq.raw", IMPORT_SETTINGS), iq)
 
 
+def test_what_lacks_beside_a_file_of_a_package_is_named(tmp_path):
+    files = examples.package_files(sweep_of("rf")) | {f"{examples.NAME}_rf.tgc": b"tgc"}
+    folder = examples.write_files(tmp_path / "p", files)
+    start = folder / f"{examples.NAME}_rf"
+    require_equal(load_sweep(start.with_suffix(".tgc"), GIVEN), sweep_of("rf"))
+    start.with_suffix(".raw").unlink()
+    for suffix in (".tgc", ".yml"):
+        with pytest.raises(InvalidInputError, match=rf"{suffix}: expected {start.name}\.raw beside"):
+            load_sweep(start.with_suffix(suffix), GIVEN)
+
+
 def test_iq_of_a_falling_frequency_becomes_that_of_one(tmp_path):
     """Echoes of 7 MHz, shifted down by 9 to 6 MHz, are afterwards a constant frequency at all depths."""
     rate_hz, samples = 15e6, 600
