@@ -1,5 +1,6 @@
 """Packages of any sweep, written as the scanner writes them, are read back; what contradicts is named."""
 
+import re
 from dataclasses import replace
 
 import clarius_examples as examples
@@ -61,14 +62,14 @@ def test_rf_is_preferred_and_a_raw_file_gives_its_own_kind(tmp_path):
 
 
 def test_what_lacks_beside_a_file_of_a_package_is_named(tmp_path):
-    files = examples.package_files(sweep_of("rf")) | {f"{examples.NAME}_rf.tgc": b"tgc"}
+    name = f"{examples.NAME}_rf"
+    files = examples.package_files(sweep_of("rf")) | {f"{name}.tgc": b"tgc"}
     folder = examples.write_files(tmp_path / "p", files)
-    start = folder / f"{examples.NAME}_rf"
-    require_equal(load_sweep(start.with_suffix(".tgc"), GIVEN), sweep_of("rf"))
-    start.with_suffix(".raw").unlink()
+    require_equal(load_sweep(folder / f"{name}.tgc", GIVEN), sweep_of("rf"))
+    (folder / f"{name}.raw").unlink()
     for suffix in (".tgc", ".yml"):
-        with pytest.raises(InvalidInputError, match=rf"{suffix}: expected {start.name}\.raw beside"):
-            load_sweep(start.with_suffix(suffix), GIVEN)
+        with pytest.raises(InvalidInputError, match=re.escape(f"{name}{suffix}: expected {name}.raw beside")):
+            load_sweep(folder / f"{name}{suffix}", GIVEN)
 
 
 def test_iq_of_a_falling_frequency_becomes_that_of_one(tmp_path):
