@@ -41,6 +41,8 @@ FORMAT = "speckle3d.calibration"
 
 _COLUMNS, _NUMBERS = tuple(field.name for field in fields(Parameter)), ("value", "standard_error")
 """Data sets of /parameters, and those of them that are numbers."""
+_FRAMES = "used", "dropped"
+"""Data sets of /frames, indices of frames."""
 
 
 def write_calibration(path: PathLike, calibration: Calibration) -> None:
@@ -64,9 +66,8 @@ def write_calibration(path: PathLike, calibration: Calibration) -> None:
         put(file, "sensor_from_image", calibration.rotation if is_rotation else calibration.sensor_from_image)
         columns: dict[str, Any] = {name: [getattr(row, name) for row in rows] for name in _COLUMNS}
         put(file, "parameters", columns | {name: np.array(columns[name], float) for name in _NUMBERS})
-        used, dropped = (np.array([*numbers], dtype=np.int64) for numbers in (frames.used, frames.dropped))
-        reasons = list(frames.dropped.values())
-        put(file, "frames", {"given": frames.given, "used": used, "dropped": dropped, "reason": reasons})
+        counts: dict[str, Any] = {name: np.array([*getattr(frames, name)], np.int64) for name in _FRAMES}
+        put(file, "frames", counts | {"given": frames.given, "reason": list(frames.dropped.values())})
 
 
 def read_calibration(path: Source) -> Calibration:
@@ -180,10 +181,10 @@ def _read_parameters(group: h5py.Group) -> tuple[Parameter, ...]:
 
 
 def _read_frames(group: h5py.Group) -> FramesUsed:
-    used, dropped = (read_array(group, name, ("n",), np.int64) for name in ("used", "dropped"))
-    reasons = read_texts(group, "reason", dropped.shape)
-    given = int(read_attribute(group, "given"))
-    return FramesUsed(given, tuple(used.tolist()), dict(zip(dropped.tolist(), reasons, strict=True)))
+    in_use, left_out = (read_array(group, name, ("n",), np.int64) for name in _FRAMES)
+    reasons = read_texts(group, "reason", left_out.shape)
+    count = int(read_attribute(group, "given"))
+    return FramesUsed(count, tuple(in_use.tolist()), dict(zip(left_out.tolist(), reasons, strict=True)))
 
 
 load_calibration = read_calibration

@@ -13,7 +13,7 @@ _LEAST_SIGMAS = 4.0
 """Of the mean of so many phases of noise, below which coherence tells nothing either: of few samples."""
 _FASTEST = 0.85 * np.pi
 """Turn of a carrier from sample to sample, above which it may seem to turn backwards."""
-_REMOVED, CARRIED, _REVERSED = (-0.5, 0.3), (0.5, 1.15), (-1.15, -0.7)
+_BASEBAND, CARRIER, _MIRROR = (-0.5, 0.3), (0.5, 1.15), (-1.15, -0.7)
 """Measured over nominal turn. Attenuation lowers a carrier, by a fifth in 40 mm of tissue and more below."""
 
 
@@ -30,20 +30,20 @@ def demodulation_of(frames: Frames, frequency_hz: float, sampling_rate_hz: float
     InvalidInputError
         If the carrier turns backwards: Q has the other sign.
     """
-    share = carried_share(frames, frequency_hz, sampling_rate_hz)
+    share = carrier_share(frames, frequency_hz, sampling_rate_hz)
     if share is None:
         return None
-    if _REVERSED[0] <= share <= _REVERSED[1]:
+    if _MIRROR[0] <= share <= _MIRROR[1]:
         raise InvalidInputError(
             f"expected I/Q that carry {frequency_hz:g} Hz or nothing, got {share * frequency_hz:g} Hz: Q has "
             "the other sign"
         )
-    if CARRIED[0] <= share <= CARRIED[1]:
+    if CARRIER[0] <= share <= CARRIER[1]:
         return 0.0
-    return frequency_hz if _REMOVED[0] <= share <= _REMOVED[1] else None
+    return frequency_hz if _BASEBAND[0] <= share <= _BASEBAND[1] else None
 
 
-def carried_share(frames: Frames, frequency_hz: float, sampling_rate_hz: float) -> float | None:
+def carrier_share(frames: Frames, frequency_hz: float, sampling_rate_hz: float) -> float | None:
     """Mean turn of the phase from sample to sample, over that of a carrier of `frequency_hz`.
 
     The phase between neighbouring samples is the mean turn of what they carry, the first moment of the

@@ -55,20 +55,20 @@ class FileSet:
             If another run is at work on the same set, or the system refuses to write.
         """
         # A link to a folder, or the working directory as ".", stays what it is.
-        given, folder = folder, folder.resolve()
-        existed = folder.is_dir()
-        if folder.exists() and not existed:
-            raise FileError(f"{given}: expected a folder or a new name, got a file")
-        for name in self.names if existed else ():
+        place, folder = folder, folder.resolve()
+        is_old = folder.is_dir()
+        if folder.exists() and not is_old:
+            raise FileError(f"{place}: expected a folder or a new name, got a file")
+        for name in self.names if is_old else ():
             require_target(folder / name)
-        base, name = (folder, self.primary) if existed else (folder.parent, folder.name)
+        base, name = (folder, self.primary) if is_old else (folder.parent, folder.name)
         make_folder(base)
         part = base / f".part-{name}"
         try:
-            with _locked(part):
+            with _lock(part):
                 try:
                     yield part
-                    if existed:
+                    if is_old:
                         self._put_in_place(part, folder)
                     else:
                         os.rename(part, folder)
@@ -76,12 +76,12 @@ class FileSet:
                     shutil.rmtree(part, ignore_errors=True)
         except BlockingIOError as error:
             raise FileError(
-                f"{given}: expected a place that no other run is at work in, got one that is taken"
+                f"{place}: expected a place that no other run is at work in, got one that is taken"
             ) from error
         except Speckle3DError as error:
-            raise type(error)(str(error).replace(str(part), str(given))) from error
+            raise type(error)(str(error).replace(str(part), str(place))) from error
         except OSError as error:
-            raise cannot_write(given / self.primary, error) from error
+            raise cannot_write(place / self.primary, error) from error
 
     def _put_in_place(self, part: Path, folder: Path) -> None:
         for name in (*self.others, *self.derived):
@@ -92,7 +92,7 @@ class FileSet:
 
 
 @contextmanager
-def _locked(folder: Path) -> Iterator[None]:
+def _lock(folder: Path) -> Iterator[None]:
     """Make an empty folder of this process, where there are locks; they end however the process does.
 
     Raises

@@ -34,7 +34,7 @@ class FileFrames:
         (frame, vector, sample).
     stored_dtype : dtype, optional
         Narrower type that a sweep file may keep them in: int16 of I/Q.
-    chosen : sequence of int, optional
+    numbers : sequence of int, optional
         Numbers of the frames in the file; by default all of them in order.
     """
 
@@ -47,12 +47,12 @@ class FileFrames:
         shape: tuple[int, int, int],
         dtype: npt.DTypeLike,
         stored_dtype: npt.DTypeLike | None = None,
-        chosen: Sequence[int] | None = None,
+        numbers: Sequence[int] | None = None,
     ) -> None:
         self.path, self.open_file = Path(path).absolute(), open_file
-        self._given = open_file, shape, dtype, stored_dtype
-        self.chosen = range(shape[0]) if chosen is None else [int(i) for i in chosen]
-        self.shape, self.dtype = (len(self.chosen), *shape[1:]), np.dtype(dtype)
+        self._arguments = open_file, shape, dtype, stored_dtype
+        self.numbers = range(shape[0]) if numbers is None else [int(i) for i in numbers]
+        self.shape, self.dtype = (len(self.numbers), *shape[1:]), np.dtype(dtype)
         self.stored_dtype = self.dtype if stored_dtype is None else np.dtype(stored_dtype)
         self._read: ReadFrame | None = None
         self._lock = threading.Lock()
@@ -61,7 +61,7 @@ class FileFrames:
         return self.shape[0]
 
     def __getitem__(self, index: int) -> npt.NDArray[Any]:
-        i = self.chosen[operator.index(index)]
+        i = self.numbers[operator.index(index)]
         where = f"{self.path}: frame {i}"
         with self._lock, reading(where), naming(where):
             if self._read is None:
@@ -77,7 +77,7 @@ class FileFrames:
 
     def take(self, rows: npt.NDArray[Any], axis: int = 0) -> FileFrames:
         """Some of the frames, as `numpy.take` along the axis of frames."""
-        return FileFrames(self.path, *self._given, [self.chosen[i] for i in rows.tolist()])
+        return FileFrames(self.path, *self._arguments, [self.numbers[i] for i in rows.tolist()])
 
     def close(self) -> None:
         """Close the file; the next frame opens it again."""
@@ -85,7 +85,7 @@ class FileFrames:
             self._read = None
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return type(self), (self.path, *self._given, self.chosen)
+        return type(self), (self.path, *self._arguments, self.numbers)
 
 
 @dataclass(frozen=True)
@@ -114,9 +114,9 @@ class HDF5Slices:
         reads = [_slice_reader(require_dataset(file, name), self.axis) for name in self.names]
         return lambda i: self.turn(*(read(i) for read in reads))
 
-    def frames(self, shape: tuple[int, int, int], dtype: npt.DTypeLike, **more: Any) -> FileFrames:
+    def frames(self, shape: tuple[int, int, int], dtype: npt.DTypeLike, **options: Any) -> FileFrames:
         """Frames of a shape (frame, vector, sample)."""
-        return FileFrames(self.path, self, shape, dtype, **more)
+        return FileFrames(self.path, self, shape, dtype, **options)
 
 
 def _slice_reader(data: h5py.Dataset, axis: int | None) -> ReadFrame:

@@ -73,7 +73,7 @@ def write_image(
     # At higher levels speckle hardly shrinks further, and takes several times as long.
     pack = DEFLATE.compressobj(1, zlib.DEFLATED, GZIP if is_nrrd else ZLIB) if is_packed else None
     with path.open("wb") as file:
-        start = file.write(_encoded(header(0 if is_packed else None)))
+        start = file.write(_header_bytes(header(0 if is_packed else None)))
         for plane in planes:
             raw = plane.astype(plane.dtype.newbyteorder("<"), order="C", copy=False).data.cast("B")
             file.write(raw if pack is None else pack.compress(raw))
@@ -81,9 +81,9 @@ def write_image(
             file.write(pack.flush())
             size = file.tell() - start
             file.seek(0)
-            file.write(_encoded(header(size)))
+            file.write(_header_bytes(header(size)))
 
 
-def _encoded(header: str) -> bytes:
+def _header_bytes(header: str) -> bytes:
     """A header as bytes that are read back as the same text."""
     return header.encode("utf-8", "backslashreplace")

@@ -126,47 +126,42 @@ class MissingSettingsError(InvalidInputError):
 
     def __init__(self, path: PathLike | str, settings: tuple[str, ...] = ()) -> None:
         self.settings = settings
-        super().__init__(_asking(path, settings) if settings else str(path))
+        super().__init__(_request(path, settings) if settings else str(path))
 
 
-def settings_for(path: PathLike, given: ImportSettings | None = None) -> ImportSettings:
-    """Settings beside a recording, with those given over them.
+def settings_for(path: PathLike, options: ImportSettings | None = None) -> ImportSettings:
+    """Settings beside a recording, with options over them.
 
     Raises
     ------
     FileError, InvalidInputError
         If the file beside it cannot be read, or holds other settings.
     """
-    given = given or ImportSettings()
-    beside = settings_file(path)
-    if beside is None:
-        return given
-    held = load_toml(ImportSettings, beside)
-    if held.plus_config is not None:
-        config = beside.parent / held.plus_config
-        if not config.resolve().is_relative_to(beside.parent.resolve()):
-            raise InvalidInputError(
-                f"{beside}: plus_config: expected a file of the same folder, got {held.plus_config!r}"
-            )
-        held = held.model_copy(update={"plus_config": str(config)})
-    said = given.model_dump(exclude_unset=True, exclude_none=True)
-    return held.model_copy(update=said)
+    options = options or ImportSettings()
+    if (file := settings_file(path)) is None:
+        return options
+    settings = load_toml(ImportSettings, file)
+    changes = options.model_dump(exclude_unset=True, exclude_none=True)
+    if (name := settings.plus_config) is not None:
+        config = file.parent / name
+        if not config.resolve().is_relative_to(file.parent.resolve()):
+            raise InvalidInputError(f"{file}: plus_config: expected a file of the same folder, got {name!r}")
+        changes = {"plus_config": str(config)} | changes
+    return settings.model_copy(update=changes)
 
 
 def settings_file(path: PathLike) -> Path | None:
     """Find the file that gives what a recording lacks: beside it, or in it if it is a folder."""
-    own = Path(os.path.abspath(path))  # of "." and "..", too, with links as they are named
-    inside = [own / _FOLDER_FILE] if own.is_dir() else []
-    for file in [own.with_name(f"{own.name}.toml"), *inside, own.with_name(_FOLDER_FILE)]:
-        if file.is_file():
-            return file
-    return None
+    place = Path(os.path.abspath(path))  # of "." and "..", too, with links as they are named
+    inside = [place / _FOLDER_FILE] if place.is_dir() else []
+    files = [place.with_name(f"{place.name}.toml"), *inside, place.with_name(_FOLDER_FILE)]
+    return next((file for file in files if file.is_file()), None)
 
 
-def _asking(path: PathLike | str, settings: tuple[str, ...]) -> str:
+def _request(path: PathLike | str, settings: tuple[str, ...]) -> str:
     fields = ImportSettings.model_fields
-    wanted = "; ".join(f"--{name.replace('_', '-')} ({fields[name].description})" for name in settings)
+    options = "; ".join(f"--{name.replace('_', '-')} ({fields[name].description})" for name in settings)
     return (
         f"{path}: the file does not say, so give `speckle3d convert` or {Path(path).name}.toml beside it: "
-        f"{wanted}"
+        f"{options}"
     )

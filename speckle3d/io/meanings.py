@@ -69,10 +69,10 @@ MEANINGS: dict[str, dict[str, str]] = {
 
 def label(file: h5py.File) -> None:
     """Give every data set of a file of the family its attributes `units` and `meaning`."""
-    known = MEANINGS.get(str(file.attrs["format"]), {})
+    meanings = MEANINGS.get(str(file.attrs["format"]), {})
 
     def add(name: str, node: h5py.HLObject) -> None:
-        words = next((text for pattern, text in known.items() if fnmatchcase(name, pattern)), None)
+        words = next((text for pattern, text in meanings.items() if fnmatchcase(name, pattern)), None)
         if words is not None and isinstance(node, h5py.Dataset):
             node.attrs["units"], _, node.attrs["meaning"] = words.partition(": ")
 

@@ -17,7 +17,7 @@ from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.files import PathLike
 from speckle3d.core.streams import TimedPoses, TimedRotations
 from speckle3d.core.sweep import OrientationSensor, Tracker
-from speckle3d.io.carrier import CARRIED, carried_share
+from speckle3d.io.carrier import CARRIER, carrier_share
 from speckle3d.io.frames import FileFrames, ReadFrame
 from speckle3d.io.header_fields import MOST_FRAMES_A_FIELD, is_image
 from speckle3d.io.headers import SequenceHeader, read_header
@@ -41,7 +41,7 @@ from speckle3d.io.readers import Reader
 from speckle3d.io.recordings import Facts, Recording, Value, differs
 
 _DEVICE = "the device set"
-_CARRIER = ("demodulation_frequency_hz", "centre_frequency_hz", "sampling_rate_hz")
+_FREQUENCIES = ("demodulation_frequency_hz", "centre_frequency_hz", "sampling_rate_hz")
 
 
 @dataclass(frozen=True)
@@ -281,11 +281,11 @@ class _Sequence:
         if not self.layout.is_complex:
             return frames, []
         demodulation, centre, rate = (
-            getattr(settings, name) or values.get(name, Value()).value for name in _CARRIER
+            getattr(settings, name) or values.get(name, Value()).value for name in _FREQUENCIES
         )
         # Depth runs backwards in lines that are stored from the far end on, and so does their phase.
-        share = None if demodulation or not (centre and rate) else carried_share(frames, centre, rate)
-        if share is None or share > -CARRIED[0]:
+        share = None if demodulation or not (centre and rate) else carrier_share(frames, centre, rate)
+        if share is None or share > -CARRIER[0]:
             return frames, []
         conjugate = replace(self.layout, conjugate=True)
         return _file_frames(self.header, conjugate), [

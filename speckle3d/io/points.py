@@ -80,17 +80,17 @@ def read_points(path: PathLike, wire_names: Sequence[str] = ()) -> PickedPoints:
     InvalidInputError
         Naming the line.
     """
-    numbered = {str(i): i for i in range(len(wire_names))} | {name: i for i, name in enumerate(wire_names)}
+    wire_of = {str(i): i for i in range(len(wire_names))} | {name: i for i, name in enumerate(wire_names)}
     rows, wires = list[list[float]](), list[int]()
     for where, cell in table(path, _COLUMNS):
         rows.append([numbers(cell[name], 1, f"{where}: {name}")[0] for name in _COLUMNS])
         if rows[-1][0] < 0 or rows[-1][0] % 1:
             raise InvalidInputError(f"{where}: frame: expected a whole number from 0, got {cell['frame']}")
         word = cell.get(_WIRE)
-        if word is not None and word not in numbered:
-            known = ", ".join(wire_names) or "no wire"
-            raise InvalidInputError(f"{where}: wire: expected {known} or its number, got {word!r}")
-        wires += [] if word is None else [numbered[word]]
+        if word is not None and word not in wire_of:
+            names = ", ".join(wire_names) or "no wire"
+            raise InvalidInputError(f"{where}: wire: expected {names} or its number, got {word!r}")
+        wires += [] if word is None else [wire_of[word]]
     if not rows:
         raise InvalidInputError(f"{path}: expected points below the heading, got none")
     places, wire = np.array(rows), np.array(wires) if wires else None

@@ -134,9 +134,9 @@ def read_record(group: h5py.Group, kind: type[Record], **values: Any) -> Record:
             continue
         options = [part for part in get_args(hints[field.name]) if part is not NoneType]
         is_optional = len(options) < len(get_args(hints[field.name]))
-        is_needed = field.default is MISSING and field.default_factory is MISSING and not is_optional
+        lacks_default = field.default is MISSING and field.default_factory is MISSING and not is_optional
         hint = options[0] if is_optional else hints[field.name]
-        if is_needed or has_member(group, field.name) or field.name in group.attrs:
+        if lacks_default or has_member(group, field.name) or field.name in group.attrs:
             values[field.name] = _read_value(group, field.name, hint)
         elif is_optional and field.default is MISSING:
             values[field.name] = None

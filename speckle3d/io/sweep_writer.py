@@ -43,7 +43,7 @@ from speckle3d.io.sweeps import (
     FORMAT,
     GROWING,
     IQ_VERSION,
-    KNOWN,
+    MEMBERS,
     SAMPLE_TYPES,
     VERSION,
     SweepSlices,
@@ -98,19 +98,20 @@ def _append_frame(node: h5py.Dataset, frame: npt.NDArray[Any]) -> None:
     count, *shape = node.shape
     kind = np.dtype(np.complex64) if node.name == "/iq" else node.dtype
     if frame.shape != (*shape[:2],) or not np.can_cast(frame.dtype, kind, "same_kind"):
-        got = f"{frame.dtype}, {frame.shape}"
-        raise InvalidInputError(f"frame {count}: expected {kind}, shape {shape[:2]}, got {got}")
+        raise InvalidInputError(
+            f"frame {count}: expected {kind}, shape {shape[:2]}, got {frame.dtype}, {frame.shape}"
+        )
     if frame.dtype.kind in "fc":
         require_finite(frame, f"frame {count}")
-    stored = np.ascontiguousarray(frame, kind)
+    samples = np.ascontiguousarray(frame, kind)
     if kind != node.dtype:  # pairs of int16, as which they were read
-        stored = stored.view(np.float32).reshape(shape).astype(node.dtype)
-    reserve(node.file.id, stored.nbytes)
+        samples = samples.view(np.float32).reshape(shape).astype(node.dtype)
+    reserve(node.file.id, samples.nbytes)
     node.id.set_extent((count + 1, *shape))
     if node.compression is None:
-        node.id.write_direct_chunk((count, *(0,) * stored.ndim), stored)
+        node.id.write_direct_chunk((count, *(0,) * samples.ndim), samples)
     else:
-        node[count] = stored
+        node[count] = samples
 
 
 def write_sweep(
@@ -154,10 +155,10 @@ def write_sweep(
     """
     frames = sweep.frames
     # Frames that are computed when they are read are made on all cores.
-    made = (ahead if getattr(frames, "computed", False) else map)(frames.__getitem__, range(len(sweep)))
+    images = (ahead if getattr(frames, "computed", False) else map)(frames.__getitem__, range(len(sweep)))
     with naming(str(path)), written(path, FORMAT) as file:
         node = _create_frames(file, sweep.grid, sweep.signal, stored_dtype(frames), compression)
-        for i, frame in enumerate(made):
+        for i, frame in enumerate(images):
             _append_frame(node, frame)
             if progress is not None:
                 progress(i + 1, len(sweep))
@@ -177,11 +178,11 @@ def write_sweep(
 
 def _copy_unknown(source: PathLike, file: h5py.File) -> None:
     """Copy what another sweep file holds beyond this version of the format."""
-    with reading(source), naming(str(source)), open_hdf5(source) as other:
-        for name in {*other} - KNOWN - {*file}:
-            other.copy(find_member(other, name), file, name)
-        for name in {*other.attrs} - {*file.attrs}:
-            file.attrs[name] = other.attrs[name]
+    with reading(source), naming(str(source)), open_hdf5(source) as origin:
+        for name in {*origin} - MEMBERS - {*file}:
+            origin.copy(find_member(origin, name), file, name)
+        for name in {*origin.attrs} - {*file.attrs}:
+            file.attrs[name] = origin.attrs[name]
 
 
 def attach_orientation(path: PathLike, sensor: OrientationSensor) -> None:

@@ -54,13 +54,13 @@ VERSION, IQ_VERSION, FAN_VERSION = 1, 2, 3
 GROWING = "unfinished"
 """Data set of files that grow as they are recorded: 0 once the recording has been closed."""
 
-KNOWN = frozenset({"rf", "iq", "bmode", "frame_time_s", "orientation", "tracker", "truth", "fan", GROWING})
+MEMBERS = frozenset({"rf", "iq", "bmode", "frame_time_s", "orientation", "tracker", "truth", "fan", GROWING})
 """Members of the root that these versions of the format give a meaning to."""
 
 SAMPLE_TYPES = {"rf": ("int16", "float32"), "iq": ("complex64", "int16"), "bmode": ("uint8",)}
 """Types that the samples of each kind may have in the file; int16 of I/Q in pairs, I first."""
 
-_STORED: dict[str, tuple[str, str, tuple[int, ...], Callable[[FloatArray, str], Any]]] = {
+_SENSORS: dict[str, tuple[str, str, tuple[int, ...], Callable[[FloatArray, str], Any]]] = {
     "orientation": ("quaternion_wxyz", "sensor_from_image_wxyz", (4,), rotations_from_quaternions),
     "tracker": ("world_from_sensor", "sensor_from_image", (4, 4), transforms_from_matrices),
 }
@@ -192,7 +192,7 @@ def _read_sensor(file: h5py.File, name: str) -> Any:
         valid = clock.rows("valid", dtype=np.bool_)
     if not valid.any():
         return None
-    readings, mounting, shape, check = _STORED[name]
+    readings, mounting, shape, check = _SENSORS[name]
     values = clock.rows(readings, *shape)
     # Invalid samples may hold anything; replaced, not dropped, so that indices in messages stay right.
     values[~valid] = np.eye(4)[0] if shape == (4,) else np.eye(4)

@@ -68,9 +68,10 @@ def read_tum(path: PathLike, length_unit: LengthUnit | None = None) -> TimedPose
     unit = next((unit for unit in _MM_PER_UNIT if f"x_{unit}" in comments), length_unit or "m")
     table = np.array([_eight(text) for text in lines if not text.startswith("#")]).reshape(-1, _COLUMNS)
     finite = np.isfinite(table).all(axis=1)
-    if 2 * np.count_nonzero(finite) <= len(table):
-        got = f"{np.count_nonzero(finite)} of {len(table)}"
-        raise InvalidInputError(f"{path}: expected lines of eight finite numbers, got {got}")
+    if 2 * (count := np.count_nonzero(finite)) <= len(table):
+        raise InvalidInputError(
+            f"{path}: expected lines of eight finite numbers, got {count} of {len(table)}"
+        )
     if unit != (length_unit or unit):
         raise InvalidInputError(f"{path}: expected lengths in {length_unit}, got a file that says {unit}")
     sound = np.abs(np.linalg.norm(table[:, 4:], axis=1) - 1.0) <= _UNIT_TOLERANCE

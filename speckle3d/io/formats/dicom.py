@@ -56,14 +56,14 @@ _TAGS = (
 """All that is loaded."""
 
 
-def _frames(path: Path, part: tuple[slice, slice], inverted: bool, spread: int) -> ReadFrame:
+def _frames(path: Path, part: tuple[slice, slice], invert: bool, spread: int) -> ReadFrame:
     """Decode grey frames of a region, (column, row), each from the file anew.
 
     Parameters
     ----------
     part : pair of slice
         Rows and columns of the region.
-    inverted : bool
+    invert : bool
         Whether black is the highest level.
     spread : int
         Levels by which the colours of a grey pixel may differ.
@@ -74,14 +74,14 @@ def _frames(path: Path, part: tuple[slice, slice], inverted: bool, spread: int) 
         with _reading(f"{path}: frame {i}"), open_regular(path) as stream:
             image = np.asarray(pixel_array(stream, index=i))[part]
         if image.ndim == 3:
-            coloured = np.argwhere(np.ptp(image.astype(np.int16), axis=2) > spread)
-            if len(coloured):
+            colours = np.argwhere(np.ptp(image.astype(np.int16), axis=2) > spread)
+            if len(colours):
                 raise InvalidInputError(
-                    f"expected grey, got {len(coloured)} pixels of a colour, the first at row, column "
-                    f"{coloured[0].tolist()} of the region: colour Doppler or an overlay"
+                    f"expected grey, got {len(colours)} pixels of a colour, the first at row, column "
+                    f"{colours[0].tolist()} of the region: colour Doppler or an overlay"
                 )
             image = np.rint(image.mean(axis=2)).astype(np.uint8)
-        return 255 - image.T if inverted else image.T
+        return 255 - image.T if invert else image.T
 
     return frame
 
@@ -98,9 +98,9 @@ def open_dicom(path: Path, settings: ImportSettings) -> Facts:
     yield "scanner", printable(machine) or "not named", ""
     yield "transfer syntax", printable(syntax), ""
     for name, expected in _EXPECTED.items():
-        if (got := header.get(name)) not in expected:
-            listed = " or ".join(map(str, expected))
-            raise InvalidInputError(f"{name}: expected {listed}, got {printable(str(got))}")
+        if (value := header.get(name)) not in expected:
+            words = " or ".join(map(str, expected))
+            raise InvalidInputError(f"{name}: expected {words}, got {printable(str(value))}")
     count = int(_numbers(header, "NumberOfFrames")[0]) if "NumberOfFrames" in header else 1
     if count < 2:
         raise InvalidInputError("NumberOfFrames: expected several frames, got a single image")
@@ -146,7 +146,7 @@ def _place(header: Any) -> Generator[Row, None, tuple[tuple[slice, slice], dict[
         spacing = _numbers(header, "PixelSpacing") if header.get("PixelSpacing") else []
         sizes = zip(("row_spacing_mm", "column_pitch_mm"), spacing, strict=False)
         return (slice(None), slice(None)), {name: Value(mm or None, "PixelSpacing") for name, mm in sizes}
-    chosen = []
+    tissue = []
     for candidate in regions:
         kind, box = _numbers(candidate, *_KIND), [int(number) for number in _numbers(candidate, *_BOX)]
         name = (
@@ -154,10 +154,10 @@ def _place(header: Any) -> Generator[Row, None, tuple[tuple[slice, slice], dict[
         )
         place = "columns {0} to {2}, rows {1} to {3}".format(*box)
         yield f"region {'read' if kind == _TISSUE else 'left out'}", f"{name} ({place})", ""
-        chosen += [(candidate, box)] if kind == _TISSUE else []
-    if len(chosen) != 1:
-        raise InvalidInputError(f"expected one region of 2-D tissue, got {len(chosen)} of {len(regions)}")
-    region, (left, top, right, bottom) = chosen[0]
+        tissue += [(candidate, box)] if kind == _TISSUE else []
+    if len(tissue) != 1:
+        raise InvalidInputError(f"expected one region of 2-D tissue, got {len(tissue)} of {len(regions)}")
+    region, (left, top, right, bottom) = tissue[0]
     width, height = _numbers(header, "Columns", "Rows")
     if not (0 <= left < right < width and 0 <= top < bottom < height):
         raise InvalidInputError(
@@ -208,8 +208,8 @@ def _clock(header: Any, count: int) -> tuple[FloatArray | None, Value, tuple[str
         for name, number in numbers.items()
         if 0 < number < np.inf
     ]
-    others = [f"{name} says {rate:.4g}" for rate, name in rates[1:2] if differs(rates[0][0], rate)]
-    rate = Value(rates[0][0], ", ".join([rates[0][1], *others])) if rates else Value()
+    rivals = [f"{name} says {rate:.4g}" for rate, name in rates[1:2] if differs(rates[0][0], rate)]
+    rate = Value(rates[0][0], ", ".join([rates[0][1], *rivals])) if rates else Value()
     steps = steps[int(steps.size == count) :]  # the first of as many as there are frames is 0
     if steps.size == count - 1 and np.isfinite(steps).all():
         return np.cumsum([0.0, *steps]) / 1e3, rate, ()

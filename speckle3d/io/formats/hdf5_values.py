@@ -71,7 +71,7 @@ def band_about(values: Mapping[str, Value], share: float | None, place: str) -> 
 
 
 def fan_values(
-    angle_rad: FloatArray, radius_mm: FloatArray, face_mm: float, where: str, said: str
+    angle_rad: FloatArray, radius_mm: FloatArray, face_mm: float, where: str, source: str
 ) -> dict[str, Value]:
     """Numbers of lines that meet, by their angles and by the distances of samples from where they meet.
 
@@ -93,7 +93,7 @@ def fan_values(
         "row_spacing_mm": step_of(radius_mm, f"{where}, depths"),
         "first_sample_depth_mm": float(radius_mm[0]) - array_mm,
     }
-    return {name: Value(value, said) for name, value in numbers.items()}
+    return {name: Value(value, source) for name, value in numbers.items()}
 
 
 def text_of(value: Any) -> str:

@@ -48,9 +48,9 @@ USER_BLOCK = 512
 _DATA = (("rf",), ("iq",), ("i", "q"), ("bmode",))
 _ROLES = {role for data in _DATA for role in data}
 _POSITIONS = ("x_mm", "z_mm", "time_s")
-_SCALED = re.compile(r"(?P<name>[^*/]+?)\s*(?:(?P<sign>[*/])\s*(?P<factor>[-+]?\d+\.?\d*(?:[eE][-+]?\d+)?))?")
-_MOST_SHOWN, _MOST_ELEMENTS = 12, 8
-"""Arrays that are listed, and elements of a list in which they are looked for."""
+_TERM = re.compile(r"(?P<name>[^*/]+?)\s*(?:(?P<sign>[*/])\s*(?P<factor>[-+]?\d+\.?\d*(?:[eE][-+]?\d+)?))?")
+_MOST_ARRAYS, _MOST_ELEMENTS = 12, 8
+"""Arrays that are told of, and elements of a list in which they are looked for."""
 
 
 def _is_new(start: bytes) -> bool:
@@ -63,16 +63,16 @@ def _claims(_: Path, start: bytes) -> bool:
 
 def open_matlab(path: Path, settings: ImportSettings) -> Facts:
     """Read the arrays that a mapping names; without one, list the arrays and what to write."""
-    variables: Any = open_hdf5(path) if _is_new(first_bytes(path)) else _loaded(path)
-    listed = sorted(_arrays(variables), key=lambda one: -int(np.prod(one[1].shape)))[:_MOST_SHOWN]
-    shown = [(printable(name), _size(node), _kind(node)) for name, node in listed]
-    yield from ((f"array {name}", size, kind) for name, size, kind in shown)
+    variables: Any = open_hdf5(path) if _is_new(first_bytes(path)) else _variables(path)
+    largest = sorted(_arrays(variables), key=lambda row: -int(np.prod(row[1].shape)))[:_MOST_ARRAYS]
+    rows = [(printable(name), _size(node), _kind(node)) for name, node in largest]
+    yield from ((f"array {name}", size, kind) for name, size, kind in rows)
     arrays, where = settings.arrays, f"{path}: arrays"
     if unknown := sorted({*arrays} - {*_ROLES, *_POSITIONS, *ImportSettings.model_fields, "axes"}):
         raise InvalidInputError(f"{where}: expected {', '.join(sorted(_ROLES))}, axes, got {unknown[0]}")
     data = next((data for data in _DATA if {*data} == _ROLES & {*arrays}), None)
     if data is None:
-        listing = ", ".join(map(" ".join, shown))
+        listing = ", ".join(map(" ".join, rows))
         raise InvalidInputError(
             f"{path}: expected to be told which array is what: write rf (or iq, or i and q, or bmode) = "
             f'"NAME" and axes = "sample, vector, frame" below [arrays] in {path.name}.toml beside it; there '
@@ -96,7 +96,7 @@ def open_matlab(path: Path, settings: ImportSettings) -> Facts:
     return Recording(path, settings, frames, values, time_s=times)
 
 
-def _loaded(path: Path) -> dict[str, Any]:
+def _variables(path: Path) -> dict[str, Any]:
     """Variables of versions 5 to 7, read whole by SciPy."""
     from scipy.io import loadmat
 
@@ -114,14 +114,14 @@ def _array(variables: Any, name: str) -> Any:
         If there is none of numbers.
     """
     plain = name.replace(" ", "")
-    for wanted in (plain, re.sub(r"[({]1[)}]", "", plain)):
-        if (node := dict(_arrays(variables, wanted)).get(wanted)) is not None:
+    for target in (plain, re.sub(r"[({]1[)}]", "", plain)):
+        if (node := dict(_arrays(variables, target)).get(target)) is not None:
             return node
-    known = ", ".join(printable(label) for label, _ in _arrays(variables)) or "none"
-    raise InvalidInputError(f"expected an array {printable(name)}, got {known}")
+    names = ", ".join(printable(label) for label, _ in _arrays(variables)) or "none"
+    raise InvalidInputError(f"expected an array {printable(name)}, got {names}")
 
 
-def _arrays(node: Any, wanted: str = "", name: str = "") -> Iterator[tuple[str, Any]]:
+def _arrays(node: Any, target: str = "", name: str = "") -> Iterator[tuple[str, Any]]:
     """Names and arrays of numbers, of the first elements of lists; or those along the way to a name.
 
     All have their axes in reverse.
@@ -133,8 +133,8 @@ def _arrays(node: Any, wanted: str = "", name: str = "") -> Iterator[tuple[str, 
     elements = 0
     for label, child in _children(node):
         elements += label[:1] in ("(", "{")
-        if wanted.startswith(name + label) if wanted else elements <= _MOST_ELEMENTS:
-            yield from _arrays(child, wanted, name + label)
+        if target.startswith(name + label) if target else elements <= _MOST_ELEMENTS:
+            yield from _arrays(child, target, name + label)
 
 
 def _children(node: Any) -> Iterator[tuple[str, Any]]:
@@ -199,8 +199,8 @@ def _axes(text: str, node: Any) -> tuple[dict[str, int], list[str]]:
     sizes = [*node.shape[::-1], *(1,) * (len(names) - node.ndim)]  # MATLAB leaves out last ones of length 1
     axes = list(zip(names, sizes, strict=False))
     plain = sorted(name for name in names if name != "-")
-    is_named = plain in (["frame", "sample", "vector"], ["sample", "vector"])
-    if not is_named or len(sizes) > len(names) or any(name == "-" and size > 1 for name, size in axes):
+    has_all = plain in (["frame", "sample", "vector"], ["sample", "vector"])
+    if not has_all or len(sizes) > len(names) or any(name == "-" and size > 1 for name, size in axes):
         raise InvalidInputError(
             f"axes: expected sample, vector, frame once each, and - for axes of length 1, of {_size(node)}, "
             f"got {printable(text) or 'none'}"
@@ -236,7 +236,7 @@ def _numbers(
     values, times = dict[str, Value](), None
     lengths = {"x_mm": shape[1], "z_mm": shape[2], "time_s": shape[0], "bandwidth_hz": 2}
     for name in sorted({*arrays} & {*_POSITIONS, *ImportSettings.model_fields}):
-        numbers, said = _scaled(variables, name, arrays[name]), f"in {arrays[name]}"
+        numbers, source = _product(variables, name, arrays[name]), f"in {arrays[name]}"
         if name not in lengths and np.ptp(numbers) == 0:
             numbers = numbers[:1]
         if numbers.size != lengths.get(name, 1):
@@ -247,18 +247,18 @@ def _numbers(
         if name == "time_s":
             times = numbers
         elif name == "x_mm":
-            values["vector_pitch_mm"] = Value(step_of(numbers, name), said)
+            values["vector_pitch_mm"] = Value(step_of(numbers, name), source)
         elif name == "z_mm":
-            values["row_spacing_mm"] = Value(step_of(numbers, name), said)
-            values["first_sample_depth_mm"] = Value(float(numbers[0]), said)
+            values["row_spacing_mm"] = Value(step_of(numbers, name), source)
+            values["first_sample_depth_mm"] = Value(float(numbers[0]), source)
         else:
-            values[name] = Value(tuple(numbers.tolist()) if numbers.size > 1 else float(numbers[0]), said)
+            values[name] = Value(tuple(numbers.tolist()) if numbers.size > 1 else float(numbers[0]), source)
     return values, times
 
 
-def _scaled(variables: Any, name: str, text: str) -> FloatArray:
+def _product(variables: Any, name: str, text: str) -> FloatArray:
     """Numbers of an array, in one row, times the factor behind its name."""
-    parts = _SCALED.fullmatch(text.strip())
+    parts = _TERM.fullmatch(text.strip())
     factor = float(parts["factor"] or 1.0) if parts else 0.0
     if parts is None or not factor:
         raise InvalidInputError(f"{name}: expected as NAME, NAME * 1e6 or NAME / 2, got {printable(text)}")

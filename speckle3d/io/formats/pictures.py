@@ -46,8 +46,10 @@ class PictureFolder:
             grey = picture.mode in ("L", "I;16", "I")
             image = np.asarray(picture if grey else picture.convert("RGB"))
         if index and image.shape != self.shape[1:]:
-            got = f"{image.shape}, and {self.shape[1:]} before"
-            raise InvalidInputError(f"{self._paths[index]}: expected pictures of one size, got {got}")
+            raise InvalidInputError(
+                f"{self._paths[index]}: expected pictures of one size, got {image.shape}, and "
+                f"{self.shape[1:]} before"
+            )
         return image
 
 
@@ -76,8 +78,8 @@ def _pictures(folder: Path) -> list[Path]:
 
 def _claims(path: Path, start: bytes) -> bool:
     if path.is_dir():
-        own = [one for one in path.iterdir() if one.suffix != ".toml" and not one.name.startswith(".")]
-        return bool(own) and all(one.suffix.lower() in _PICTURES for one in own)
+        files = [file for file in path.iterdir() if file.suffix != ".toml" and not file.name.startswith(".")]
+        return bool(files) and all(file.suffix.lower() in _PICTURES for file in files)
     return start.startswith(_ARRAY) or path.suffix.lower() in _VIDEOS
 
 

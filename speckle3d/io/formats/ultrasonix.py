@@ -38,7 +38,7 @@ _BMODE, _LAST_TYPE = 4, 2**19
 _SUFFIXES = (".rf", ".bpr", ".b8", ".crf", ".col")
 
 
-def _mapped(path: Path, record: np.dtype[Any], count: int, is_image: bool) -> ReadFrame:
+def _open_frames(path: Path, record: np.dtype[Any], count: int, is_image: bool) -> ReadFrame:
     """Map frames that lie one after the other, each with its number before it or not."""
     pixels = np.memmap(path, record, "r", _HEADER.itemsize, (count,))["pixels"]
     return lambda i: pixels[i].T if is_image else pixels[i]
@@ -48,7 +48,7 @@ def _header(content: bytes) -> Any:
     return np.frombuffer(content, _HEADER, 1)[0]
 
 
-def _is_tagged(header: Any, size: int) -> bool | None:
+def _has_tags(header: Any, size: int) -> bool | None:
     """Whether each frame has its number before it, by the file's size; None if that is neither's."""
     frames, *sides = (int(header[name]) for name in ("frames", "width", "height", "bits"))
     sizes = {_HEADER.itemsize + frames * (math.prod(sides) // 8 + tag): bool(tag) for tag in (0, 4)}
@@ -58,7 +58,7 @@ def _is_tagged(header: Any, size: int) -> bool | None:
 def _claims(path: Path, start: bytes) -> bool:
     if len(start) < _HEADER.itemsize or not 0 < (kind := int(_header(start)["kind"])) <= _LAST_TYPE:
         return False
-    is_whole = _is_tagged(_header(start), path.stat().st_size) is not None
+    is_whole = _has_tags(_header(start), path.stat().st_size) is not None
     return kind.bit_count() == 1 and (is_whole or path.suffix.lower() in _SUFFIXES)
 
 
@@ -83,13 +83,13 @@ def open_ultrasonix(path: Path, settings: ImportSettings) -> Facts:
             f"expected frames of RF, of 16 bits, or B-mode, of 8, got {count} of {name}, of "
             f"{header['bits']} bits"
         )
-    if (is_tagged := _is_tagged(header, size)) is None:
+    if (has_tags := _has_tags(header, size)) is None:
         whole = 8 * (size - _HEADER.itemsize) // (width * height * bits)
         raise FileError(f"{path}: ends early, or is longer than its frames: {whole} of {count} frames")
     is_image, dtype = header["kind"] == _BMODE, np.dtype("<i2" if bits == 16 else "u1")
     shape = (height, width) if is_image else (width, height)
-    tag = [("tag", "<i4")] if is_tagged else []
-    source = partial(_mapped, path, np.dtype([*tag, ("pixels", dtype, shape)]), count, is_image)
+    tag = [("tag", "<i4")] if has_tags else []
+    source = partial(_open_frames, path, np.dtype([*tag, ("pixels", dtype, shape)]), count, is_image)
     frames = FileFrames(path, source, (count, width, height), dtype.newbyteorder("="))
     return Recording(path, settings, frames, values, assumptions=() if is_image else ("parallel lines",))
 

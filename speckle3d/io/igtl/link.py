@@ -25,7 +25,7 @@ _LOOK_S = 0.005
 """Between two looks at what another thread does."""
 _CONNECT_S, _PAUSE_S = 5.0, 0.5
 """Longest time to connect, and between two attempts."""
-_MOST_RECEIVED, _MOST_UNSENT_BYTES = 256, 2**24
+_MOST_MESSAGES, _MOST_UNSENT_BYTES = 256, 2**24
 """Messages not yet taken, for which the peer then waits; and what is not yet sent, above which no more is:
 a dozen frames of 1 MB, half a second."""
 _PIECE_BYTES = 2**20
@@ -71,7 +71,7 @@ class End:
 
     def __init__(self) -> None:
         self.state = LinkState()
-        self._inbox: queue.Queue[Received] = queue.Queue(_MOST_RECEIVED)
+        self._inbox: queue.Queue[Received] = queue.Queue(_MOST_MESSAGES)
         self._writers: list[asyncio.StreamWriter] = []
         self._loop, self._over = asyncio.new_event_loop(), asyncio.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
@@ -102,12 +102,12 @@ class End:
         list
             Empty if none came in time.
         """
-        taken: list[Received] = []
+        messages: list[Received] = []
         with suppress(queue.Empty):
-            taken.append(self._inbox.get(timeout_s > 0, timeout_s))
+            messages.append(self._inbox.get(timeout_s > 0, timeout_s))
             while True:
-                taken.append(self._inbox.get_nowait())
-        return taken
+                messages.append(self._inbox.get_nowait())
+        return messages
 
     def send(self, message: bytes) -> None:
         """Send a packed message to all peers, without waiting for any: a slow one is left out."""

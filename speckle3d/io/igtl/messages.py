@@ -157,9 +157,9 @@ def packed_image(
         If the image is of a type or a size that OpenIGTLink does not know.
     """
     whole = pixels if pixels.ndim - (components > 1) == 3 else np.expand_dims(pixels, 2)
-    turned = whole.transpose(2, 1, 0, *range(3, whole.ndim))
-    native = np.ascontiguousarray(turned, pixels.dtype.newbyteorder("="))
-    return _packed(ImageMessage(native, image_to_world, "ras"), device, time_s)
+    by_slice = whole.transpose(2, 1, 0, *range(3, whole.ndim))
+    native = np.ascontiguousarray(by_slice, pixels.dtype.newbyteorder("="))
+    return _pack(ImageMessage(native, image_to_world, "ras"), device, time_s)
 
 
 def packed_transform(device: str, time_s: float, matrix: FloatArray, valid: bool = True) -> bytes:
@@ -167,13 +167,13 @@ def packed_transform(device: str, time_s: float, matrix: FloatArray, valid: bool
     message = TransformMessage(matrix)
     if not valid:
         message.metadata = {"TransformValid": "False", "TransformStatus": "MISSING"}
-    return _packed(message, device, time_s)
+    return _pack(message, device, time_s)
 
 
 def packed_text(device: str, time_s: float, text: str) -> bytes:
     """Pack a STRING."""
     message = StringMessage(text.encode("ascii", "backslashreplace").decode("ascii"))
-    return _packed(message, device, time_s)
+    return _pack(message, device, time_s)
 
 
 def packed_status(device: str, time_s: float, text: str, code: int = _OK) -> bytes:
@@ -181,10 +181,10 @@ def packed_status(device: str, time_s: float, text: str, code: int = _OK) -> byt
     message: Any = MessageBase()
     body = _STATUS.pack(code, 0, b"OK" if code == _OK else b"") + text.encode("ascii", "backslashreplace")
     message._message_type, message._pack_content = "STATUS", lambda: body + b"\0"
-    return _packed(message, device, time_s)
+    return _pack(message, device, time_s)
 
 
-def _packed(message: Any, device: str, time_s: float) -> bytes:
+def _pack(message: Any, device: str, time_s: float) -> bytes:
     if len(device) > 20 or not device.isascii() or not 0 <= time_s < 2**32:
         raise InvalidInputError(
             f"device {device!r}, {time_s} s: expected at most 20 letters of ASCII and a time from 0 to 2^32 s"
@@ -194,8 +194,8 @@ def _packed(message: Any, device: str, time_s: float) -> bytes:
     try:
         return bytes(message.pack())
     except (struct.error, IndexError) as error:  # of an image too long, or of a type that it does not know
-        what = f"{message.message_type} {device}"
-        raise InvalidInputError(f"{what}: expected what OpenIGTLink can hold: {error}") from error
+        where = f"{message.message_type} {device}"
+        raise InvalidInputError(f"{where}: expected what OpenIGTLink can hold: {error}") from error
 
 
 def _image(message: Any) -> ImageReceived:
@@ -214,8 +214,8 @@ def _image(message: Any) -> ImageReceived:
 
 
 def _transform(message: Any) -> TransformReceived:
-    said = message.metadata
-    valid = said.get("TransformValid", "True") != "False" and said.get("TransformStatus", "OK") == "OK"
+    fields = message.metadata
+    valid = fields.get("TransformValid", "True") != "False" and fields.get("TransformStatus", "OK") == "OK"
     return TransformReceived(message.device_name, message.timestamp, _finite(message.matrix), valid)
 
 

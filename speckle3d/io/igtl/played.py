@@ -56,7 +56,7 @@ def played(
     InvalidInputError
         If a message cannot hold the frames, or a time.
     """
-    image, *others = devices
+    image, *sensor_devices = devices
     first_s = float(sweep.frame_time_s[0])
 
     def images() -> Iterator[Played]:
@@ -69,15 +69,16 @@ def played(
                 True,
             )
 
-    sensors = zip((sweep.tracker, sweep.orientation), others, strict=True)
-    readings = (_readings(one, name, first_s, later_s) for one, name in sensors if one is not None)
+    sensors = zip((sweep.tracker, sweep.orientation), sensor_devices, strict=True)
+    readings = (_readings(sensor, name, first_s, later_s) for sensor, name in sensors if sensor is not None)
     return heapq.merge(images(), *readings, key=lambda message: message[0])
 
 
 def clock_shift_s(sweep: Sweep) -> float:
     """Whole seconds by which a sweep's times are to be put later: messages hold none below zero."""
-    sensors = (one.readings.time_s for one in (sweep.tracker, sweep.orientation) if one is not None)
-    earliest_s = min(float(times[0]) for times in (sweep.frame_time_s, *sensors))
+    sensors = (sweep.tracker, sweep.orientation)
+    clocks = sweep.frame_time_s, *(sensor.readings.time_s for sensor in sensors if sensor is not None)
+    earliest_s = min(float(times[0]) for times in clocks)
     return float(max(0, math.ceil(-earliest_s)))
 
 

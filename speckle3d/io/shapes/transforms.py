@@ -84,13 +84,13 @@ def write_transforms(path: PathLike, world_from_image: RigidTransform) -> None:
     InvalidInputError, FileError
         As `write_transform` does.
     """
-    first, *others = (each.name for each in transform_paths(path, len(world_from_image)))
-    with FileSet(first, tuple(others)).replaced(Path(path).parent) as part:
-        for name, pose in zip((first, *others), world_from_image, strict=True):
+    first, *rest = (file.name for file in transform_paths(path, len(world_from_image)))
+    with FileSet(first, tuple(rest)).replaced(Path(path).parent) as part:
+        for name, pose in zip((first, *rest), world_from_image, strict=True):
             write_transform(part / name, pose)
 
 
 def transform_paths(path: PathLike, count: int) -> list[Path]:
     """Files of a row of poses: the path with the frame's number behind its stem, as poses-0000.tfm."""
-    given = Path(path)
-    return [given.with_name(f"{given.stem}-{i:04d}{given.suffix}") for i in range(count)]
+    pattern = Path(path)
+    return [pattern.with_name(f"{pattern.stem}-{i:04d}{pattern.suffix}") for i in range(count)]
