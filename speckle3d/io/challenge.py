@@ -102,8 +102,9 @@ def open_scan(file: h5py.File, _: ImportSettings) -> Recording:
     separate = _transforms_file(scan)
     with nullcontext(file) if separate is None else open_hdf5(separate) as transforms:
         if has_member(transforms, "tforms"):
-            matrices = read_array(transforms, "tforms", (n, 4, 4))
-            readings, remarks = timed_poses(np.arange(n) / FRAME_RATE_HZ, matrices)
+            matrices = read_array(transforms, "tforms", ("pose", 4, 4))
+            readings, remarks = timed_poses(np.arange(len(matrices)) / FRAME_RATE_HZ, matrices)
+            remarks += [] if len(matrices) == n else [f"tforms: {len(matrices)} poses for {n} frames"]
             tracker = None if readings is None else Tracker(readings, tool_from_image)
     values = {
         "column_pitch_mm": Value(float(size_mm[0]), _CALIBRATION),

@@ -187,8 +187,8 @@ def family_format(path: PathLike, source: Path | h5py.File) -> str:
         content = "a folder that none of them is in"
     elif place.name.lower().endswith(_VOLUMES):
         content = "a volume (NIfTI)"
-    elif (start := first_bytes(path)).startswith(b"\x1f\x8b"):
-        content = "a file packed by gzip: unpack it first"
+    elif (start := first_bytes(path)).startswith((b"\x1f\x8b", b"PK\3\4")):
+        content = "a packed file: unpack it first"
     else:
         content = "another file" if start else "an empty file"
     raise InvalidInputError(

@@ -53,7 +53,8 @@ def read_tum(path: PathLike, length_unit: LengthUnit | None = None) -> TimedPose
     Parameters
     ----------
     length_unit : {"m", "mm"}, optional
-        By default what a comment of the file says, else metres, as the format has it.
+        By default what a comment of the file says, else metres, as the format has it. A heading that names
+        qw before qx says that quaternions are scalar first.
 
     Raises
     ------
@@ -64,13 +65,15 @@ def read_tum(path: PathLike, length_unit: LengthUnit | None = None) -> TimedPose
         whose time is not after the one before, are left out with a warning that counts them.
     """
     lines = [text for _, text in text_lines(path)]
-    comments = {word for text in lines if text.startswith("#") for word in text.split()}
-    unit = next((unit for unit in _MM_PER_UNIT if f"x_{unit}" in comments), length_unit or "m")
+    heading = [word for text in lines if "qw" in text or text.startswith("#") for word in text.split()]
+    unit = next((unit for unit in _MM_PER_UNIT if f"x_{unit}" in heading), length_unit or "m")
+    scalar_first = "qw" in heading and "qx" in heading[heading.index("qw") :]
     table = np.array([_eight(text) for text in lines if not text.startswith("#")]).reshape(-1, _COLUMNS)
     finite = np.isfinite(table).all(axis=1)
     if 2 * (count := np.count_nonzero(finite)) <= len(table):
         raise InvalidInputError(
-            f"{path}: expected lines of eight finite numbers, got {count} of {len(table)}"
+            f"{path}: expected lines of eight finite numbers (time x y z qx qy qz qw, blanks between), "
+            f"got {count} of {len(table)}"
         )
     if unit != (length_unit or unit):
         raise InvalidInputError(f"{path}: expected lengths in {length_unit}, got a file that says {unit}")
@@ -82,7 +85,9 @@ def read_tum(path: PathLike, length_unit: LengthUnit | None = None) -> TimedPose
     for note in notes:
         warnings.warn(note, stacklevel=2)
     time_s, places, turns = np.split(table[rows], [1, 4], axis=1)
-    poses = RigidTransform.from_components(_MM_PER_UNIT[unit] * places, Rotation.from_quat(turns))
+    poses = RigidTransform.from_components(
+        _MM_PER_UNIT[unit] * places, Rotation.from_quat(turns, scalar_first=scalar_first)
+    )
     return TimedPoses(time_s[:, 0], poses)
 
 

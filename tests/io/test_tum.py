@@ -1,3 +1,5 @@
+import warnings
+
 import numpy as np
 import pytest
 from drifting import hand_sweep
@@ -39,6 +41,17 @@ def test_one_bad_line_is_left_out_and_counted(tmp_path, bad):
         poses = read_tum(tmp_path / "a.tum", "mm")
     np.testing.assert_array_equal(poses.time_s, np.arange(6.0))
     np.testing.assert_array_equal(poses.world_from_sensor.translation[:, 0], np.arange(6.0))
+
+
+@pytest.mark.parametrize("sign", ["# ", ""])
+def test_a_heading_says_that_quaternions_are_scalar_first(tmp_path, sign):
+    (tmp_path / "a.tum").write_text(
+        f"{sign}timestamp tx ty tz qw qx qy qz\n0 0 0 0 1 0 0 0\n1 0 0 0 0 0 0 1\n"
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # a heading that is no comment is a line of no use
+        rotation = read_tum(tmp_path / "a.tum").world_from_sensor.rotation
+    np.testing.assert_allclose(rotation.as_quat(scalar_first=True), [[1, 0, 0, 0], [0, 0, 0, 1]], atol=1e-12)
 
 
 def test_a_file_says_its_own_unit_and_is_not_overruled(tmp_path):

@@ -27,6 +27,8 @@ FORMAT = "arrays, pictures or video"
 _ARRAY = b"\x93NUMPY"
 _PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 _VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".wmv", ".m4v", ".mpg", ".gif")
+_NOTES = (".toml", ".txt", ".md", ".json", ".csv", ".db", ".ini")
+"""Of files that may lie among pictures."""
 
 
 class PictureFolder:
@@ -78,8 +80,10 @@ def _pictures(folder: Path) -> list[Path]:
 
 def _claims(path: Path, start: bytes) -> bool:
     if path.is_dir():
-        files = [file for file in path.iterdir() if file.suffix != ".toml" and not file.name.startswith(".")]
-        return bool(files) and all(file.suffix.lower() in _PICTURES for file in files)
+        suffixes = {file.suffix.lower() for file in path.iterdir() if not file.name.startswith(".")} - {
+            *_NOTES
+        }
+        return bool(suffixes) and suffixes <= {*_PICTURES}
     return start.startswith(_ARRAY) or path.suffix.lower() in _VIDEOS
 
 

@@ -27,7 +27,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import FloatArray
-from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.printable import printable
 from speckle3d.core.sweep import Tracker
 from speckle3d.io.carrier import demodulation_of
@@ -137,7 +137,10 @@ def open_zea(file: h5py.File, settings: ImportSettings) -> Facts:
         rate_hz = rate_by_spacing(values["row_spacing_mm"], settings, values).value
         words = "of scan/demodulation_frequency and the phase of the data"
         values["demodulation_frequency_hz"] = Value(demodulation_of(frames, shift_hz, rate_hz), words)
-    tracker, remarks = _tracker(file, left_mm)
+    try:
+        tracker, remarks = _tracker(file, left_mm)
+    except (InvalidInputError, FileError) as error:
+        tracker, remarks = None, [f"the tracker is left out: {error}"]
     return Recording(
         path,
         settings,
