@@ -149,7 +149,7 @@ def test_the_tool_is_what_the_image_is_on(tmp_path):
 @pytest.mark.parametrize("size", [b"5 4", b"0 0"])
 @pytest.mark.parametrize("packed", [b"False", b"True"])
 def test_frames_that_a_header_claims_beyond_its_bytes_are_refused_in_one_line(tmp_path, size, packed):
-    path = write_mha(tmp_path / "a.mha", grey(), frames=tracked(3)[2])
+    path = write_mha(tmp_path / "a.mha", grey(), frames=frame_fields(3)[2])
     content = path.read_bytes().replace(b"DimSize = 5 4 3", b"DimSize = " + size + b" 100000000000000")
     path.write_bytes(content.replace(b"CompressedData = False", b"CompressedData = " + packed))
     for read in (read_poses, lambda path: load_sweep(path, BMODE)):
@@ -159,7 +159,7 @@ def test_frames_that_a_header_claims_beyond_its_bytes_are_refused_in_one_line(tm
 
 
 def test_a_number_of_a_frame_that_no_header_has_is_refused_at_once(tmp_path):
-    path = write_mha(tmp_path / "a.mha", grey(), frames=tracked(3)[2])
+    path = write_mha(tmp_path / "a.mha", grey(), frames=frame_fields(3)[2])
     path.write_bytes(path.read_bytes().replace(b"Seq_Frame0002", b"Seq_Frame9999999"))
     with pytest.raises(InvalidInputError, match="most frames"):
         read_poses(path)
