@@ -65,11 +65,11 @@ def test_what_lacks_beside_a_file_of_a_package_is_named(tmp_path):
     name = f"{examples.NAME}_rf"
     files = examples.package_files(sweep_of("rf")) | {f"{name}.tgc": b"tgc"}
     folder = examples.write_files(tmp_path / "p", files)
-    require_equal(load_sweep(folder / f"{name}.tgc", GIVEN), sweep_of("rf"))
+    require_equal(load_sweep(folder / f"{name}.tgc", IMPORT_SETTINGS), sweep_of("rf"))
     (folder / f"{name}.raw").unlink()
     for suffix in (".tgc", ".yml"):
         with pytest.raises(InvalidInputError, match=re.escape(f"{name}{suffix}: expected {name}.raw beside")):
-            load_sweep(folder / f"{name}{suffix}", GIVEN)
+            load_sweep(folder / f"{name}{suffix}", IMPORT_SETTINGS)
 
 
 def test_iq_of_a_falling_frequency_becomes_that_of_one(tmp_path):
