@@ -101,11 +101,11 @@ class _Viewer:
         self._words.object = "<br>".join(
             [
                 f'<span style="{_BIG}">{escape(progress.length)}</span>'
-                f" &emsp; {progress.recorded} frames &emsp; {escape(progress.words)}",
-                escape("; ".join(filter(None, (self._status(), progress.missing, progress.failed)))),
+                f" &emsp; {progress.frames} frames &emsp; {escape(progress.words)}",
+                escape("; ".join(filter(None, (self._status(), progress.missing, progress.failure)))),
             ]
         )
-        shown = (progress.matched, progress.volumes)
+        shown = (progress.poses, progress.volumes)
         if shown[0] != self._shown[0]:
             if (picture := session.picture()) is not None:
                 levels, grid = picture

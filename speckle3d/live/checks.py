@@ -9,9 +9,9 @@ from speckle3d.matching.quality import FrameFlag
 from speckle3d.matching.schedule import TrajectorySettings
 
 GOOD = "good"
-TOO_FAST, LOST, LIFTED = "too fast", "not overlapping: go back to where it was", "lifted"
+TOO_FAST, NO_OVERLAP, NO_CONTACT = "too fast", "not overlapping: go back to where it was", "lifted"
 _OF_FLAGS = {
-    FrameFlag.LIFTED: LIFTED,
+    FrameFlag.LIFTED: NO_CONTACT,
     FrameFlag.SATURATED: "gain too high",
     FrameFlag.NO_SPECKLE: "no speckle",
     FrameFlag.FROZEN: "image frozen",
@@ -32,7 +32,7 @@ def words_for(pose: LivePose, settings: TrajectorySettings) -> str:
         if pose.flags & flag:
             return words
     if pose.flags & FrameFlag.UNMATCHED:
-        return LOST
+        return NO_OVERLAP
     # False for the first frame, which has no correlation.
     if pose.median < settings.clear_correlation:
         return TOO_FAST
@@ -45,20 +45,20 @@ class Words:
 
     Attributes
     ----------
-    said : str
+    text : str
     """
 
-    said: str = GOOD
+    text: str = GOOD
     _next: str = GOOD
     _since_s: float = float("-inf")
-    _said_s: float = float("-inf")
+    _text_s: float = float("-inf")
 
     def take(self, words: str, time_s: float) -> bool:
         """Take what there is to say at a time; true if something else is said from now on."""
         if words != self._next:
             self._next, self._since_s = words, time_s
-        settled = time_s - self._since_s >= SEEN_S and time_s - self._said_s >= STAYS_S
-        if self._next == self.said or not settled:
+        lasts = time_s - self._since_s >= SEEN_S and time_s - self._text_s >= STAYS_S
+        if self._next == self.text or not lasts:
             return False
-        self.said, self._said_s = self._next, time_s
+        self.text, self._text_s = self._next, time_s
         return True

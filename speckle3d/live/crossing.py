@@ -1,4 +1,4 @@
-"""Whether a second sweep crosses the first one as it must, while it is made."""
+"""Check while a second sweep is made that it crosses the first one."""
 
 from __future__ import annotations
 
@@ -71,12 +71,12 @@ class CrossingCheck:
             As `track`.
         """
         stack = stack_for(first, config)
-        tracked = track(first, curves, config, progress, images=stack.keep)
-        return cls(crossing_side(first, tracked, stack, config), config.crossing)
+        motion = track(first, curves, config, progress, images=stack.keep)
+        return cls(crossing_side(first, motion, stack, config), config.crossing)
 
-    def look(self, tracker: LiveTracker, kept: GrowingVolume) -> None:
+    def look(self, tracker: LiveTracker, volume: GrowingVolume) -> None:
         """Lay the frames whose images are kept against the first sweep."""
-        numbers, images = kept.kept()
+        numbers, images = volume.images()
         poses, flags = tracker.poses, tracker.flags
         numbers = numbers[numbers < min(len(poses), flags.size)]
         if numbers.size < LEAST_FRAMES:
@@ -100,8 +100,8 @@ class CrossingCheck:
             # Too little of it so far.
             self.words = GOOD
 
-    def keep_looking(self, tracker: LiveTracker, kept: GrowingVolume, over: threading.Event) -> None:
+    def keep_looking(self, tracker: LiveTracker, volume: GrowingVolume, over: threading.Event) -> None:
         """Look again and again, on this thread alone, until it is over."""
         with on_one_thread():
             while not over.wait(PAUSE_S):
-                self.look(tracker, kept)
+                self.look(tracker, volume)

@@ -125,7 +125,7 @@ def _plane(image: ImageReceived, where: str) -> npt.NDArray[Any]:
 
 
 def _example(pixels: npt.NDArray[Any], image: ImageReceived, settings: ImportSettings, where: str) -> Sweep:
-    """A sweep of one black frame; the speed of sound is asked for, as nothing told of it is seen later."""
+    """Sweep of one black frame; of RF the speed of sound must be given: no message has it."""
     if pixels.dtype != _GREY_LEVELS:
         if settings.demodulation_frequency_hz is not None:
             raise InvalidInputError(
@@ -134,7 +134,7 @@ def _example(pixels: npt.NDArray[Any], image: ImageReceived, settings: ImportSet
         values, black = {"speed_of_sound_m_s": Value()}, np.zeros_like(pixels.T)
     else:
         column_mm, row_mm = image.spacing_mm[:2].tolist()
-        is_said = column_mm > 0 < row_mm and (column_mm, row_mm) != (1.0, 1.0)
+        has_size = column_mm > 0 < row_mm and (column_mm, row_mm) != (1.0, 1.0)
         sizes = {"column_pitch_mm": Value(column_mm), "row_spacing_mm": Value(row_mm)}
-        values, black = sizes if is_said else {}, np.zeros_like(pixels)
+        values, black = sizes if has_size else {}, np.zeros_like(pixels)
     return Recording(Path(where), settings, black[None], values).sweep

@@ -12,6 +12,8 @@ from speckle3d.io.igtl.messages import packed_image, packed_status, packed_text,
 POSE, VOLUME, ADVICE = "ImageToReference", "Volume_Reference", "SweepAdvice"
 """Devices: pixels of the received images to the first image's mm, as PLUS names it; the growing volume in the
 same; words."""
+_NOT_READY = 13
+"""OpenIGTLink's code of a device that is not ready."""
 _RAS_FROM_LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
 """Files of this package call a world's axes left, posterior, superior: Slicer shows both alike."""
 
@@ -30,8 +32,4 @@ def volume_message(volume: Volume, time_s: float) -> bytes:
 
 def word_messages(words: str, good: bool, time_s: float) -> tuple[bytes, bytes]:
     """STRING with words for the person who holds the probe, and STATUS: code 1 if all is well, else 13."""
-    return packed_text(ADVICE, time_s, words), packed_status(ADVICE, time_s, words, 1 if good else _NOT_GOOD)
-
-
-_NOT_GOOD = 13
-"""OpenIGTLink's code of a device that is not ready."""
+    return packed_text(ADVICE, time_s, words), packed_status(ADVICE, time_s, words, 1 if good else _NOT_READY)

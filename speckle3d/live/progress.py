@@ -1,4 +1,4 @@
-"""How a live session goes, for a line that is looked at."""
+"""Progress of a live session, and the devices that it hears from."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ _MOST_DEVICES = 64
 
 @dataclass
 class Progress:
-    """How a session goes, for a line that is looked at.
+    """Counts, length and remarks of a live session, for a line on the terminal.
 
     Attributes
     ----------
-    recorded, matched, left : int
-        Frames in the file, frames placed, and frames left for later.
+    frames, poses, left : int
+        Frames in the file, frames with a pose, and frames left for later.
     waiting : int
         Frames about to be matched.
     delay_s : float
@@ -29,18 +29,18 @@ class Progress:
     words : str
     volumes : int
         Sent.
-    refused : int
-        Messages that could not be used; `last_refused` says why.
+    refusals : int
+        Messages that could not be used; `last_refusal` says why.
     restarts : int
         How often the sender's clock began anew.
     missing : str
         Which device that was asked for has sent nothing, and which others have.
-    failed : str
+    failure : str
         Why frames are no longer placed, or volumes no longer sent; they are recorded all the same.
     """
 
-    recorded: int = 0
-    matched: int = 0
+    frames: int = 0
+    poses: int = 0
     left: int = 0
     waiting: int = 0
     delay_s: float = 0.0
@@ -48,11 +48,11 @@ class Progress:
     length_sigma: float = float("nan")
     words: str = ""
     volumes: int = 0
-    refused: int = 0
+    refusals: int = 0
     restarts: int = 0
-    last_refused: str = ""
+    last_refusal: str = ""
     missing: str = ""
-    failed: str = ""
+    failure: str = ""
 
     @property
     def length(self) -> str:
@@ -64,14 +64,14 @@ class Progress:
     def line(self) -> str:
         """All of it in one line."""
         parts = [
-            f"{self.recorded} frames",
+            f"{self.frames} frames",
             self.length.replace("±", "+-"),
             f"pose after {1e3 * self.delay_s:.0f} ms",
         ]
         parts += [f"{self.left} left for later"] if self.left else []
         parts += [f"the sender's clock began anew {self.restarts} times"] if self.restarts else []
-        parts += [f"{self.refused} refused ({self.last_refused})"] if self.refused else []
-        return " | ".join(filter(None, (", ".join(parts), self.words, self.missing, self.failed)))
+        parts += [f"{self.refusals} refused ({self.last_refusal})"] if self.refusals else []
+        return " | ".join(filter(None, (", ".join(parts), self.words, self.missing, self.failure)))
 
 
 class Devices:
@@ -84,8 +84,8 @@ class Devices:
     """
 
     def __init__(self, image: str | None, transform: str | None, orientation: str | None) -> None:
-        named = (("IMAGE", image), ("TRANSFORM", transform), ("TRANSFORM", orientation))
-        self._wanted = [(kind, name) for kind, name in named if name is not None]
+        devices = (("IMAGE", image), ("TRANSFORM", transform), ("TRANSFORM", orientation))
+        self._wanted = [(kind, name) for kind, name in devices if name is not None]
         self._heard: set[tuple[str, str]] = set()
 
     def hear(self, message: Received) -> None:

@@ -29,30 +29,22 @@ class Recording:
     Parameters
     ----------
     path : path
-        A new file.
+        A new file; its folder is made.
     layout : ImageLayout
     first_s : float
         The first frame's time on the sender's clock.
     progress : Progress
         Told how many frames are written, what is refused, and how often the sender's clock begins anew.
-    packed : bool
-        Whether frames are compressed.
     """
 
-    def __init__(
-        self, path: Path, layout: ImageLayout, first_s: float, progress: Progress, packed: bool = False
-    ) -> None:
+    def __init__(self, path: Path, layout: ImageLayout, first_s: float, progress: Progress) -> None:
         example = layout.example
         self._progress, self._first_s, self._last_s = progress, first_s, float("-inf")
         self._began_s = self._came_s = time.monotonic()
         self._timeless = False
+        path.parent.mkdir(parents=True, exist_ok=True)
         self._sweep = GrowingSweep(
-            path,
-            example.grid,
-            example.signal,
-            example.frames.dtype,
-            "gzip" if packed else None,
-            probe=example.probe,
+            path, example.grid, example.signal, example.frames.dtype, probe=example.probe
         )
 
     def __enter__(self) -> Self:
@@ -67,7 +59,7 @@ class Recording:
     def keep_frame(self, frame: npt.NDArray[Any], sent_s: float) -> float | None:
         """Write a frame; its time in the sweep, or None if it is not later than the last frame's."""
         now_s = time.monotonic()
-        if self._progress.recorded and sent_s == 0.0:
+        if self._progress.frames and sent_s == 0.0:
             self._timeless = True
         elif sent_s - self._first_s < self._last_s - RESTARTED_S:
             self._first_s = sent_s - (self._last_s + now_s - self._came_s)
@@ -83,7 +75,7 @@ class Recording:
         except InvalidInputError as error:
             self.refuse(error)
             return None
-        self._progress.recorded += 1
+        self._progress.frames += 1
         self._last_s, self._came_s = time_s, now_s
         return time_s
 
@@ -106,5 +98,5 @@ class Recording:
 
     def refuse(self, error: InvalidInputError) -> None:
         """Count a message that cannot be written."""
-        self._progress.refused += 1
-        self._progress.last_refused = str(error)
+        self._progress.refusals += 1
+        self._progress.last_refusal = str(error)

@@ -1,4 +1,4 @@
-"""A live session: received, recorded, tracked and sent on, each in a thread of its own.
+"""A live session: messages are recorded, frames placed, poses and volumes sent, each in its own thread.
 
 What is received is recorded before anything else is done with it. Frames that come while earlier ones are
 still being matched wait, `MOST_WAITING` of them; of more every other one is left for later: they are in the
@@ -13,6 +13,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol, TypeGuard
 
@@ -29,7 +30,7 @@ from speckle3d.core.threads import on_one_thread
 from speckle3d.imaging.voxels.volume import CompoundedVolume
 from speckle3d.io.igtl.messages import ImageReceived, Received, TransformReceived
 from speckle3d.io.import_settings import ImportSettings
-from speckle3d.live.checks import GOOD, LOST, TOO_FAST, Words, words_for
+from speckle3d.live.checks import GOOD, NO_OVERLAP, TOO_FAST, Words, words_for
 from speckle3d.live.crossing import CrossingCheck
 from speckle3d.live.frames import ImageLayout
 from speckle3d.live.outgoing import pose_message, volume_message, word_messages
@@ -63,22 +64,21 @@ class SessionSettings:
         New sweep file for everything that is received.
     image, transform, orientation : str or None
         Devices whose messages count: by default the first image's; no sensor's.
-    imported : ImportSettings
+    importing : ImportSettings
         What IMAGE messages do not say.
     config : Config
-    volume, check, packed : bool
-        Whether to make a growing volume, to give advice, and to compress the recording.
+    volume, check : bool
+        Whether to make a growing volume, and to give advice.
     """
 
     recording: Path
     image: str | None = None
     transform: str | None = None
     orientation: str | None = None
-    imported: ImportSettings = field(default_factory=ImportSettings)
+    importing: ImportSettings = field(default_factory=ImportSettings)
     config: Config = field(default_factory=Config)
     volume: bool = True
     check: bool = False
-    packed: bool = False
 
 
 @dataclass(frozen=True)
@@ -127,7 +127,7 @@ class Session:
         self.tracker: LiveTracker | None = None
         self.voxels: CompoundedVolume | None = None
         self._volume: GrowingVolume | None = None
-        self._layout: ImageLayout | None = None
+        self._centre_mm = np.zeros(3)
         self._queue: deque[_Waiting] = deque()
         self._changed = threading.Condition()
         self._over = threading.Event()
@@ -146,12 +146,10 @@ class Session:
 
     def path(self) -> tuple[FloatArray, FloatArray, RigidTransform]:
         """Times of frames, elevation of the image's centre there, mm, and poses, as they are known now."""
-        tracker, layout = self.tracker, self._layout
-        if tracker is None or layout is None:
-            return np.zeros(0), np.zeros(0), RigidTransform.identity(0)
-        times, poses = np.array([pose.time_s for pose in self.poses]), tracker.poses
-        count, centre_mm = min(len(times), len(poses)), layout.example.grid.centre_mm
-        return times[:count], poses[:count].apply(centre_mm)[:, 2], poses[:count]
+        times = np.array([pose.time_s for pose in self.poses])
+        poses = RigidTransform.identity(0) if self.tracker is None else self.tracker.poses
+        count = min(len(times), len(poses))
+        return times[:count], poses[:count].apply(self._centre_mm)[:, 2], poses[:count]
 
     def run(self, duration_s: float | None = None, show: Callable[[Progress], None] | None = None) -> None:
         """Take messages until ended, for so long at most.
@@ -174,25 +172,23 @@ class Session:
         while layout is None and not self._is_over(until_s):
             for message in self._source.receive(_LOOK_S):
                 self._devices.hear(message)
-                if layout is None and self._is_wanted(message):
-                    layout, first = ImageLayout.of(message, self._settings.imported, message.device), message
+                if layout is None and self._is_image(message):
+                    layout, first = ImageLayout.of(message, self._settings.importing, message.device), message
                 if layout is not None or isinstance(message, TransformReceived):
                     waiting.append(message)
                 if layout is None and len(waiting) > MOST_BEFORE:
                     waiting.popleft()
-            self._shown(show)
+            self._report(show)
         if layout is None or first is None:
             return
         with (
             self._tracking(layout),
-            Recording(
-                self._settings.recording, layout, first.time_s, self.progress, self._settings.packed
-            ) as recording,
+            Recording(self._settings.recording, layout, first.time_s, self.progress) as recording,
         ):
             self._take_all(waiting, recording, layout)
             while not self._is_over(until_s):
                 self._take_all(self._source.receive(_LOOK_S), recording, layout)
-                self._shown(show)
+                self._report(show)
             # What has come and waits for the disk is part of the sweep, too.
             self._take_all(self._source.receive(0.0), recording, layout)
 
@@ -200,17 +196,17 @@ class Session:
         late = until_s is not None and time.monotonic() >= until_s
         return self._over.is_set() or late
 
-    def _shown(self, show: Callable[[Progress], None] | None) -> None:
+    def _report(self, show: Callable[[Progress], None] | None) -> None:
         self.progress.missing = self._devices.missing
         if show:
             show(self.progress)
 
-    def _is_wanted(self, message: Received) -> TypeGuard[ImageReceived]:
+    def _is_image(self, message: Received) -> TypeGuard[ImageReceived]:
         return isinstance(message, ImageReceived) and self._settings.image in (None, message.device)
 
-    def _take_all(self, received: Sequence[Received], recording: Recording, layout: ImageLayout) -> None:
+    def _take_all(self, messages: Sequence[Received], recording: Recording, layout: ImageLayout) -> None:
         """Record messages, and have frames matched."""
-        for message in received:
+        for message in messages:
             self._devices.hear(message)
             if isinstance(message, ImageReceived) and message.device == layout.device:
                 self._take_image(message, recording, layout)
@@ -231,28 +227,28 @@ class Session:
         if time_s is None:
             return
         with self._changed:
-            self._queue.append(_Waiting(self.progress.recorded, frame, time_s, image.time_s, came_s))
+            self._queue.append(_Waiting(self.progress.frames, frame, time_s, image.time_s, came_s))
             if len(self._queue) > MOST_WAITING:
                 # Every other one, so that those that are left out leave no gap that speckle does not cross.
-                thinned = list(self._queue)[::-2][::-1]
-                self.progress.left += len(self._queue) - len(thinned)
-                self._queue = deque(thinned)
+                count = len(self._queue)
+                self._queue = deque(list(self._queue)[::-2][::-1])
+                self.progress.left += count - len(self._queue)
             self.progress.waiting = len(self._queue)
             self._changed.notify()
 
     @contextmanager
     def _tracking(self, layout: ImageLayout) -> Iterator[None]:
         """Match frames and make volumes in threads that end with the block."""
-        self._layout = layout
-        settings = self._settings
-        work = {"placing": self._match}
-        with LiveTracker(layout.example, self._curves, settings.config, images=self._keep) as self.tracker:
-            self._volume = GrowingVolume(self.tracker.image_grid)
-            work |= {"volumes": self._send_volumes} if settings.volume else {}
-            work |= {"crossing check": self._look_for_crossing} if self._crossing is not None else {}
-            threads = [
-                threading.Thread(target=self._guarded, args=task, daemon=True) for task in work.items()
-            ]
+        self._centre_mm = layout.example.grid.centre_mm
+        with LiveTracker(layout.example, self._curves, self._settings.config) as tracker:
+            volume = GrowingVolume(tracker.image_grid)
+            self.tracker, self._volume, tracker.images = tracker, volume, volume.keep
+            work = {"placing": partial(self._match, tracker, layout.image_from_pixel)}
+            if self._settings.volume:
+                work["volumes"] = partial(self._send_volumes, tracker, volume)
+            if self._crossing is not None:
+                work["crossing check"] = partial(self._crossing.keep_looking, tracker, volume, self._over)
+            threads = [threading.Thread(target=self._do, args=task, daemon=True) for task in work.items()]
             for thread in threads:
                 thread.start()
             try:
@@ -264,24 +260,17 @@ class Session:
                 for thread in threads:
                     thread.join()
 
-    def _guarded(self, name: str, work: Callable[[], None]) -> None:
+    def _do(self, name: str, work: Callable[[], None]) -> None:
         """Do work of a thread; an error ends this work alone, since what is received must be recorded."""
         try:
             work()
         except Exception as error:  # noqa: BLE001 (told in the line, and kept for who runs the session)
             self.failure = error
-            said = str(error) if isinstance(error, Speckle3DError) else repr(error)
-            self.progress.failed = f"{name} ended, recording goes on: {said}"
+            reason = str(error) if isinstance(error, Speckle3DError) else repr(error)
+            self.progress.failure = f"{name} ended, recording goes on: {reason}"
 
-    def _keep(self, frame: int, intensity: Float32Array) -> None:
-        if self._volume is not None:
-            self._volume.keep(frame, intensity)
-
-    def _match(self) -> None:
-        """Place frames as they come, and say so."""
-        assert self._layout is not None
-        assert self.tracker is not None
-        image_from_pixel, centre_mm = self._layout.image_from_pixel, self._layout.example.grid.centre_mm
+    def _match(self, tracker: LiveTracker, image_from_pixel: FloatArray) -> None:
+        """Place frames as they come, and send their poses."""
         before = 0
         while True:
             with self._changed:
@@ -290,52 +279,43 @@ class Session:
                     return
                 waiting = self._queue.popleft()
                 self.progress.waiting = len(self._queue)
-            self.tracker.hurried = bool(self._queue)
-            pose = self.tracker.append(waiting.frame, waiting.time_s)
+            tracker.hurry = bool(self._queue)
+            pose = tracker.append(waiting.frame, waiting.time_s)
             self._send(pose_message(pose.world_from_image, image_from_pixel, waiting.sent_s))
             self.poses.append(pose)
             self._sent_s = waiting.sent_s
-            self.progress.matched += 1
+            self.progress.poses += 1
             self.progress.delay_s = time.monotonic() - waiting.came_s
-            self.progress.length_sigma = self.tracker.length_sigma
-            self.progress.length_mm = float(
-                pose.world_from_image.apply(centre_mm)[2] - self.poses[0].world_from_image.apply(centre_mm)[2]
-            )
+            self.progress.length_sigma = tracker.length_sigma
+            first, last = (end.world_from_image.apply(self._centre_mm)[2] for end in (self.poses[0], pose))
+            self.progress.length_mm = float(last - first)
             if self._settings.check:
                 self._advise(pose, waiting.sent_s, waiting.number - before > 1)
             before = waiting.number
 
     def _advise(self, pose: LivePose, sent_s: float, after_gap: bool) -> None:
         words = words_for(pose, self._settings.config.trajectory)
-        if after_gap and words in (TOO_FAST, LOST):
+        if after_gap and words in (TOO_FAST, NO_OVERLAP):
             # Frames between were left for later: the gap is none of the person's.
             return
         if words == GOOD and self._crossing is not None:
             words = self._crossing.words
         if self._words.take(words, pose.time_s):
-            self.progress.words = self._words.said
-            for message in word_messages(self._words.said, self._words.said == GOOD, sent_s):
+            self.progress.words = self._words.text
+            for message in word_messages(self._words.text, self._words.text == GOOD, sent_s):
                 self._send(message)
 
-    def _send_volumes(self) -> None:
+    def _send_volumes(self, tracker: LiveTracker, volume: GrowingVolume) -> None:
         """Send the volume about once a second."""
-        assert self._volume is not None
-        assert self.tracker is not None
-        drawn = 0
+        frames = 1
         while not self._over.wait(VOLUME_EVERY_S):
-            poses = self.tracker.poses
-            if len(poses) > max(drawn, 1):
-                drawn = len(poses)
+            poses = tracker.poses
+            if len(poses) > frames:
+                frames = len(poses)
                 with on_one_thread():
-                    self.voxels = self._volume.compounded(poses)
+                    self.voxels = volume.compound(poses)
                     self._send(volume_message(self.voxels, self._sent_s))
                 self.progress.volumes += 1
-
-    def _look_for_crossing(self) -> None:
-        assert self._crossing is not None
-        assert self._volume is not None
-        assert self.tracker is not None
-        self._crossing.keep_looking(self.tracker, self._volume, self._over)
 
     def _send(self, message: bytes) -> None:
         for send in self._outlets:

@@ -95,16 +95,14 @@ class LiveTracker:
     config : Config, optional
     background : bool
         Revise in a thread of its own, as fast as it can; false: now and then, with the frame that has come.
-    images : callable, optional
-        Called with every frame's intensity image.
 
     Attributes
     ----------
     image_grid : ImageGrid
         Of the intensity images.
     images : callable or None
-        As given; may be set before the first frame.
-    hurried : bool
+        Called with every frame's intensity image, if set before the first frame.
+    hurry : bool
         Set while frames wait to be matched: what is revised in the background waits, but not for ever.
 
     Raises
@@ -119,27 +117,25 @@ class LiveTracker:
         curves: DecorrelationCurves,
         config: Config | None = None,
         background: bool = True,
-        images: ImageSink | None = None,
     ) -> None:
-        self.images = images
+        self.images: ImageSink | None = None
         self._config = c = config or Config()
         matcher = FrameMatcher(example, c, curves)
         self.image_grid = matcher.grid
         self._example, self._matcher = example, matcher
         self._overlay = Overlay()
-        self._matched = FrameByFrame(matcher, PairSchedule(self._config.trajectory))
-        read = curves, matcher.patches, matcher.centre_mm, 1
-        self._problem = MotionProblem(*read, c.planes, c.trajectory)
+        self._matching = FrameByFrame(matcher, PairSchedule(self._config.trajectory))
+        self._problem = MotionProblem(curves, matcher.patches, matcher.centre_mm, 1, c.planes, c.trajectory)
         self._texture = Texture(matcher)
         self._features: list[FrameFeatures] = []
         self._tables: list[CorrelationTable] = []
         self._flags = np.zeros(0, dtype=np.int64)
         self._poses = RigidTransform.identity(0)
         self._motion: Motion | None = None
-        self._lock, self._grown = threading.Lock(), threading.Condition()
-        self._ended = False
+        self._lock, self._growth = threading.Lock(), threading.Condition()
+        self._end = False
         self._failure: Exception | None = None
-        self.hurried = False
+        self.hurry = False
         self._thread: threading.Thread | None = None
         if background:
             self._thread = threading.Thread(target=self._keep_revising, name="revising", daemon=True)
@@ -182,9 +178,9 @@ class LiveTracker:
 
     def close(self) -> None:
         """End the thread that revises."""
-        with self._grown:
-            self._ended = True
-            self._grown.notify_all()
+        with self._growth:
+            self._end = True
+            self._growth.notify_all()
         if self._thread is not None:
             self._thread.join()
 
@@ -209,14 +205,15 @@ class LiveTracker:
             self._matcher.leave_out(self._overlay)
             if isinstance(self._example.signal, BModeSettings):
                 self._texture.keep(number, frame, ready)
-        table = self._matched.advance(number, ready.frame)
+        table = self._matching.advance(number, ready.frame)
         with self._lock:
             self._keep(ready.features, table)
             self._place()
-        if self._thread is None or len(self) <= ANEW:
-            self._revise_now()
-        with self._grown:
-            self._grown.notify_all()
+        # Without another thread now and then.
+        if len(self) <= ANEW or (self._thread is None and len(self) % EVERY == 0):
+            self._revise(LATEST)
+        with self._growth:
+            self._growth.notify_all()
         best = float(table.median.max(initial=-np.inf))
         before = table.median[table.first == number - 1]
         with self._lock:
@@ -259,8 +256,8 @@ class LiveTracker:
         problem, before = replace(motion.problem, frames=frames.size), self._poses[frames[:-1]]
         rows = alike_pairs(problem, table)
         models = motion.coherence.models(np.full(rows.size, LAST))
-        pairs, determined = pair_planes(problem, table, rows, models)
-        pairs = pairs[determined].scaled(motion.coherence.scale)
+        pairs, has_plane = pair_planes(problem, table, rows, models)
+        pairs = pairs[has_plane].scaled(motion.coherence.scale)
         if not len(pairs):
             return
         earlier = elevation_of(before, problem.centre_mm)[:, :2]
@@ -270,15 +267,9 @@ class LiveTracker:
         # Earlier frames stay: every edge then starts at the first of them.
         centre, start = RigidTransform.from_translation(problem.centre_mm), np.zeros_like(edges.first)
         relative = centre.inv() * before[0].inv() * before[edges.first] * centre * edges.poses
-        both = RelativePoses(start, start + 1, relative, edges.covariance)
-        placed = solve_trajectory(both, 2, problem.centre_mm, problem.trajectory.huber).poses
-        self._poses = RigidTransform.concatenate([self._poses[:-1], before[0] * placed[-1:]])
-
-    def _revise_now(self) -> None:
-        """Revise if it is time to, without help of another thread."""
-        frames = len(self)
-        if frames <= ANEW or frames % EVERY == 0:
-            self._revise(LATEST)
+        star = RelativePoses(start, start + 1, relative, edges.covariance)
+        solution = solve_trajectory(star, 2, problem.centre_mm, problem.trajectory.huber)
+        self._poses = RigidTransform.concatenate([self._poses[:-1], before[0] * solution.poses[-1:]])
 
     def _revise(self, latest: int) -> None:
         """Estimate the motion of the latest frames anew; later frames go along with the last of them."""
@@ -307,32 +298,32 @@ class LiveTracker:
             poses = mirrored(poses)
         with self._lock:
             anchor, last = self._poses[begin + stay], self._poses[count - 1]
-            revised = anchor * poses[stay].inv() * poses[stay:] if stay else before[begin] * poses
-            parts = [self._poses[: begin + stay], revised]
+            poses = anchor * poses[stay].inv() * poses[stay:] if stay else before[begin] * poses
+            parts = [self._poses[: begin + stay], poses]
             if count < len(self._poses):
-                parts.append(revised[-1] * last.inv() * self._poses[count:])
+                parts.append(poses[-1] * last.inv() * self._poses[count:])
             self._poses, self._motion = RigidTransform.concatenate(parts), motion
 
     def _keep_revising(self) -> None:
         """Revise as often as there are new frames, on this thread alone: matching needs the others."""
         try:
             with on_one_thread():
-                seen = 0
-                while self._awaited(seen):
-                    seen = len(self)
+                frames = 0
+                while self._wait_for_more(frames):
+                    frames = len(self)
                     self._revise(LATEST)
         except Exception as error:  # noqa: BLE001 (raised with the next frame)
             self._failure = error
 
-    def _awaited(self, frames: int) -> bool:
+    def _wait_for_more(self, frames: int) -> bool:
         """Wait for more frames; false at the end."""
-        with self._grown:
-            self._grown.wait_for(lambda: self._ended or len(self) > max(frames, ANEW))
-            self._grown.wait_for(lambda: self._ended or not self.hurried, LONGEST_HURRY_S)
-            return not self._ended
+        with self._growth:
+            self._growth.wait_for(lambda: self._end or len(self) > max(frames, ANEW))
+            self._growth.wait_for(lambda: self._end or not self.hurry, LONGEST_HURRY_S)
+            return not self._end
 
 
-def _against(poses: RigidTransform, others: RigidTransform, centre_mm: FloatArray) -> bool:
+def _against(poses: RigidTransform, before: RigidTransform, centre_mm: FloatArray) -> bool:
     """Whether two trajectories of the same frames go opposite ways along the image's normal."""
-    steps = [(path[:-1].inv() * path[1:]).apply(centre_mm)[:, 2] - centre_mm[2] for path in (poses, others)]
+    steps = [(path[:-1].inv() * path[1:]).apply(centre_mm)[:, 2] - centre_mm[2] for path in (poses, before)]
     return bool(steps[0] @ steps[1] < 0)

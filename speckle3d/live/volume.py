@@ -60,13 +60,13 @@ class GrowingVolume:
         """Grey levels of the latest frame's small image, shape (vector, sample); None before the first."""
         return None if self._latest is None else grey_levels(self._latest[None])[0]
 
-    def kept(self) -> tuple[IntArray, Float16Array]:
+    def images(self) -> tuple[IntArray, Float16Array]:
         """Numbers of the frames whose images are kept, and these, dB, shape (n, vector, sample)."""
         with self._lock:
             numbers = np.array(sorted(self._images), dtype=np.int64)
             return numbers, np.stack([self._images[k] for k in numbers.tolist()])
 
-    def compounded(self, poses: RigidTransform) -> CompoundedVolume:
+    def compound(self, poses: RigidTransform) -> CompoundedVolume:
         """Make a volume of grey levels, as coarse as its size asks for.
 
         Parameters
@@ -74,11 +74,11 @@ class GrowingVolume:
         poses : RigidTransform
             ``world_from_image`` of all frames that were kept, and perhaps others.
         """
-        numbers, images = self.kept()
-        placed = numbers < len(poses)
-        at = poses[numbers[placed]]
+        numbers, images = self.images()
+        has_pose = numbers < len(poses)
+        at = poses[numbers[has_pose]]
         voxel_mm = max(spacing_within(self.grid, at, VOXELS_GB), self.grid.vector_pitch_mm)
-        return compound(grey_levels(images[placed]), self.grid, at, voxel_mm, voxel_type="uint8")
+        return compound(grey_levels(images[has_pose]), self.grid, at, voxel_mm, voxel_type="uint8")
 
 
 def grey_levels(images: Float16Array) -> Float32Array:

@@ -1,4 +1,4 @@
-"""Everything that placing a frame needs loaded before the first one comes: kernels take seconds to load."""
+"""Load what placing a frame needs before the first one comes: kernels take seconds to load."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from speckle3d.live.tracking import ANEW, EVERY, LiveTracker
 from speckle3d.live.volume import GrowingVolume
 
 _WIDE_MM, _DEEP_MM = 12.0, 12.0
-_KEPT = 0.97
+_CORRELATION = 0.97
 """Correlation of the amplitude from frame to frame."""
 _BMODE_SPACING_MM = 0.1
 
@@ -27,7 +27,7 @@ def warm_up(curves: DecorrelationCurves, config: Config) -> None:
     depth_mm = float(curves.depth_mm[0]) + _DEEP_MM
     grid = ImageGrid(round(_WIDE_MM / pitch_mm), round(depth_mm / spacing_mm), pitch_mm, spacing_mm)
     noise = np.random.default_rng(0).normal(size=(max(ANEW, EVERY) + 4, grid.vectors, grid.samples))
-    changing = lfilter([np.sqrt(1 - _KEPT**2)], [1, -_KEPT], noise, axis=0)
+    changing = lfilter([np.sqrt(1 - _CORRELATION**2)], [1, -_CORRELATION], noise, axis=0)
     field = changing + np.roll(changing, 1, axis=1)
     frames = (2000 * field).astype(np.int16) if of_rf else np.clip(128 + 40 * field, 0, 255).astype(np.uint8)
     times_s = np.arange(float(len(frames)))
@@ -41,4 +41,4 @@ def warm_up(curves: DecorrelationCurves, config: Config) -> None:
     tracker.images = volume.keep
     for frame, time_s in zip(frames, sweep.frame_time_s.tolist(), strict=True):
         tracker.append(frame, time_s)
-    volume.compounded(tracker.poses)
+    volume.compound(tracker.poses)

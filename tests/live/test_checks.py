@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from speckle3d.live.checks import GOOD, LIFTED, LOST, SEEN_S, STAYS_S, TOO_FAST, Words, words_for
+from speckle3d.live.checks import GOOD, NO_CONTACT, NO_OVERLAP, SEEN_S, STAYS_S, TOO_FAST, Words, words_for
 from speckle3d.matching.quality import FrameFlag
 from speckle3d.matching.schedule import TrajectorySettings
 
@@ -18,8 +18,8 @@ SETTINGS = TrajectorySettings()
         (0, 0.9, GOOD),
         (0, np.nan, GOOD),
         (0, SETTINGS.clear_correlation - 0.01, TOO_FAST),
-        (FrameFlag.UNMATCHED, 0.1, LOST),
-        (FrameFlag.LIFTED | FrameFlag.UNMATCHED, 0.0, LIFTED),
+        (FrameFlag.UNMATCHED, 0.1, NO_OVERLAP),
+        (FrameFlag.LIFTED | FrameFlag.UNMATCHED, 0.0, NO_CONTACT),
         (FrameFlag.SATURATED, 0.9, "gain too high"),
     ],
 )
@@ -28,12 +28,12 @@ def test_a_frame_is_told_by_what_the_reconstruction_asks_of_it(flags, median, wo
 
 
 def test_words_come_when_they_are_so_for_a_while_and_stay_to_be_read():
-    words, said = Words(), []
+    words, changes = Words(), []
     for k in range(100):
         # One frame too fast, then two seconds of it, then good.
-        now = TOO_FAST if k == 5 or 20 <= k < 70 else GOOD
-        if words.take(now, k / 25):
-            said.append((words.said, k / 25))
-    assert [each for each, _ in said] == [TOO_FAST, GOOD]
-    assert said[0][1] == pytest.approx(20 / 25 + SEEN_S, abs=0.05)
-    assert said[1][1] >= said[0][1] + STAYS_S
+        latest = TOO_FAST if k == 5 or 20 <= k < 70 else GOOD
+        if words.take(latest, k / 25):
+            changes.append((words.text, k / 25))
+    assert [text for text, _ in changes] == [TOO_FAST, GOOD]
+    assert changes[0][1] == pytest.approx(20 / 25 + SEEN_S, abs=0.05)
+    assert changes[1][1] >= changes[0][1] + STAYS_S

@@ -16,26 +16,26 @@ from speckle3d.live.recording import Recording
 
 
 @pytest.fixture
-def kept(tmp_path, monkeypatch):
+def record(tmp_path, monkeypatch):
     """Records frames that come at some times here, with some times of the sender's; the sweep's times."""
 
-    def keep(here_s, sent_s):
+    def times_of(here_s, sent_s):
         frame = np.ones((4, 8), dtype=np.int16)
         grid = ImageGrid(4, 8, 0.3, RF.sample_spacing_mm)
         example = Sweep(frame[None], grid, RF, np.zeros(1))
         layout, progress = ImageLayout("Image", example, True), Progress()
         clock = iter([here_s[0], *here_s])
         monkeypatch.setattr(recording, "time", SimpleNamespace(monotonic=lambda: next(clock)))
-        with Recording(tmp_path / "sweep.h5", layout, sent_s[0], progress) as made:
-            for sent in sent_s:
-                made.keep_frame(frame, sent)
+        with Recording(tmp_path / "sweep.h5", layout, sent_s[0], progress) as growing:
+            for time_s in sent_s:
+                growing.keep_frame(frame, time_s)
         return s3.load_sweep(tmp_path / "sweep.h5").frame_time_s, progress
 
-    return keep
+    return times_of
 
 
 @pytest.mark.parametrize(
-    ("here_s", "sent_s", "expected_s", "restarts", "refused"),
+    ("here_s", "sent_s", "expected_s", "restarts", "refusals"),
     [
         ([0.0, 0.3, 0.31], [50.0, 50.04, 50.08], [0.0, 0.04, 0.08], 0, 0),
         ([0.0, 0.04, 2.0, 2.04], [50.0, 50.04, 3.0, 3.04], [0.0, 0.04, 2.0, 2.04], 1, 0),
@@ -44,7 +44,7 @@ def kept(tmp_path, monkeypatch):
     ],
     ids=["the sender's", "a clock that begins anew", "messages without a time", "a little before the last"],
 )
-def test_times_are_the_senders_or_what_passed_here(kept, here_s, sent_s, expected_s, restarts, refused):
-    times, counts = kept(here_s, sent_s)
+def test_times_are_the_senders_or_what_passed_here(record, here_s, sent_s, expected_s, restarts, refusals):
+    times, counts = record(here_s, sent_s)
     np.testing.assert_allclose(times, expected_s, atol=1e-9)
-    assert (counts.restarts, counts.refused) == (restarts, refused)
+    assert (counts.restarts, counts.refusals) == (restarts, refusals)

@@ -9,7 +9,7 @@ from scipy.spatial.transform import RigidTransform
 
 import speckle3d as s3
 from speckle3d.io.igtl.messages import ImageReceived, TransformReceived
-from speckle3d.io.import_settings import ImportSettings
+from speckle3d.io.import_settings import ImportSettings, MissingSettingsError
 from speckle3d.live.frames import ImageLayout
 from speckle3d.live.outgoing import ADVICE, POSE, VOLUME, pose_message
 from speckle3d.live.session import Session, SessionSettings
@@ -33,113 +33,119 @@ def reading(time_s, device="ProbeToReference"):
 
 
 class Messages:
-    """Some messages at a time, then silence until the session has done what is waited for."""
+    """Some messages at a time, then silence until the session's progress meets a condition."""
 
-    def __init__(self, batches, done):
-        self.batches, self.done, self.session = list(batches), done, None
-        self.until_s = time.monotonic() + 60
+    def __init__(self, batches, until):
+        self.batches, self.until, self.session = list(batches), until, None
+        self.until_s = time.monotonic() + 300
 
     def receive(self, timeout_s):
         if self.batches and self.session.progress.waiting < 3:
             return self.batches.pop(0)
         time.sleep(0.005)
-        if self.done(self.session.progress) or time.monotonic() > self.until_s:
+        if self.until(self.session.progress) or time.monotonic() > self.until_s:
             self.session.end()
         return []
 
 
-def run(batches, done, curves, folder, **settings):
+def run(batches, until, curves, folder, **options):
     """The session after its end, and the messages that it sent."""
-    sent, messages = [], Messages(batches, done)
-    known = SessionSettings(folder / "sweep.h5", imported=RF, **{"volume": False, **settings})
-    messages.session = Session(messages, [sent.append], curves, known)
+    outbox, messages = [], Messages(batches, until)
+    settings = SessionSettings(folder / "out" / "sweep.h5", **{"importing": RF, "volume": False, **options})
+    messages.session = Session(messages, [outbox.append], curves, settings)
     messages.session.run()
-    return messages.session, [decode_whole(each) for each in sent]
+    return messages.session, [decode_whole(message) for message in outbox]
 
 
 @pytest.fixture(scope="module")
-def recorded(data_folder):
+def example(data_folder):
     sweep = s3.load_sweep(data_folder / "phantom.h5")
     return [sweep.frames[k] for k in range(14)], s3.load_curves(data_folder / "curves.h5")
 
 
-def test_what_is_received_is_recorded_placed_and_sent_on(recorded, tmp_path):
-    frames, curves = recorded
+def test_what_is_received_is_recorded_placed_and_sent_on(example, tmp_path):
+    frames, curves = example
     batches = [[reading(9.96), reading(9.98)]]
     batches += [[image(frame, 10.0 + k / 25), reading(10.02 + k / 25)] for k, frame in enumerate(frames)]
     batches += [[reading(11.0, "StylusToReference")]]
-    session, sent = run(batches, lambda p: p.matched == 14, curves, tmp_path, transform="ProbeToReference")
-    assert (session.progress.recorded, session.progress.left) == (14, 0)
-    poses = [each for each in sent if each.device == POSE]
-    assert [each.time_s for each in poses] == pytest.approx([10.0 + k / 25 for k in range(14)], abs=1e-6)
-    kept = s3.load_sweep(tmp_path / "sweep.h5")
-    np.testing.assert_array_equal(kept.frames[13], frames[13])
-    assert kept.frame_time_s == pytest.approx(np.arange(14) / 25)
+    session, messages = run(batches, lambda p: p.poses == 14, curves, tmp_path, transform="ProbeToReference")
+    assert (session.progress.frames, session.progress.left) == (14, 0)
+    poses = [message for message in messages if message.device == POSE]
+    assert [pose.time_s for pose in poses] == pytest.approx([10.0 + k / 25 for k in range(14)], abs=1e-6)
+    sweep = s3.load_sweep(tmp_path / "out" / "sweep.h5")
+    np.testing.assert_array_equal(sweep.frames[13], frames[13])
+    assert sweep.frame_time_s == pytest.approx(np.arange(14) / 25)
     # Readings before the first frame are there, and another tool's are not.
-    assert kept.tracker.readings.time_s[0] == pytest.approx(-0.04)
-    assert len(kept.tracker.readings) == 16
-    assert kept.tracker.covers(kept.frame_time_s).all()
+    assert sweep.tracker.readings.time_s[0] == pytest.approx(-0.04)
+    assert len(sweep.tracker.readings) == 16
+    assert sweep.tracker.covers(sweep.frame_time_s).all()
 
 
-def test_messages_that_make_no_sweep_are_counted_and_cost_nothing_else(recorded, tmp_path):
-    frames, curves = recorded
-    good = [image(frame, 1.0 + k / 25) for k, frame in enumerate(frames[:4])]
+def test_messages_that_make_no_sweep_are_counted_and_cost_nothing_else(example, tmp_path):
+    frames, curves = example
+    usable = [image(frame, 1.0 + k / 25) for k, frame in enumerate(frames[:4])]
     late, small = image(frames[1], 0.5), image(frames[0][:, :700], 2.0)
-    sheared = TransformReceived("ProbeToReference", 1.2, np.diag([1.0, 1.0, 3.0, 1.0]), True)
+    shear = TransformReceived("ProbeToReference", 1.2, np.diag([1.0, 1.0, 3.0, 1.0]), True)
     session, _ = run(
-        [[*good, late, small, sheared, image(frames[4], 3.0)]],
-        lambda p: p.matched == 5,
+        [[*usable, late, small, shear, image(frames[4], 3.0)]],
+        lambda p: p.poses == 5,
         curves,
         tmp_path,
         transform="ProbeToReference",
     )
-    assert (session.progress.recorded, session.progress.refused) == (5, 3)
-    assert "rigid" in session.progress.last_refused
-    assert len(s3.load_sweep(tmp_path / "sweep.h5")) == 5
+    assert (session.progress.frames, session.progress.refusals) == (5, 3)
+    assert "rigid" in session.progress.last_refusal
+    assert len(s3.load_sweep(tmp_path / "out" / "sweep.h5")) == 5
 
 
 @pytest.mark.slow
-def test_words_and_a_volume_go_out(recorded, tmp_path, monkeypatch):
-    frames, curves = recorded
+def test_words_and_a_volume_go_out(example, tmp_path, monkeypatch):
+    frames, curves = example
     monkeypatch.setattr("speckle3d.live.session.VOLUME_EVERY_S", 0.05)
     noise = np.random.default_rng(0).integers(-20, 20, frames[0].shape).astype(np.int16)
     batches = [[image(frame, float(k))] for k, frame in enumerate([*frames[:9], *[noise] * 3])]
-    _, sent = run(
+    _, messages = run(
         batches,
-        lambda p: p.matched == 12 and p.volumes > 0,
+        lambda p: p.poses == 12 and p.volumes > 0,
         curves,
         tmp_path,
         volume=True,
         check=True,
     )
-    words = {each.type for each in sent if each.device == ADVICE}
+    words = {message.type for message in messages if message.device == ADVICE}
     assert words >= {"STRING lifted"} or words >= {"STRING no speckle"}
-    volumes = [each for each in sent if each.device == VOLUME]
+    volumes = [message for message in messages if message.device == VOLUME]
     assert volumes[-1].pixels.ndim == 3
     assert volumes[-1].pixels.max() > 100
 
 
-def test_when_placing_fails_recording_goes_on(recorded, tmp_path, monkeypatch):
-    frames, curves = recorded
+def test_when_placing_fails_recording_goes_on(example, tmp_path, monkeypatch):
+    frames, curves = example
 
     def failing(*_):
         raise np.linalg.LinAlgError("singular")
 
     monkeypatch.setattr("speckle3d.live.session.LiveTracker.append", failing)
-    first, *rest = [image(frame, k / 25) for k, frame in enumerate(frames)]
-    session, _ = run([[first], rest], lambda p: p.recorded == 14 and p.failed, curves, tmp_path)
+    images = [image(frame, k / 25) for k, frame in enumerate(frames)]
+    session, _ = run([images[:1], images[1:]], lambda p: p.frames == 14 and p.failure, curves, tmp_path)
     assert isinstance(session.failure, np.linalg.LinAlgError)
     assert "placing ended, recording goes on: LinAlgError('singular')" in session.progress.line
-    assert len(s3.load_sweep(tmp_path / "sweep.h5")) == 14
+    assert len(s3.load_sweep(tmp_path / "out" / "sweep.h5")) == 14
 
 
-def test_a_pose_takes_pixels_to_slicers_axes(recorded):
-    frames, _ = recorded
+def test_a_pose_takes_pixels_to_slicers_axes(example):
+    frames, _ = example
     layout = ImageLayout.of(image(frames[0], 0.0), RF, "sweep")
     world = RigidTransform.from_translation([1.0, 2.0, 3.0])
-    packed = pose_message(world, layout.image_from_pixel, 5.0)
-    found = decode_whole(packed)
+    message = decode_whole(pose_message(world, layout.image_from_pixel, 5.0))
     # Sample 100 of vector 10: 3 mm along x and 1.155 mm deep in the image; x and y are reversed in RAS.
-    at = found.matrix @ [100, 10, 0, 1]
+    at = message.matrix @ [100, 10, 0, 1]
     assert at[:3] == pytest.approx([-(1.0 + 3.0), -(2.0 + 1.155), 3.0], abs=1e-4)
-    assert np.linalg.det(found.matrix[:3, :3]) > 0
+    assert np.linalg.det(message.matrix[:3, :3]) > 0
+
+
+def test_images_that_say_too_little_leave_no_folder(example, tmp_path):
+    frames, curves = example
+    with pytest.raises(MissingSettingsError, match="--sampling-rate-hz"):
+        run([[image(frames[0], 0.0)]], lambda _: False, curves, tmp_path, importing=ImportSettings())
+    assert not (tmp_path / "out").exists()

@@ -143,12 +143,11 @@ def live(
     if match is None or not 0 < int(match[2]) < 2**16:
         raise InvalidInputError(f"expected HOST:PORT, as localhost:18944, got {server!r}")
     config, curves = load_settings(config_file).with_choices(region=region), read_curves(curves_file)
-    recorded = out / "sweep.h5"
-    if recorded.exists():
-        raise InvalidInputError(f"{recorded}: there already; expected a folder without a recorded sweep")
+    recording = out / "sweep.h5"
+    if recording.exists():
+        raise InvalidInputError(f"{recording}: there already; expected a folder without a recorded sweep")
     require_own(out, RESULTS)
-    out.mkdir(parents=True, exist_ok=True)
-    settings = SessionSettings(recorded, image, transform, orientation, imported, config, volume, check)
+    settings = SessionSettings(recording, image, transform, orientation, imported, config, volume, check)
     note("loading")
     warm_up(curves, config)
     first = None
@@ -171,15 +170,15 @@ def live(
         _run(session, duration_s, connection, server)
         done = session.progress
         ends.append(f"the sweep has ended; reconstructing it into {out} ...")
-        if not done.recorded:
+        if not done.frames:
             reasons = filter(None, (done.missing, _trouble(connection.state, server)))
             raise InvalidInputError(f"{server}: no images came: {'; '.join(reasons) or 'none was sent'}")
         links.close()
-        note(f"{done.recorded} frames in {recorded}, {done.matched} placed as they came")
+        note(f"{done.frames} frames in {recording}, {done.poses} placed as they came")
         if done.missing:
             note(done.missing)
         reconstruct(
-            recorded,
+            recording,
             out,
             curves_file,
             drift,
@@ -215,34 +214,36 @@ def _run(session: Session, duration_s: float | None, connection: Connection, nam
     terminal; a log has it now and then, and when there is something else to say.
     """
     from rich.console import Console
+    from rich.live import Live
     from rich.text import Text
 
-    heard, console, logged = list[int](), Console(stderr=True), (-_LOG_EVERY_S, "")
+    signals, console, last_note = list[int](), Console(stderr=True), (-_LOG_EVERY_S, "")
 
     def show(progress: Progress) -> None:
-        nonlocal logged
+        nonlocal last_note
         state, now = connection.state, time.monotonic()
         trouble = _trouble(state, name)
         text = " | ".join(filter(None, (progress.line, trouble)))
+        # A status of rich's would wrap where the terminal is narrow.
         line.update(Text(printable(text), no_wrap=True, overflow="ellipsis"))
-        if not console.is_terminal and (progress.words != logged[1] or now - logged[0] > _LOG_EVERY_S):
+        if not console.is_terminal and (progress.words != last_note[1] or now - last_note[0] > _LOG_EVERY_S):
             note(text)
-            logged = now, progress.words
-        if progress.recorded and not state.peers and state.silent_s > _LEFT_S:
+            last_note = now, progress.words
+        if progress.frames and not state.peers and state.silent_s > _LEFT_S:
             note(f"{trouble}: taken for the end of the sweep")
             session.end()
 
     def end(number: int, _frame: FrameType | None) -> None:
-        heard.append(number)
+        signals.append(number)
         session.end()
 
     interval_s = sys.getswitchinterval()
     sys.setswitchinterval(_SWITCH_S)
-    with handled(end, *ENDS), console.status("") as line:
+    with handled(end, *ENDS), Live(console=console, transient=True) as line:
         try:
             session.run(duration_s, show)
         finally:
             sys.setswitchinterval(interval_s)
-    for number in heard:
+    for number in signals:
         if number != signal.SIGINT:
             signal.raise_signal(number)
