@@ -45,6 +45,5 @@ def view(path: PathLike, reconstruction: PathLike | None = None, sweep: PathLike
     from speckle3d.app.look import in_notebook
     from speckle3d.app.opened import pages_of
 
-    beside = {"reconstruction": reconstruction, "sweep": sweep}
-    given = {name: Path(each) for name, each in beside.items() if each is not None}
-    return in_notebook(pages_of(Path(path), given.get("reconstruction"), given.get("sweep")))
+    files = [None if file is None else Path(file) for file in (reconstruction, sweep)]
+    return in_notebook(pages_of(Path(path), files[0], files[1]))

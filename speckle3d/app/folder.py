@@ -8,11 +8,9 @@ from pathlib import Path
 
 from speckle3d.core.errors import InvalidInputError
 
-_NO_NAME = re.compile(r"^[.\s]|[\s.]$|[/\\:\0-\x1f\x7f]")
-"""In names that are hidden, lead elsewhere or are none on some system."""
-
-_LONGEST = 200
-"""Of the 255 bytes that file systems take, room for the name of a temporary sibling."""
+_NO_NAME = re.compile(r"^$|^[.\s]|[\s.]$|[/\\:\0-\x1f\x7f]|.{100}")
+"""In names that are empty or hidden, lead elsewhere, or are none on some system; of 100 characters none is
+longer than the bytes that file systems take, with room for the name of a temporary sibling."""
 
 
 class Folder:
@@ -20,13 +18,13 @@ class Folder:
 
     Parameters
     ----------
-    opened : path
+    file : path
         The opened file.
     """
 
-    def __init__(self, opened: Path) -> None:
-        self.opened = opened.resolve()
-        self.path = self.opened.parent
+    def __init__(self, file: Path) -> None:
+        self.file = file.resolve()
+        self.path = self.file.parent
 
     def place(self, name: str) -> Path:
         """Path of a new file in the folder.
@@ -37,10 +35,8 @@ class Folder:
             If the name is not that of a file in the folder itself, or is taken.
         """
         inside = self.path / name
-        if not name.strip() or _NO_NAME.search(name) or Path(name).name != name:
-            raise InvalidInputError(f"expected the name of a file in {self.path}, got {name!r}")
-        if len(name.encode(errors="replace")) > _LONGEST:
-            raise InvalidInputError(f"expected a name of at most {_LONGEST} bytes, got {len(name)} letters")
+        if _NO_NAME.search(name):
+            raise InvalidInputError(f"expected a short name of a file in {self.path}, got {name!r}")
         if inside.is_symlink() or inside.exists():
             raise InvalidInputError(f"{inside}: expected a new name, got one that is taken")
         return inside

@@ -13,7 +13,7 @@ import panel as pn
 from bokeh.models import ColumnDataSource
 from panel.viewable import Viewable
 
-from speckle3d.app.look import batched
+from speckle3d.app.look import batch_changes
 from speckle3d.app.plots import ImagePlot, empty_plot, greys
 from speckle3d.app.server import AppServer
 from speckle3d.core.geometry import roll_yaw_tilt
@@ -47,7 +47,7 @@ class LivePage:
 
 
 @contextmanager
-def watched(page: LivePage) -> Iterator[tuple[str, str]]:
+def watch(page: LivePage) -> Iterator[tuple[str, str]]:
     """Serve a page beside the work of a block; yields its address, and one that leads there once."""
     loop = asyncio.new_event_loop()
     asyncio.set_event_loop(loop)
@@ -70,7 +70,7 @@ class _Viewer:
     """What one viewer sees."""
 
     def __init__(self, session: Session, status: Callable[[], str]) -> None:
-        self._session, self._status, self._shown = session, status, (-1, -1)
+        self._session, self._status, self._counts = session, status, (-1, -1)
         self._words = pn.pane.HTML("", sizing_mode="stretch_width", margin=(6, 12))
         self._picture, self._cut = ImagePlot("lateral / mm"), ImagePlot("along the sweep / mm")
         self._path = ColumnDataSource({name: [] for name in ("t", "length", "low", "high", *_LINES)})
@@ -94,7 +94,7 @@ class _Viewer:
         row = pn.Row(picture, cut, pn.Column(*paths, sizing_mode="stretch_both"), sizing_mode="stretch_both")
         return pn.Column(self._words, row, sizing_mode="stretch_both")
 
-    @batched
+    @batch_changes
     def _refresh(self) -> None:
         session = self._session
         progress = session.progress
@@ -105,20 +105,20 @@ class _Viewer:
                 escape("; ".join(filter(None, (self._status(), progress.missing, progress.failure)))),
             ]
         )
-        shown = (progress.poses, progress.volumes)
-        if shown[0] != self._shown[0]:
+        counts = (progress.poses, progress.volumes)
+        if counts[0] != self._counts[0]:
             if (picture := session.picture()) is not None:
                 levels, grid = picture
                 pitch_mm = (grid.vector_pitch_mm, grid.sample_spacing_mm)
                 first_mm = (grid.first_vector_mm, grid.first_sample_depth_mm)
                 self._picture.show(greys(levels.T, 0.0, 255.0), first_mm, pitch_mm)
             self._draw_path()
-        if shown[1] != self._shown[1] and (volume := session.voxels) is not None:
+        if counts[1] != self._counts[1] and (volume := session.voxels) is not None:
             middle = volume.voxels[volume.shape[0] // 2].astype(np.float32)
             _, y_mm, z_mm = volume.world_from_grid.translation.tolist()
             _, dy_mm, dz_mm = volume.spacing_mm
             self._cut.show(greys(middle, 0.0, 255.0), (z_mm, y_mm), (dz_mm, dy_mm))
-        self._shown = shown
+        self._counts = counts
 
     def _draw_path(self) -> None:
         times, elevation_mm, poses = self._session.path()

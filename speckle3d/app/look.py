@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import wraps
+from functools import partial, wraps
 from html import escape
 from typing import Any, TypeVar
 
@@ -34,13 +34,13 @@ white-space:nowrap" title="{name}">{name}</span></div>
 _BODY = "html, body { background: #fff; overflow-x: hidden; }"
 
 
-def batched(act: _Act) -> _Act:
+def batch_changes(act: _Act) -> _Act:
     """Have the changes of an act sent together; figures may be changed by the event of a widget only so."""
 
     @wraps(act)
-    def run(*args: Any, **more: Any) -> Any:
+    def run(*args: Any, **options: Any) -> Any:
         with pn.io.hold():
-            return act(*args, **more)
+            return act(*args, **options)
 
     return run  # type: ignore[return-value]
 
@@ -54,47 +54,44 @@ def shell(pages: Sequence[Page], title: str) -> Viewable:
     header = pn.pane.HTML(
         _HEADER.format(name=escape(title, quote=True)), sizing_mode="stretch_width", margin=0
     )
-    return _styled("100vh", header, inside(pages))
+    return _column("100vh", header, _tabs(pages))
 
 
 def in_notebook(pages: Sequence[Page]) -> Viewable:
     """Pages as tabs, in the app's style."""
     pn.extension("plotly")
-    return _styled("720px", inside(pages))
+    return _column("720px", _tabs(pages))
 
 
-def _styled(height: str, *parts: Viewable) -> Viewable:
+def _column(height: str, *parts: Viewable) -> Viewable:
     return pn.Column(
         *parts, stylesheets=[STYLE], styles={"height": height}, sizing_mode="stretch_both", margin=0
     )
 
 
-def inside(pages: Sequence[Page]) -> Viewable:
+def _tabs(pages: Sequence[Page]) -> Viewable:
     """Pages as tabs, or a single one, without the line of the app."""
     if len(pages) == 1:
-        return _viewed(pages[0])
-    views = [pn.Column(_opening(page.title), sizing_mode="stretch_both", margin=0) for page in pages]
-    opened = {0}
-    tabs = pn.Tabs(
-        *((page.title, view) for page, view in zip(pages, views, strict=True)),
-        sizing_mode="stretch_both",
-    )
+        return _view(pages[0])
+    views = [pn.Column(_view(pages[0]), sizing_mode="stretch_both", margin=0)]
+    views += [pn.Column(_opening(page.title), sizing_mode="stretch_both", margin=0) for page in pages[1:]]
+    tabs = pn.Tabs(*zip((page.title for page in pages), views, strict=True), sizing_mode="stretch_both")
+    closed = {*range(1, len(pages))}
 
-    def make(which: int) -> None:
-        views[which].objects = [_viewed(pages[which])]
+    def make(number: int) -> None:
+        views[number].objects = [_view(pages[number])]
 
     def fill(event: Any) -> None:
-        if event.new not in opened:
-            opened.add(event.new)
+        if event.new in closed:
+            closed.remove(event.new)
             # When what is there instead has been shown.
-            pn.state.execute(lambda: make(event.new), schedule=True)
+            pn.state.execute(partial(make, event.new), schedule=True)
 
     tabs.param.watch(fill, "active")
-    make(0)
     return tabs
 
 
-def _viewed(page: Page) -> Viewable:
+def _view(page: Page) -> Viewable:
     """A page's view, or why there is none."""
     try:
         return page.view()

@@ -63,15 +63,15 @@ def pages_of(
     place = path / RECONSTRUCTION if (path / RECONSTRUCTION).is_file() else path
     if find_reader(place) is not None:
         if reconstruction is not None:
-            return _reconstructed(reconstruction, place, place)
-        return _recording(place, settings)
+            return _result_pages(reconstruction, place, place)
+        return _recording_pages(place, settings)
     if reconstruction is not None:
         raise InvalidInputError(f"{path}: expected a recording beside --reconstruction, got something else")
     if first_bytes(place).startswith(SIGNATURE) and (kind := kind_of(place)) is not None:
         if kind != FORMAT:
             raise InvalidInputError(f"{path}: expected a recording, a reconstruction or a log, got {kind}")
-        return _reconstructed(place, sweep, place)
-    return _logged(place)
+        return _result_pages(place, sweep, place)
+    return _log_pages(place)
 
 
 def is_port(path: Path) -> bool:
@@ -80,7 +80,7 @@ def is_port(path: Path) -> bool:
 
 
 @contextmanager
-def opened(path: Path, record: Path | None = None, **of_file: Any) -> Iterator[Sequence[Page]]:
+def open_pages(path: Path, record: Path | None = None, **of_file: Any) -> Iterator[Sequence[Page]]:
     """Pages of a file, as `pages_of` has them, or of a sensor on a serial port, which runs during the block.
 
     Raises
@@ -102,7 +102,7 @@ def opened(path: Path, record: Path | None = None, **of_file: Any) -> Iterator[S
     yield pages_of(path, **of_file)
 
 
-def _recording(path: Path, settings: ImportSettings | None) -> list[Page]:
+def _recording_pages(path: Path, settings: ImportSettings | None) -> list[Page]:
     """Pages of a recording; of a package with a sensor's samples but no frames, the sensor's alone."""
     from speckle3d.sensor_logs import held_log
 
@@ -115,10 +115,10 @@ def _recording(path: Path, settings: ImportSettings | None) -> list[Page]:
             if (log := held_log(path)) is not None:
                 return [_sensor(replace(log, notes=(*log.notes, f"frames are not shown: {error}")))]
         raise
-    return _recorded(sweep, path)
+    return _sweep_pages(sweep, path)
 
 
-def _recorded(
+def _sweep_pages(
     sweep: Sweep,
     path: Path,
     reconstruction: Reconstruction | None = None,
@@ -135,24 +135,24 @@ def _recorded(
     return pages
 
 
-def _reconstructed(path: Path, sweep_file: Path | None, opened: Path) -> list[Page]:
+def _result_pages(path: Path, sweep_file: Path | None, file: Path) -> list[Page]:
     from speckle3d.app.reconstruction.page import ReconstructionPage
     from speckle3d.scoring.modes import default_mode
     from speckle3d.study.details import recorded_doubts
     from speckle3d.study.images import open_reconstruction
 
-    found, sweep = open_reconstruction(path, sweep_file)
-    found = replace(found, pairs=read_reconstruction(path).pairs)
-    pages = _recorded(sweep, opened, found, recorded_doubts(path, found.provenance))
+    result, sweep = open_reconstruction(path, sweep_file)
+    result = replace(result, pairs=read_reconstruction(path).pairs)
+    pages = _sweep_pages(sweep, file, result, recorded_doubts(path, result.provenance))
     mode = "image"
     with suppress(MismatchError):  # modes disagree: all can be looked at
-        mode = default_mode(found)[0]
-    viewer = ReconstructionPage(found, sweep, Folder(path), sweep_file, mode)
+        mode = default_mode(result)[0]
+    viewer = ReconstructionPage(result, sweep, Folder(path), sweep_file, mode)
     # First what was asked for.
-    return [viewer, *pages] if opened == path else [pages[0], viewer, *pages[1:]]
+    return [viewer, *pages] if file == path else [pages[0], viewer, *pages[1:]]
 
 
-def _logged(path: Path) -> list[Page]:
+def _log_pages(path: Path) -> list[Page]:
     from xsens.logs.read import read_log
 
     if path.is_dir():

@@ -28,13 +28,13 @@ def empty_plot(across: str, down: str, **look: Any) -> figure:
 
 
 def time_plot(
-    label: str, x_range: Range1d, cursor: Span, tapped: Callable[[float], object], **look: Any
+    label: str, x_range: Range1d, cursor: Span, on_tap: Callable[[float], object], **look: Any
 ) -> figure:
-    """Plot over a time that several share, with a cursor; `tapped` is called with the time of a click."""
+    """Plot over a time that several share, with a cursor; `on_tap` is called with the time of a click."""
     tools = {"tools": "xpan,xwheel_zoom,reset", "active_scroll": "xwheel_zoom", "toolbar_location": None}
     plot = empty_plot("", label, x_range=x_range, **tools, **look)
     plot.add_layout(cursor)
-    plot.on_event(Tap, lambda event: tapped(event.x))
+    plot.on_event(Tap, lambda event: on_tap(event.x))
     return plot
 
 
@@ -72,10 +72,10 @@ class ImagePlot:
     def show(self, colours: ByteArray, first: Pair, pitch: Pair) -> None:
         """Draw an image, shape (row, column, 4), whose first pixel's centre and pitch are given as (x, y)."""
         rows, columns = colours.shape[:2]
-        packed = np.ascontiguousarray(colours).view(np.uint32)[..., 0]
+        pixels = np.ascontiguousarray(colours).view(np.uint32)[..., 0]
         place = {"x": [first[0] - pitch[0] / 2], "y": [first[1] - pitch[1] / 2]}
         size = {"dw": [columns * pitch[0]], "dh": [rows * pitch[1]]}
-        self.source.data = {"image": [packed], **place, **size}
+        self.source.data = {"image": [pixels], **place, **size}
 
 
 def greys(image: npt.NDArray[Any], low: float, high: float) -> ByteArray:

@@ -103,13 +103,13 @@ class AppServer:
         self._server.io_loop.add_callback(self._server.io_loop.stop)
 
     def _look(self) -> None:
-        now, before = time.monotonic(), self._sessions
+        now_s, before = time.monotonic(), self._sessions
         sessions = self._server.get_sessions()
         self._sessions = {session.id for session in sessions}
         # A page that was sent a moment ago has no connection yet.
         if self._sessions - before or any(session.connection_count for session in sessions):
-            self._seen_s = now
-        elif now - self._seen_s > self._unseen_s:
+            self._seen_s = now_s
+        elif now_s - self._seen_s > self._unseen_s:
             self._server.io_loop.stop()
 
 

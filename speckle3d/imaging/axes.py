@@ -10,14 +10,14 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.grid import ImageGrid
-from speckle3d.imaging.images import image_corners, require_poses
+from speckle3d.imaging.images import image_corners
 
 _LEAST_ALIKE = 0.55
 """Mean squared cosine to a direction in common: as of a spread of 80 degrees either way; all round 0.5."""
 
 _TURNS = Rotation.from_rotvec(np.stack(np.meshgrid(*[np.linspace(-0.7, 0.7, 7)] * 3), axis=-1).reshape(-1, 3))
 """Turns at which the smallest box is looked for: with quarter turns, near any orientation there is."""
-_REFINED = 4
+_SEARCHES = 4
 """Of those, how many are searched from: the smallest box is not the only minimum."""
 _SIMPLEX = np.vstack([np.zeros(3), 0.15 * np.eye(3)])
 """Turns with which each search begins, rad."""
@@ -38,17 +38,14 @@ def sweep_axes(world_from_image: RigidTransform) -> Rotation:
     InsufficientDataError
         If the images have no lateral, axial or elevational direction in common, as when the probe turned
         through half a circle.
-    InvalidInputError
-        If there are no poses.
     """
-    require_poses(world_from_image)
     images = world_from_image.rotation.as_matrix()
     axes = np.stack([line_along(images[:, :, axis]) for axis in range(3)], axis=1)
     alike = np.square(np.einsum("nia,ia->na", images, axes)).mean(axis=0)
     if alike.min() < _LEAST_ALIKE:
-        which = ("lateral", "axial", "elevational")[int(alike.argmin())]
+        axis = ("lateral", "axial", "elevational")[int(alike.argmin())]
         raise InsufficientDataError(
-            f"the images have no {which} direction in common: expected one sweep, or axes as asked for"
+            f"the images have no {axis} direction in common: expected one sweep, or axes as asked for"
         )
     return Rotation.from_matrix(axes)
 
@@ -95,12 +92,12 @@ def principal_axes(grid: ImageGrid, world_from_image: RigidTransform) -> Rotatio
         turn = fmin(log_volume, np.zeros(3), (), 1e-6, 1e-6, initial_simplex=_SIMPLEX, disp=False)
         return start * Rotation.from_rotvec(turn)
 
-    turned = lateral_first * _TURNS
-    starts = turned[np.argsort(log_volumes(turned), kind="stable")[:_REFINED]]
-    ways = Rotation.concatenate([lateral_first, Rotation.identity(), *map(smallest_near, starts)])
-    volume = log_volumes(ways)
-    alike = ways[int(np.argmax(volume <= volume.min() + 1e-4))] * Rotation.create_group("O")
-    return alike[int((lateral_first.inv() * alike).magnitude().argmin())]
+    starts = lateral_first * _TURNS
+    starts = starts[np.argsort(log_volumes(starts), kind="stable")[:_SEARCHES]]
+    boxes = Rotation.concatenate([lateral_first, Rotation.identity(), *map(smallest_near, starts)])
+    volume = log_volumes(boxes)
+    axes = boxes[int(np.argmax(volume <= volume.min() + 1e-4))] * Rotation.create_group("O")
+    return axes[int((lateral_first.inv() * axes).magnitude().argmin())]
 
 
 def line_along(directions: FloatArray) -> FloatArray:

@@ -61,12 +61,7 @@ class PosedImages:
     def __len__(self) -> int:
         return len(self.world_from_image)
 
-    @property
-    def any_thread(self) -> bool:
-        """Whether images may be read by several threads at once."""
-        return _any_thread(self.images)
-
-    def read_as_stored(self, index: int) -> npt.NDArray[Any]:
+    def read(self, index: int) -> npt.NDArray[Any]:
         """Image number `index` in the type and the order in memory that it has, shape (vector, sample).
 
         Raises
@@ -76,7 +71,7 @@ class PosedImages:
         InvalidInputError
             If it is complex.
         """
-        image = self.images(index) if callable(self.images) else self.images[index]
+        image = _read(self.images, index)
         expected = (self.grid.vectors, self.grid.samples)
         if image.shape != expected:
             raise MismatchError(f"images[{index}]: expected shape {expected}, got {image.shape}")
@@ -106,8 +101,7 @@ class ChosenImages:
 
     def __getitem__(self, index: int) -> npt.NDArray[Any]:
         """Read one image, shape (vector, sample)."""
-        number = int(self.frames[index])
-        return self.images(number) if callable(self.images) else self.images[number]
+        return _read(self.images, int(self.frames[index]))
 
     def __len__(self) -> int:
         return int(self.frames.size)
@@ -115,10 +109,15 @@ class ChosenImages:
     @property
     def any_thread(self) -> bool:
         """Whether images may be read by several threads at once."""
-        return _any_thread(self.images)
+        return any_thread(self.images)
 
 
-def _any_thread(images: Images) -> bool:
+def _read(images: Images, index: int) -> npt.NDArray[Any]:
+    return images(index) if callable(images) else images[index]
+
+
+def any_thread(images: Images) -> bool:
+    """Whether images may be read by several threads at once."""
     return isinstance(images, np.ndarray) or getattr(images, "any_thread", False)
 
 

@@ -82,7 +82,7 @@ class NearestImages:
 
         in_parallel(look, len(self._lines), _GRAIN)
 
-    def blended(self, alone_mm: float = np.inf) -> tuple[Float32Array, ByteArray]:
+    def blend(self, alone_mm: float = np.inf) -> tuple[Float32Array, ByteArray]:
         """Interpolate between the two images by their distances.
 
         Parameters
@@ -100,24 +100,23 @@ class NearestImages:
         levels = np.empty(self._grey.shape[1:], np.float32)
         state = np.empty(levels.shape, np.uint8)
 
-        def blend(first: int, stop: int) -> None:
+        def blend_lines(first: int, stop: int) -> None:
             band = slice(first, stop)
-            (behind, front), (back_level, front_level) = self._distance_mm[:, band], self._grey[:, band]
+            distance, (back, front) = self._distance_mm[:, band], self._grey[:, band]
             present = ~np.isnan(self._grey[:, band])
-            measured = (present & (self._distance_mm[:, band] <= alone_mm)).any(axis=0)
+            near = (present & (distance <= alone_mm)).any(axis=0)
             with np.errstate(invalid="ignore"):
-                between = back_level + behind / (behind + front) * (front_level - back_level)
-            alone = np.where(present[0], back_level, front_level)
-            counts = np.select([measured, present.all(axis=0)], [MEASURED, FILLED], EMPTY)
+                between = back + distance[0] / (distance[0] + distance[1]) * (front - back)
+            alone = np.where(present[0], back, front)
+            state[band] = np.select([near, present.all(axis=0)], [MEASURED, FILLED], EMPTY)
             levels[band] = np.where(np.isnan(between), alone, between)
-            levels[band][counts == EMPTY] = np.nan
-            state[band] = counts
+            levels[band][state[band] == EMPTY] = np.nan
 
-        in_parallel(blend, len(levels), _GRAIN)
+        in_parallel(blend_lines, len(levels), _GRAIN)
         return levels, state
 
 
-def look_up(sought: Sequence[NearestImages], region: BoolArray | None = None) -> None:
+def look_up(targets: Sequence[NearestImages], region: BoolArray | None = None) -> None:
     """Look up points of several kinds in the same images, each at poses of its own.
 
     One pass over the images, in any order, with memory for the points and a few images; images that reach no
@@ -125,7 +124,7 @@ def look_up(sought: Sequence[NearestImages], region: BoolArray | None = None) ->
 
     Parameters
     ----------
-    sought : sequence of NearestImages
+    targets : sequence of NearestImages
         Changed.
     region : ndarray of bool, shape (vector, sample), optional
         Samples that count; by default all.
@@ -135,20 +134,20 @@ def look_up(sought: Sequence[NearestImages], region: BoolArray | None = None) ->
     InvalidInputError
         If the region is not one of the images.
     """
-    source = sought[0].source
+    source = targets[0].source
     expected = (source.grid.vectors, source.grid.samples)
     if region is not None and region.shape != expected:
         raise InvalidInputError(f"region: expected shape {expected}, as the images, got {region.shape}")
 
     def read(index: int) -> Float32Array:
         # In memory of its own, since readers may reuse theirs.
-        image = np.array(source.read_as_stored(index), dtype=np.float32, order="C")
+        image = np.array(source.read(index), dtype=np.float32, order="C")
         if region is not None:
             image[~region] = np.nan
         return image
 
-    frames = np.flatnonzero(np.any([points.near for points in sought], axis=0)).tolist()
+    frames = np.flatnonzero(np.any([points.near for points in targets], axis=0)).tolist()
     for start in range(0, len(frames), _BATCH):
         batch = {index: read(index) for index in frames[start : start + _BATCH]}
-        for points in sought:
+        for points in targets:
             points.add(batch)

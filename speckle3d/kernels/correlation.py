@@ -136,6 +136,7 @@ def phase_ramp(size: Lag, lateral_rad: float, axial_rad: float) -> Float32Array:
     along = np.exp(1j * axial_rad * np.arange(size[1]))
     out = np.empty((2, size[0], size[1]), np.float32)
     for v in range(size[0]):
-        phase = across[v] * along
-        out[0, v], out[1, v] = phase.real, phase.imag
+        for s in range(size[1]):
+            phase = across[v] * along[s]
+            out[0, v, s], out[1, v, s] = phase.real, phase.imag
     return out

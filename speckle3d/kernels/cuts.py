@@ -29,7 +29,7 @@ def _clip(first: float, last: float, start: float, step: float, low: float, high
 
 
 @njit(cache=True, inline="always", error_model="numpy", fastmath=False)
-def _mapped(matrix, row, point):  # type: ignore[no-untyped-def]
+def _coordinate(matrix, row, point):  # type: ignore[no-untyped-def]
     """One coordinate of a point of the world, and its change with the line's step."""
     start = matrix[row, 3]
     step = 0.0
@@ -65,9 +65,9 @@ def keep_nearest(
     """
     points = grey.shape[2]
     for line in range(lines.shape[0]):
-        u, du = _mapped(index_from_world, 0, lines[line])
-        v, dv = _mapped(index_from_world, 1, lines[line])
-        q, dq = _mapped(index_from_world, 2, lines[line])
+        u, du = _coordinate(index_from_world, 0, lines[line])
+        v, dv = _coordinate(index_from_world, 1, lines[line])
+        q, dq = _coordinate(index_from_world, 2, lines[line])
         # Coordinates are linear along a line, so the points an image can reach are one interval.
         first, last = _clip(0.0, points - 1.0, q, dq, -max_distance_mm, max_distance_mm)
         first, last = _clip(first, last, u, du, 0.0, image.shape[0] - 1.0)
@@ -75,9 +75,9 @@ def keep_nearest(
         if first > last + 2.0:
             continue
         for point in range(max(int(first) - 1, 0), min(int(last) + 2, points)):
-            signed = q + dq * point
-            side = 0 if signed >= 0.0 else 1
-            away = np.float32(abs(signed))
+            offset = q + dq * point
+            side = 0 if offset >= 0.0 else 1
+            away = np.float32(abs(offset))
             if away < distance_mm[side, line, point]:
                 at_u, at_v = u + du * point, v + dv * point
                 if not (-EDGE_TOLERANCE <= at_u <= image.shape[0] - 1 + EDGE_TOLERANCE):

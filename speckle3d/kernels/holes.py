@@ -35,14 +35,14 @@ def fill_planes(voxels: Float32Array, state: ByteArray, boxes: IntArray, first: 
     row_total, row_count = np.empty(n_i), np.empty(n_i, np.uint32)
     for k in range(first, stop):
         total[:], count[:] = 0.0, 0
-        summed, holes = -1, True
+        reach_k, holes = -1, True
         for box in range(boxes.shape[0]):
             if not holes:
                 break
             half_k, half_j, half_i = boxes[box]
-            while summed < half_k:
-                summed += 1
-                for plane in range(k - summed, k + summed + 1, max(2 * summed, 1)):
+            while reach_k < half_k:
+                reach_k += 1
+                for plane in range(k - reach_k, k + reach_k + 1, max(2 * reach_k, 1)):
                     if 0 <= plane < n_k:
                         _add_plane(voxels[plane], state[plane], total, count)
             holes = False
@@ -71,6 +71,6 @@ def _add_plane(voxels: Float32Array, state: ByteArray, total: FloatArray, count:
     """Add the measured voxels of a plane to the sum and the number so far."""
     for j in range(voxels.shape[0]):
         for i in range(voxels.shape[1]):
-            measured = state[j, i] == MEASURED
-            total[j, i] += voxels[j, i] if measured else np.float32(0.0)
-            count[j, i] += np.uint32(measured)
+            is_level = state[j, i] == MEASURED
+            total[j, i] += voxels[j, i] if is_level else np.float32(0.0)
+            count[j, i] += np.uint32(is_level)

@@ -9,6 +9,7 @@ from numba import njit
 
 from speckle3d.core.arrays import BoolArray, Complex64Array, Float32Array, FloatArray, IntArray
 from speckle3d.core.leastsquares import MAD_TO_SIGMA
+from speckle3d.kernels.copying import copy_into
 from speckle3d.kernels.correlation import LAGS, cohere_patch, common_window, correlate_patch, phase_ramp
 
 LEAST_CORRELATION = 0.05
@@ -148,8 +149,8 @@ def _robust_fit(
         normal = weighted.T @ design
         if not np.linalg.det(normal) > _COLLINEAR * normal[0, 0] * normal[1, 1] * normal[2, 2]:
             return False
-        covariance[:] = np.linalg.inv(normal)
-        solution[:] = covariance @ (weighted.T @ data)
+        copy_into(covariance, np.linalg.inv(normal))
+        copy_into(solution, covariance @ (weighted.T @ data))
         size = np.abs(data - design @ solution) * np.sqrt(weight)
         scale = MAD_TO_SIGMA * np.median(size) + 1e-12
         total = weight * (_HUBER / np.maximum(size / scale, _HUBER))
@@ -184,9 +185,11 @@ def _fit_fan(
         for i in range(2):
             size = np.abs(shift[i] - rows[i] @ solution) * np.sqrt(weight)
             scale = MAD_TO_SIGMA * np.median(size) + 1e-12
-            total[i][:] = weight * (_HUBER / np.maximum(size / scale, _HUBER)) / scale**2
+            copy_into(total[i], weight * (_HUBER / np.maximum(size / scale, _HUBER)) / scale**2)
     for i in range(2):
-        field[i], covariance[i] = solution[3 * i : 3 * i + 3], inverse[3 * i : 3 * i + 3, 3 * i : 3 * i + 3]
+        own = slice(3 * i, 3 * i + 3)
+        copy_into(field[i], solution[own])
+        copy_into(covariance[i], inverse[own, own])
 
 
 @njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
@@ -282,12 +285,12 @@ def match_pair(fixed: Frame, moving: Frame, geometry: Geometry, matches: Matches
         if not by_echo:
             fitted = _fit(geometry, shift, weight, field, covariance)
             if not fitted:
-                field[:] = start
+                copy_into(field, start)
     places = _places(geometry, field)
     for p in range(patches):
         away = places[p, 0] - lag[0, p], places[p, 1] - lag[1, p]
         correlation[p] = _read(rho[p], logarithmic[p], away[0], away[1])
-    matches.covariance[row] = np.eye(3)
+    copy_into(matches.covariance[row], np.eye(3))
     if fitted:
         # The centre's shift is seen in the second image's axes; its displacement is told in the first's. Roll
         # comes from axial shifts alone. Off focus the wavefront is curved, so a turn in the plane moves
@@ -301,4 +304,4 @@ def match_pair(fixed: Frame, moving: Frame, geometry: Geometry, matches: Matches
         error = matches.covariance[row]
         error[:] = 0.0
         error[0, 0] = covariance[0, 0, 0]
-        error[1:, 1:] = covariance[1, :2, :2]
+        copy_into(error[1:, 1:], covariance[1, :2, :2])

@@ -48,7 +48,10 @@ def patch_statistics(
     patch = np.empty((wide, samples), np.float32)
     for p in range(len(first)):
         v, s = first[p]
-        patch[:] = image[v : v + wide, s : s + high : step]
+        # A slice that is assigned to compiles for seconds, for numba's words about its shape.
+        for a in range(wide):
+            for b in range(samples):
+                patch[a, b] = image[v + a, s + b * step]
         mean = patch.mean()
         patch /= np.float32(mean)
         patch -= np.float32(1.0)

@@ -61,21 +61,21 @@ def field_table(
     rows = np.stack([steps[:, r : r + most * per_pitch : per_pitch] for r in range(per_pitch + 1)], axis=2)
     rows = np.ascontiguousarray(rows.transpose(0, 3, 2, 1, 4)).view(np.float32)
     # Between the last lateral step and the one after it, there is nothing to interpolate.
-    reached = np.zeros((ny, most * per_pitch), np.int64)
-    reached[:, : nx - 1] = reach[:, : nx - 1]
-    reached = np.ascontiguousarray(reached.reshape(ny, most, per_pitch).transpose(0, 2, 1))
-    inside = np.arange(nz)[:, None, None] < reached[:, None]
+    steps_z = np.zeros((ny, most * per_pitch), np.int64)
+    steps_z[:, : nx - 1] = reach[:, : nx - 1]
+    steps_z = np.ascontiguousarray(steps_z.reshape(ny, most, per_pitch).transpose(0, 2, 1))
+    inside = np.arange(nz)[:, None, None] < steps_z[:, None]
     vectors = np.where(inside.any(axis=-1), most - np.argmax(inside[..., ::-1], axis=-1), 0)
-    return FieldTable(rows.reshape(ny, nz, per_pitch + 1, -1), reached, vectors, curvature_per_mm, grid)
+    return FieldTable(rows.reshape(ny, nz, per_pitch + 1, -1), steps_z, vectors, curvature_per_mm, grid)
 
 
 @njit(cache=True, inline="always", fastmath=_SUMS)
 def _unit_phasor(cycles: float) -> Any:
-    """``exp(-2 pi i cycles)`` to 1e-7: the nearest tabulated phasor, turned by the small rest."""
-    scaled = (cycles - np.floor(cycles)) * _TURNS
-    nearest = int(scaled + 0.5)
-    rest = np.float32((scaled - nearest) * (_TWO_PI / _TURNS))
-    return _PHASORS[nearest & (_TURNS - 1)] * np.complex64(complex(1.0, -rest))
+    """``exp(-2 pi i cycles)`` to 1e-7: the nearest tabulated phasor, turned by the small angle to it."""
+    place = (cycles - np.floor(cycles)) * _TURNS
+    nearest = int(place + 0.5)
+    angle = np.float32((place - nearest) * (_TWO_PI / _TURNS))
+    return _PHASORS[nearest & (_TURNS - 1)] * np.complex64(complex(1.0, -angle))
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=_SUMS)

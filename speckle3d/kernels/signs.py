@@ -8,6 +8,7 @@ import numpy as np
 from numba import njit
 
 from speckle3d.core.arrays import FloatArray, IntArray
+from speckle3d.kernels.copying import copy_into
 
 
 class PathRules(NamedTuple):
@@ -110,14 +111,14 @@ def follow_paths(
     paths, cost, trend = np.zeros((count, frames, 2)), np.zeros(count), np.ones(count)
     parent, new_cost, new_trend = np.zeros(count, np.int64), np.zeros(count), np.zeros(count)
     places = np.zeros((count, 2))
-    paths[0, :placed_frames] = best[:placed_frames]
+    copy_into(paths[0, :placed_frames], best[:placed_frames])
     for f in range(1, placed_frames):
         trend[0] = _next_trend(trend[0], best[f, 0] - best[f - 1, 0], rules.trend_mm)
     survivors, moving = 1, False
     for f in range(placed_frames, frames):
         pairs = start[f + 1] - start[f]
         if pairs == 0:
-            paths[:survivors, f] = paths[:survivors, f - 1]
+            copy_into(paths[:survivors, f], paths[:survivors, f - 1])
             continue
         earlier, steps = first[start[f] : start[f + 1]], moves[start[f] : start[f + 1]]
         weight, latest = np.empty((pairs, 3)), np.argmax(earlier)
@@ -158,14 +159,17 @@ def follow_paths(
                     off = max(off, abs(paths[parent[g], earlier[e], 0] - paths[h, earlier[e], 0]))
                 is_duplicate = is_duplicate or off < rules.same_mm
             if not is_duplicate:
-                places[size], parent[size], new_cost[size] = place, h, total[n]
+                copy_into(places[size], place)
+                parent[size], new_cost[size] = h, total[n]
                 step = place[0] - paths[h, earlier[latest], 0]
                 new_trend[size] = _next_trend(trend[h], step, rules.trend_mm)
                 size += 1
             total[n] = np.inf
         if size:
-            paths[:size, :f] = paths[parent[:size], :f]
-            paths[:size, f] = places[:size]
-            trend[:size], cost[:size] = new_trend[:size], new_cost[:size] - new_cost[:size].min()
+            copy_into(paths[:size, :f], paths[parent[:size], :f])
+            copy_into(paths[:size, f], places[:size])
+            least = new_cost[:size].min()
+            for g in range(size):
+                trend[g], cost[g] = new_trend[g], new_cost[g] - least
             survivors = size
-    best[:] = paths[np.argmin(cost[:survivors])]
+    copy_into(best, paths[np.argmin(cost[:survivors])])

@@ -138,11 +138,11 @@ def compare_patches(
         n_near = _images_near(sample, source, patches, p, max_gap_mm, near)
         if n_near < 2:
             continue
-        n, wanted = _cut_patch(
+        n, total = _cut_patch(
             sample, source, patches, p, max_gap_mm, near[:n_near], planes, f, g, rows, derivatives
         )
-        out.share[p] = n / max(wanted, 1)
-        if n < 6 or n < least_share * wanted:
+        out.share[p] = n / max(total, 1)
+        if n < 6 or n < least_share * total:
             continue
         a, b = f[:n] - f[:n].mean(), g[:n] - g[:n].mean()
         norm_a, norm_b = math.sqrt(a @ a), math.sqrt(b @ b)
@@ -195,7 +195,7 @@ def _cut_patch(
     rows: FloatArray,
     derivatives: bool,
 ) -> tuple[int, int]:
-    """Fill levels of a patch (`f`), of its cut (`g`) and derivatives; return points found and wanted.
+    """Fill levels of a patch (`f`), of its cut (`g`) and derivatives; return points supported and in all.
 
     `planes`, shape (5, n), holds the planes of the images near the patch, and their distances from a point.
     """
@@ -210,14 +210,14 @@ def _cut_patch(
             planes[c, index] = source.poses[near[index], 2, c]
     away = planes[4]
     n = 0
-    wanted = 0
+    total = 0
     for a in range(patches.sides[0]):
         for b in range(patches.sides[1]):
             u, v = u0 + a * patches.stride, v0 + b * patches.stride
             value = image[u, v]
             if math.isnan(value):
                 continue
-            wanted += 1
+            total += 1
             x = pixels[2] + u * pixels[0]
             y = pixels[3] + v * pixels[1]
             wx = pose[0, 0] * x + pose[0, 1] * y + pose[0, 3]
@@ -246,9 +246,9 @@ def _cut_patch(
                     su = (px - cut_pixels[2]) / cut_pixels[0]
                     sv = (py - cut_pixels[3]) / cut_pixels[1]
                     if 0.0 <= su <= last_u and 0.0 <= sv <= last_v:
-                        found, du, dv = bilinear(source.images[near[best[s]]], su, sv)
-                        if not math.isnan(found):
-                            frame[s], level[s] = near[best[s]], found
+                        grey, du, dv = bilinear(source.images[near[best[s]]], su, sv)
+                        if not math.isnan(grey):
+                            frame[s], level[s] = near[best[s]], grey
                             slope[s, 0], slope[s, 1] = du / cut_pixels[0], dv / cut_pixels[1]
                             place[s, 0], place[s, 1], place[s, 2] = px, py, away[best[s]]
                             break
@@ -276,7 +276,7 @@ def _cut_patch(
                 slope[1, 2] = rise * distance[0]
                 _fill_rows(source.poses, frame, pose, x, y, slope, place, part, rows[:, n])
             n += 1
-    return n, wanted
+    return n, total
 
 
 # Inlined, which costs no time; a function of its own for the images beside a point took 40 % more.

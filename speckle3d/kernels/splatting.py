@@ -14,7 +14,7 @@ from speckle3d.core.arrays import Float32Array, FloatArray, IntArray
 from speckle3d.kernels.samples import POSITION_BITS, SHARE_BITS, Samples
 
 _WHOLE = 1 << POSITION_BITS
-_DROPPED = POSITION_BITS - SHARE_BITS
+_SHIFT = POSITION_BITS - SHARE_BITS
 _SHARE = 1.0 / (1 << SHARE_BITS)
 _SHARES = (1 << SHARE_BITS) - 1
 _LEAST_SHARE = 0.125
@@ -114,7 +114,7 @@ def _same_cell(x: int, y: int, z: int, i: int, j: int, k: int) -> bool:
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
 def _fraction(x: int) -> float:
     """How far a position is from the voxel below to the one above."""
-    return (x >> _DROPPED & _SHARES) * _SHARE
+    return (x >> _SHIFT & _SHARES) * _SHARE
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=False)

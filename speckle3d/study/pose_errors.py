@@ -11,7 +11,7 @@ from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.pose_errors import PoseErrors
 from speckle3d.core.reconstruction import Reconstruction, SharedErrors
 from speckle3d.imaging.measures.belonging import require_inside
-from speckle3d.imaging.measures.measure import Measurement, measured
+from speckle3d.imaging.measures.measure import Measurement, measure_points
 from speckle3d.motion.uncertainty import joint_errors
 from speckle3d.scoring.modes import default_mode
 from speckle3d.scoring.trajectories import poses_of
@@ -59,7 +59,7 @@ def measure(
     mode = default_mode(reconstruction)[0] if mode is None else mode
     errors, grid = errors_of(reconstruction, mode), reconstruction.grid
     near = require_inside(points, grid, errors.world_from_image)
-    return measured(points, near, errors, PICKED * grid.vector_pitch_mm if pick_mm is None else pick_mm)
+    return measure_points(points, near, errors, PICKED * grid.vector_pitch_mm if pick_mm is None else pick_mm)
 
 
 def caution(reconstruction: Reconstruction, mode: str) -> str | None:

@@ -41,26 +41,28 @@ def page(tmp_path_factory):
     }
     covariance = np.array([np.diag([0.01, 0.02, 0.05 * k + 1e-3, 1e-5, 1e-5, 1e-5]) for k in range(FRAMES)])
     trust = Trust(covariance, np.zeros(FRAMES, dtype=np.int64))
-    made = Provenance("s.h5", recording_sha256(folder / "s.h5"), "")
-    write_reconstruction(folder / "r.h5", Reconstruction(sweep.frame_time_s, GRID, poses, made, trust=trust))
+    origin = Provenance("s.h5", recording_sha256(folder / "s.h5"), "")
+    write_reconstruction(
+        folder / "r.h5", Reconstruction(sweep.frame_time_s, GRID, poses, origin, trust=trust)
+    )
     return ReconstructionPage(read_reconstruction(folder / "r.h5"), sweep, Folder(folder / "r.h5"))
 
 
 @pytest.fixture
 def viewer(page):
-    shown = _Viewer(page)
-    shown.layout()
-    return shown
+    viewer = _Viewer(page)
+    viewer.layout()
+    return viewer
 
 
-def printed(page, command):
+def run_command(page, command):
     """What a command prints that is run where the reconstruction is."""
-    said = io.StringIO()
-    with pytest.MonkeyPatch.context() as patch, redirect_stdout(said), chdir(page.folder.path):
+    output = io.StringIO()
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(output), chdir(page.folder.path):
         patch.setattr(sys, "argv", shlex.split(command))
         with suppress(SystemExit):
             cli.main()
-    return said.getvalue().splitlines()
+    return output.getvalue().splitlines()
 
 
 def commands(pane):
@@ -73,24 +75,24 @@ def test_a_cut_is_what_its_command_makes(viewer, page, cut, mode):
     viewer.mode = mode
     viewer.param.update(frame=7, lateral_mm=9.0, depth_mm=11.0)
     command = commands(viewer._commands)[["along", "frame", "depth"].index(cut)]
-    printed(page, command.replace(f"{cut}.png", f"{cut}-{mode}.nrrd"))
+    run_command(page, command.replace(f"{cut}.png", f"{cut}-{mode}.nrrd"))
     levels = read_volume(page.folder.path / f"{cut}-{mode}.nrrd").voxels[..., 0].T.astype(float)
-    (packed,) = viewer._plots[cut].source.data["image"]
-    grey = (packed & 0xFF).astype(float)
+    (pixels,) = viewer._plots[cut].source.data["image"]
+    grey = (pixels & 0xFF).astype(float)
     assert levels.shape == grey.shape
-    seen = levels > 0
-    assert seen.mean() > 0.6
-    assert np.abs(grey - (levels - 1) * 255 / 254)[seen].max() < 2.0
+    inside = levels > 0
+    assert inside.mean() > 0.6
+    assert np.abs(grey - (levels - 1) * 255 / 254)[inside].max() < 2.0
 
 
 def test_points_are_measured_as_their_command_measures(viewer, page):
     for frame, lateral, depth in ((2, 3.0, 4.0), (18, 9.0, 15.0), (20, 2.0, 8.0)):
         viewer.param.update(frame=frame, lateral_mm=lateral, depth_mm=depth)
         viewer._add()
-    (command,) = commands(viewer._told)
-    lines = printed(page, command)
+    (command,) = commands(viewer._words)
+    lines = run_command(page, command)
     assert any(line.startswith("distance 1 2: 14.07") for line in lines)
     for line in lines:
-        assert line.replace("'", "&#x27;") in viewer._told.object
+        assert line.replace("'", "&#x27;") in viewer._words.object
     viewer.mode = "pose"
     assert viewer.points_mm == []

@@ -9,6 +9,7 @@ References
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,9 @@ from bokeh.models import ColumnDataSource
 from panel.viewable import Viewable
 
 from calibration.detection.lines import LineFinder
-from speckle3d.app.phantom.plots import DROPPED, FOUND
+from calibration.points import Recording
+from speckle3d.app.folder import Folder
+from speckle3d.app.phantom.plots import ORANGE, SKY_BLUE
 from speckle3d.app.phantom.viewer import PhantomViewer
 from speckle3d.calibrating.settings import OrientationSettings, PlaneSettings, ScanSettings
 
@@ -33,19 +36,14 @@ class LinesViewer(PhantomViewer):
 
     detection = ("columns", "smoothing_mm", "threshold", "tolerance_mm", "consensus", "place")
 
-    def __init__(self, *given: Any) -> None:
-        self.more = (
-            ("time_offset_s", "pixel_error", "fixed_pixels", "outlier_sigma")
-            if isinstance(given[-1], PlaneSettings)
-            else ("time_offset_s", "viewed_from", "level", "outlier_sigma")
-        )
-        super().__init__(*given)
+    def __init__(self, recording: Recording, images: Path, folder: Folder, settings: ScanSettings) -> None:
+        super().__init__(recording, images, folder, settings)
         self._finder: tuple[object, LineFinder] | None = None
         self._line = ColumnDataSource({"column": [], "row": []}, name="line")
         self._inliers = ColumnDataSource({"column": [], "row": []})
         plot = self.frame_plot.plot
-        plot.line("column", "row", source=self._line, color=FOUND, line_width=2)
-        plot.scatter("column", "row", source=self._inliers, size=6, line_color=DROPPED, fill_color=None)
+        plot.line("column", "row", source=self._line, color=SKY_BLUE, line_width=2)
+        plot.scatter("column", "row", source=self._inliers, size=6, line_color=ORANGE, fill_color=None)
 
     def view(self) -> Viewable:
         """Lay out the sliders, two in a row."""
@@ -69,5 +67,5 @@ class LinesViewer(PhantomViewer):
         rows = v + (x - v) / (w - u) * (across - u)
         self._line.data = {"column": across, "row": rows}
         self._inliers.data = dict(zip(("column", "row"), line.inlier_px.T, strict=True))
-        agreed = f"{line.consensus} of {line.possible} columns agree"
-        return f"line: {agreed}; row {rows[1]:.2f} in the middle"
+        consensus = f"{line.consensus} of {line.possible} columns agree"
+        return f"line: {consensus}; row {rows[1]:.2f} in the middle"

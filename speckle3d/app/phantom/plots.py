@@ -13,10 +13,9 @@ from bokeh.models import ColumnDataSource, HoverTool, Range1d
 from calibration.points import Recording
 from speckle3d.app.plots import ImagePlot, empty_plot, greys
 
-USED, DROPPED, REGION, LEFT_OUT, UNKNOWN = "#0072B2", "#D55E00", "#F0E442", "#999999", "#e8e8e8"
-"""Colours of Okabe and Ito's palette, distinguishable with any colour vision."""
-FOUND = "#56B4E9"
-"""A lighter blue, seen on dark images."""
+BLUE, SKY_BLUE, ORANGE, YELLOW, GREY, PALE = "#0072B2", "#56B4E9", "#D55E00", "#F0E442", "#999999", "#e8e8e8"
+"""Okabe and Ito's palette, distinguishable with any colour vision: blue for what is used, sky blue for that
+on dark images, orange for what is not, grey for frames left out by hand."""
 _GREYS = 1.0, 99.9
 """Percentiles of grey levels of other images than 8-bit ones that are drawn black and white."""
 
@@ -29,11 +28,11 @@ class FramePlot(ImagePlot):
     Parameters
     ----------
     recording : Recording
-    drawn : callable
+    on_box : callable
         Called with the corners, shape (n, 2), of a box that was drawn.
     """
 
-    def __init__(self, recording: Recording, drawn: Callable[[npt.NDArray[Any]], None]) -> None:
+    def __init__(self, recording: Recording, on_box: Callable[[npt.NDArray[Any]], None]) -> None:
         column_mm, row_mm = (float(size) for size in recording.pixel_mm)
         super().__init__(
             f"column ({column_mm:.3g} mm apart)",
@@ -44,12 +43,12 @@ class FramePlot(ImagePlot):
             active_drag="box_select",
             toolbar_location="above",
         )
-        self._images, self._drawn = recording.images, drawn
+        self._images, self._on_box = recording.images, on_box
         middle = recording.images[recording.images.shape[0] // 2]
         self._levels = (0.0, 255.0) if middle.dtype == np.uint8 else np.nanpercentile(middle, _GREYS)
         self._region = ColumnDataSource({"x": [], "y": []})
-        self.plot.patch("x", "y", source=self._region, fill_alpha=0.06, color=REGION, line_dash="dashed")
-        self.plot.on_event(SelectionGeometry, self._selected)
+        self.plot.patch("x", "y", source=self._region, fill_alpha=0.06, color=YELLOW, line_dash="dashed")
+        self.plot.on_event(SelectionGeometry, self._select)
 
     def show_frame(self, frame: int, region: npt.ArrayLike | None) -> npt.NDArray[Any]:
         """Draw a frame and the region, and return the frame as it is, shape (column, row)."""
@@ -59,11 +58,11 @@ class FramePlot(ImagePlot):
         self._region.data = {"x": x, "y": y}
         return image
 
-    def _selected(self, event: SelectionGeometry) -> None:
+    def _select(self, event: SelectionGeometry) -> None:
         box: Any = event.geometry
         if event.final:
             (left, right), (top, bottom) = (sorted((box[f"{axis}0"], box[f"{axis}1"])) for axis in "xy")
-            self._drawn(np.array([(left, top), (right, top), (right, bottom), (left, bottom)]))
+            self._on_box(np.array([(left, top), (right, top), (right, bottom), (left, bottom)]))
 
 
 class FrameStrip:
@@ -73,13 +72,15 @@ class FrameStrip:
     ----------
     count : int
         Frames.
-    chosen, toggled : callable
+    on_tap, on_double_tap : callable
         Called with the number of a frame that was clicked, or double clicked.
     """
 
-    def __init__(self, count: int, chosen: Callable[[int], None], toggled: Callable[[int], None]) -> None:
+    def __init__(
+        self, count: int, on_tap: Callable[[int], None], on_double_tap: Callable[[int], None]
+    ) -> None:
         self._count = count
-        self._frames = ColumnDataSource({"frame": [], "colour": [], "told": []})
+        self._frames = ColumnDataSource({"frame": [], "colour": [], "reason": []})
         self._cursor = ColumnDataSource({"frame": [0]})
         self.plot = empty_plot(
             "frame (click: look; double click: leave out)",
@@ -97,24 +98,20 @@ class FrameStrip:
             "frame", width=0.9, bottom=0, top=1, color="colour", alpha=0.55, source=self._frames
         )
         self.plot.vspan("frame", source=self._cursor, color="black", line_width=2)
-        self.plot.add_tools(HoverTool(renderers=[bars], tooltips=[("frame", "@frame"), ("", "@told")]))
-        self.plot.on_event(Tap, lambda event: chosen(self._at(event.x)))
-        self.plot.on_event(DoubleTap, lambda event: toggled(self._at(event.x)))
+        self.plot.add_tools(HoverTool(renderers=[bars], tooltips=[("frame", "@frame"), ("", "@reason")]))
+        self.plot.on_event(Tap, lambda event: on_tap(self._at(event.x)))
+        self.plot.on_event(DoubleTap, lambda event: on_double_tap(self._at(event.x)))
 
     def _at(self, place: float) -> int:
         return int(np.clip(round(place), 0, self._count - 1))
 
     def show(
-        self, frame: int, used: Mapping[int, str], dropped: Mapping[int, str], left_out: Mapping[int, str]
+        self, frame: int, uses: Mapping[int, str], refusals: Mapping[int, str], left_out: Mapping[int, str]
     ) -> None:
         """Mark the frame that is looked at, and colour all by what became of them and why."""
         self._cursor.data = {"frame": [frame]}
-        said = {
-            at: (colour, why)
-            for colour, frames in ((USED, used), (DROPPED, dropped), (LEFT_OUT, left_out))
-            for at, why in frames.items()
-        }
-        colour, told = zip(
-            *(said.get(at, (UNKNOWN, "not looked at")) for at in range(self._count)), strict=True
-        )
-        self._frames.data = {"frame": np.arange(self._count), "colour": colour, "told": told}
+        colours, reasons = [PALE] * self._count, ["not looked at"] * self._count
+        for colour, frames in ((BLUE, uses), (ORANGE, refusals), (GREY, left_out)):
+            for at, reason in frames.items():
+                colours[at], reasons[at] = colour, reason
+        self._frames.data = {"frame": np.arange(self._count), "colour": colours, "reason": reasons}

@@ -1,4 +1,4 @@
-"""Points of wires in images, picked, moved and deleted with the mouse, and the calibration with them."""
+"""The tuner of wires: points picked, moved and deleted with the mouse, and the calibration with them."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from panel.viewable import Viewable
 from calibration.points import Recording, Seen
 from calibration.recording import choose_crossings
 from speckle3d.app.folder import Folder
-from speckle3d.app.look import batched
-from speckle3d.app.phantom.plots import DROPPED, FOUND, USED
-from speckle3d.app.phantom.run import Work, sentence
+from speckle3d.app.look import batch_changes
+from speckle3d.app.phantom.plots import BLUE, ORANGE, SKY_BLUE
+from speckle3d.app.phantom.run import run_in_thread, sentence
 from speckle3d.app.phantom.viewer import PhantomViewer
 from speckle3d.calibrating.phantoms import Wired, found, picked
 from speckle3d.calibrating.settings import ScanSettings, WireSettings, with_values
@@ -32,7 +32,7 @@ _NO_POINTS: dict[str, list[Any]] = {"column": [], "row": [], "wire": []}
 
 
 class Picks(dict[tuple[int, str], tuple[float, float]]):
-    """Column and row by frame and wire; of each wire one in a frame, the last that was put there.
+    """Column and row by frame and wire; of each wire one in a frame, the last that was set there.
 
     Parameters
     ----------
@@ -48,7 +48,7 @@ class Picks(dict[tuple[int, str], tuple[float, float]]):
         """Column and row by wire, in the order of the wires."""
         return {name: self[frame, name] for name in self.names if (frame, name) in self}
 
-    def put(self, frame: int, points: Iterable[tuple[float, float, str]]) -> None:
+    def set_frame(self, frame: int, points: Iterable[tuple[float, float, str]]) -> None:
         """Take these columns, rows and wires as the points of a frame, in place of those it had."""
         for name in self.of(frame):
             del self[frame, name]
@@ -82,22 +82,20 @@ class PointsViewer(PhantomViewer):
         If the phantom or the points cannot be read, or do not fit the recording.
     """
 
-    more = ("time_offset_s", "registration", "fixed_pixels", "beside_mm", "outlier_sigma")
-
-    def __init__(self, recording: Recording, images: Path, folder: Folder, given: ScanSettings) -> None:
-        assert isinstance(given, WireSettings)
-        super().__init__(recording, images, folder, given)
-        self._wired, self._drawing = Wired.of(given.phantom), False
-        self.picks = Picks(self._wired.names)
-        if given.points is not None:
-            points = read_points(given.points, self._wired.names)
+    def __init__(self, recording: Recording, images: Path, folder: Folder, settings: ScanSettings) -> None:
+        assert isinstance(settings, WireSettings)
+        super().__init__(recording, images, folder, settings)
+        self._phantom, self._drawing = Wired.of(settings.phantom), False
+        self.picks = Picks(self._phantom.names)
+        if settings.points is not None:
+            points = read_points(settings.points, self._phantom.names)
             points.require_inside(recording.images.shape)
             self.picks.take(points)
-        self._run_with = self.picks.points()
+        self._run_points = self.picks.points()
         self._points = ColumnDataSource(_NO_POINTS, name="points")
-        self._points.on_change("data", self._edited)
-        drawn = self.frame_plot.plot.scatter(
-            "column", "row", source=self._points, size=11, line_color=FOUND, line_width=2, fill_alpha=0.0
+        self._points.on_change("data", self._edit)
+        dots = self.frame_plot.plot.scatter(
+            "column", "row", source=self._points, size=11, line_color=SKY_BLUE, line_width=2, fill_alpha=0.0
         )
         self.frame_plot.plot.text(
             "column",
@@ -106,21 +104,24 @@ class PointsViewer(PhantomViewer):
             source=self._points,
             x_offset=8,
             y_offset=-4,
-            text_color=FOUND,
+            text_color=SKY_BLUE,
             text_font_size="11px",
         )
-        count = 0 if self._wired.names else 1
-        self._tool = PointDrawTool(renderers=[drawn], empty_value="", num_objects=count)
+        count = 0 if self._phantom.names else 1
+        self._tool = PointDrawTool(renderers=[dots], empty_value="", num_objects=count)
         self.frame_plot.plot.add_tools(self._tool)
         self.frame_plot.plot.toolbar.active_tap = self.frame_plot.plot.toolbar.active_drag = self._tool
-        self._wire = pn.widgets.Select(name="wire of the next point", options=[*self._wired.names], width=170)
-        self._wire.param.watch(self._named, "value")
-        self._work = Work("Find points in all frames", width=190)
-        self._work.button.disabled = not self._wired.found
-        self._name = pn.widgets.TextInput(
+        self._wire = pn.widgets.Select(
+            name="wire of the next point", options=[*self._phantom.names], width=170
+        )
+        self._wire.param.watch(self._name_next, "value")
+        self._search = pn.widgets.Button(
+            name="Find points in all frames", width=190, disabled=not self._phantom.found
+        )
+        self._points_name = pn.widgets.TextInput(
             name="file of the points", value=f"{images.stem}-points.csv", width=460
         )
-        self._saved = pn.pane.HTML("", width=600)
+        self._points_note = pn.pane.HTML("", width=600)
 
     def view(self) -> Viewable:
         """Lay out what finds, picks and saves points."""
@@ -128,12 +129,13 @@ class PointsViewer(PhantomViewer):
             pn.widgets.Button(name="Clear this frame"),
             pn.widgets.Button(name="Save points", width=110, align="end"),
         )
-        clear.on_click(lambda _: self._put([]))
-        save.on_click(self._save)
-        self._work.button.on_click(self._find_all)
-        wires = [self._wire] if self._wired.names else []
-        buttons = pn.Row(self._work.button, clear, *wires)
-        return self.layout(pn.pane.HTML(_HINT, width=600), buttons, pn.Row(save, self._name), self._saved)
+        clear.on_click(lambda _: self._set_points([]))
+        save.on_click(self._save_points)
+        self._search.on_click(self._find_all)
+        wires = [self._wire] if self._phantom.names else []
+        buttons = pn.Row(self._search, clear, *wires)
+        files = pn.Row(save, self._points_name)
+        return self.layout(pn.pane.HTML(_HINT, width=600), buttons, files, self._points_note)
 
     def show(self, image: npt.NDArray[Any], settings: ScanSettings) -> str:
         """Draw the points of a frame, and count them."""
@@ -142,77 +144,66 @@ class PointsViewer(PhantomViewer):
         self._drawing = True
         self._points.data = {"column": list(column), "row": list(row), "wire": list(points)}
         self._drawing = False
-        missing = [name for name in self._wired.names if name not in points]
+        missing = [name for name in self._phantom.names if name not in points]
         if missing and self._wire.value not in missing:
             self._wire.value = missing[0]
-        self._named()
+        self._name_next()
         lacking = f"; none on {', '.join(missing)}" if points and missing else ""
-        every = self.picks.points()
-        frames = len(np.unique(every.frame))
-        return f"frame {self.frame}: {len(points)} points{lacking}; {len(every)} in {frames} frames"
+        total, frames = len(self.picks), len({frame for frame, _ in self.picks})
+        return f"frame {self.frame}: {len(points)} points{lacking}; {total} in {frames} frames"
 
     def find(self, settings: ScanSettings) -> Seen:
         """Take the points that are there."""
-        self._run_with = self.picks.points()
-        if not len(self._run_with):
+        self._run_points = self.picks.points()
+        if not len(self._run_points):
             raise InvalidInputError("expected points: find them, or click where they are")
-        return picked(self.recording, self._run_with, settings)
+        return picked(self.recording, self._run_points, settings)
 
     def before_saving(self, settings: ScanSettings, out: Path) -> ScanSettings:
         """Save the points that a calibration was made from, for the command to be given them."""
-        return with_values(settings, {"points": self._write(f"{out.stem}-points.csv", self._run_with)})
+        return with_values(settings, {"points": self._write(f"{out.stem}-points.csv", self._run_points)})
 
-    def _edited(self, attribute: str, old: object, new: Any) -> None:
+    def _edit(self, attribute: str, old: object, new: Any) -> None:
         if not self._drawing:
-            self._put(list(zip(new["column"], new["row"], new["wire"], strict=True)))
+            self._set_points(list(zip(new["column"], new["row"], new["wire"], strict=True)))
 
-    def _put(self, points: list[tuple[float, float, str]]) -> None:
-        self.picks.put(self.frame, points)
-        self._outdated()
+    def _set_points(self, points: list[tuple[float, float, str]]) -> None:
+        self.picks.set_frame(self.frame, points)
+        self._mark_picks()
 
-    def _outdated(self) -> None:
-        self.mark_used(dict.fromkeys(map(int, self.picks.points().frame), "has points"))
+    def _mark_picks(self) -> None:
+        self.mark_frames(dict.fromkeys((frame for frame, _ in self.picks), "has points"))
         self.changed()
 
-    @batched
-    def _named(self, *_: Any) -> None:
+    @batch_changes
+    def _name_next(self, *_: Any) -> None:
         self._tool.default_overrides = {"wire": self._wire.value or ""}
 
-    def _find_all(self, _: object) -> None:
+    async def _find_all(self, _: object) -> None:
         try:
-            settings = self.settings()
+            settings = self.settings().model_copy(update={"points": None})
+            self.tell("finding points in all frames ...")
+            self.picks.take(await run_in_thread(self._search, partial(self._find_points, settings)))
         except Speckle3DError as error:
-            self.tell(str(error), DROPPED)
+            self.tell(str(error), ORANGE)
             return
-        self.tell("finding points in all frames ...")
-        self._work.start(partial(self._search, settings), self._searched)
+        self._mark_picks()
 
-    def _search(self, settings: ScanSettings) -> Seen | str:
-        """Points, or why there are none."""
+    def _find_points(self, settings: ScanSettings) -> Seen:
+        points = found(self.recording, settings)
+        if self._phantom.names:
+            return points
+        return choose_crossings(self.recording, points, [self.recording.time_offset_s])
+
+    def _save_points(self, _: object) -> None:
         try:
-            seen = found(self.recording, settings.model_copy(update={"points": None}))
-            if self._wired.names:
-                return seen
-            return choose_crossings(self.recording, seen, [self.recording.time_offset_s])
+            path = self._write(self._points_name.value or "", self.picks.points())
+            self._points_note.object = sentence(f"Saved {path}", BLUE, "saved")
         except Speckle3DError as error:
-            return str(error)
-
-    def _searched(self, seen: Seen | str) -> None:
-        if isinstance(seen, str):
-            self.tell(seen, DROPPED)
-            return
-        self.picks.take(seen)
-        self._outdated()
-
-    def _save(self, _: object) -> None:
-        try:
-            path = self._write(self._name.value or "", self.picks.points())
-            self._saved.object = sentence(f"Saved {path}", USED, "saved")
-        except Speckle3DError as error:
-            self._saved.object = sentence(str(error), DROPPED, "saved")
+            self._points_note.object = sentence(str(error), ORANGE, "saved")
 
     def _write(self, name: str, points: PickedPoints) -> Path:
         if not len(points):
             raise InvalidInputError("expected points to save, got none")
         name = name if name.endswith(".csv") else f"{name}.csv"
-        return self.folder.save(name, lambda path: write_points(path, points, self._wired.names))
+        return self.folder.save(name, lambda path: write_points(path, points, self._phantom.names))

@@ -1,38 +1,44 @@
-"""What both tuners have: frames, the picture, the settings, and the calibration."""
+"""Base of both phantom tuners: frames, their picture, the settings, and the calibration with its result."""
 
 from __future__ import annotations
 
+import html
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
-from typing import Any, Literal, get_args, get_origin
+from typing import Any
 
 import numpy.typing as npt
 import panel as pn
 from panel.viewable import Viewable
-from pydantic import BaseModel
 
 from calibration.points import Recording, Seen
+from calibration.recording import Outcome
+from calibration.report import text_report
 from speckle3d.app.folder import Folder
-from speckle3d.app.look import batched
-from speckle3d.app.phantom.plots import DROPPED, USED, FramePlot, FrameStrip
-from speckle3d.app.phantom.run import RunPane, Solved, sentence
-from speckle3d.calibrating.phantoms import BY_HAND, found, require_frames
+from speckle3d.app.look import batch_changes
+from speckle3d.app.phantom.plots import BLUE, ORANGE, FramePlot, FrameStrip
+from speckle3d.app.phantom.run import run_in_thread, sentence
+from speckle3d.app.phantom.widgets import WIDTH_PX, widget
+from speckle3d.calibrating.phantoms import BY_HAND, found, remarks, require_frames, solved, write_outcome
 from speckle3d.calibrating.settings import (
+    OrientationSettings,
     PlaneSettings,
     ScanSettings,
+    WireSettings,
     with_values,
 )
+from speckle3d.calibrating.written import BESIDE
 from speckle3d.core.errors import InvalidInputError, Speckle3DError
 
-_WIDTH_PX = 285
-_SLIDERS: dict[str, tuple[str, float, float, float]] = {
-    "columns": ("n, columns", 5, 240, 1),
-    "smoothing_mm": ("σ, smoothing / mm", 0.05, 3.05, 0.05),
-    "threshold": ("T / levels per mm, 0: automatic", 0.0, 300.0, 1.0),
-    "tolerance_mm": ("d, tolerance / mm", 0.05, 3.05, 0.05),
-    "consensus": ("p, share that agrees", 0.05, 1.0, 0.01),
+_AMBER = "#9a6700"
+"""Of a result that more motion would improve."""
+_DETAILS: dict[type[ScanSettings], tuple[str, ...]] = {
+    PlaneSettings: ("time_offset_s", "pixel_error", "fixed_pixels", "outlier_sigma"),
+    OrientationSettings: ("time_offset_s", "viewed_from", "level", "outlier_sigma"),
+    WireSettings: ("time_offset_s", "registration", "fixed_pixels", "beside_mm", "outlier_sigma"),
 }
-"""Label, least, greatest and step of settings that are tuned by sliders."""
+"""Settings of the calibration that are folded away."""
 _REFLECTORS = {"(choose before the first run)": "", "a bare wall": "wall", "a thin bar (Cambridge)": "bar"}
 
 
@@ -46,57 +52,69 @@ class PhantomViewer:
         Its file, as the command is given it.
     folder : Folder
         Where results are saved.
-    given : ScanSettings
+    settings : ScanSettings
         To begin with.
     """
 
     detection: tuple[str, ...] = ()
     """Settings of what is found, which change what is seen at once."""
-    more: tuple[str, ...] = ()
-    """Those of the calibration, folded away."""
 
-    def __init__(self, recording: Recording, images: Path, folder: Folder, given: ScanSettings) -> None:
-        self.recording, self.images, self.folder, self._given = recording, images, folder, given
+    def __init__(self, recording: Recording, images: Path, folder: Folder, settings: ScanSettings) -> None:
+        self.recording, self.images, self.folder, self._start = recording, images, folder, settings
         count = recording.images.shape[0]
-        self.widgets = {
-            name: widget(given, name) for name in (*self.detection, "region", "leave_out", *self.more)
-        }
-        self._used: dict[int, str] = {}
-        self._dropped: dict[int, str] = {}
+        self._details = _DETAILS[type(settings)]
+        names = (*self.detection, "region", "leave_out", *self._details)
+        self.widgets = {name: widget(settings, name) for name in names}
+        if isinstance(settings, PlaneSettings):
+            # A thin bar that is taken for a wall is warned of for a bias that it does not have.
+            self.widgets["reflector"] = pn.widgets.Select(
+                name="what the plane is", options=_REFLECTORS, width=WIDTH_PX
+            )
+        self._uses: dict[int, str] = {}
+        self._refusals: dict[int, str] = {}
+        self._result: tuple[ScanSettings, Outcome] | None = None
         self.frame_plot = FramePlot(recording, self._draw_region)
         self._strip = FrameStrip(count, self.go, self._toggle)
         # A slider needs two values.
         self._slider = pn.widgets.IntSlider(
             name="frame", end=max(count - 1, 1), disabled=count < 2, sizing_mode="stretch_width"
         )
-        self._said = pn.pane.HTML("", sizing_mode="stretch_width")
-        self._run = RunPane(
-            recording, images, folder, self._to_run, self.find, self._solved, self.before_saving
+        self._words = pn.pane.HTML("", sizing_mode="stretch_width")
+        self._button = pn.widgets.Button(name="Run calibration", button_type="primary", width=150)
+        self._verdict = pn.pane.HTML(sentence("Not calibrated yet.", "#555555"), width=600)
+        self._table, self._note = pn.pane.HTML("", width=600), pn.pane.HTML("", width=600)
+        self._name = pn.widgets.TextInput(
+            name="file of the result", value=f"{images.stem}-calibration.h5", width=460
         )
-        if isinstance(given, PlaneSettings):
-            # A thin bar that is taken for a wall is warned of for a bias that it does not have.
-            self.widgets["reflector"] = pn.widgets.Select(
-                name="what the plane is", options=_REFLECTORS, width=_WIDTH_PX
-            )
+        self._save = pn.widgets.Button(name="Save result", width=110, disabled=True, align="end")
         self._slider.param.watch(self._show, "value")
-        for each in self.widgets.values():
-            each.param.watch(self.changed, "value")
+        for control in self.widgets.values():
+            control.param.watch(self.changed, "value")
+        self._button.on_click(self._calibrate)
+        self._save.on_click(self._write_result)
 
     def layout(self, *parts: Viewable) -> Viewable:
-        """The picture on the left; on the right what is tuned, and the calibration."""
+        """The picture on the left; on the right what is tuned, the button, the verdict and the table."""
         left = pn.Column(
             self._slider,
             pn.pane.Bokeh(self.frame_plot.plot, sizing_mode="stretch_both"),
-            self._said,
+            self._words,
             pn.pane.Bokeh(self._strip.plot, sizing_mode="stretch_width"),
             sizing_mode="stretch_both",
         )
-        area = pn.Row(self.widgets["region"], self.widgets["leave_out"])
-        more = [self.widgets[name] for name in self.more]
-        folded = pn.Card(*more, title="More settings of the calibration", collapsed=True, width=610)
-        asked = [self.widgets["reflector"]] if "reflector" in self.widgets else []
+        details = [self.widgets[name] for name in self._details]
         right = pn.Column(
-            *parts, area, *asked, self._run.view(), folded, scroll="y-auto", sizing_mode="stretch_both"
+            *parts,
+            pn.Row(self.widgets["region"], self.widgets["leave_out"]),
+            *([self.widgets["reflector"]] if "reflector" in self.widgets else []),
+            self._button,
+            self._verdict,
+            pn.Row(self._save, self._name),
+            self._note,
+            self._table,
+            pn.Card(*details, title="More settings of the calibration", collapsed=True, width=610),
+            scroll="y-auto",
+            sizing_mode="stretch_both",
         )
         self._show()
         return pn.Row(left, right, sizing_mode="stretch_both")
@@ -118,20 +136,23 @@ class PhantomViewer:
         InvalidInputError, MismatchError
             If they are none, or do not fit the recording.
         """
-        values: dict[str, Any] = {name: each.value for name, each in self.widgets.items()}
+        values: dict[str, Any] = {name: control.value for name, control in self.widgets.items()}
         # A slider at zero, and what is not chosen yet.
         unset = {
             name
             for name in ("threshold", "reflector", "time_offset_s")
             if name in values and not values[name]
         }
-        settings = with_values(self._given, {name: values[name] for name in values if name not in unset})
+        settings = with_values(self._start, {name: values[name] for name in values if name not in unset})
         require_frames(settings.frames_left_out, self.recording.images.shape[0])
         return settings
 
     def changed(self, *_: Any) -> None:
-        """What is set is something else."""
-        self._run.outdate()
+        """Show the settings as they are now; a result of others cannot be saved."""
+        if not self._save.disabled:
+            self._save.disabled = True
+            words = "Settings changed since this result: run again."
+            self._verdict.object = sentence(words, ORANGE) + self._verdict.object
         self._show()
 
     def show(self, image: npt.NDArray[Any], settings: ScanSettings) -> str:
@@ -139,41 +160,36 @@ class PhantomViewer:
         raise NotImplementedError
 
     def find(self, settings: ScanSettings) -> Seen:
-        """Find the phantom in all frames."""
+        """Find the phantom in all frames; called in a thread."""
         return found(self.recording, settings)
 
     def before_saving(self, settings: ScanSettings, out: Path) -> ScanSettings:
-        """Bring the settings of a run into what a command can be given."""
+        """Bring the settings of a run into what a command can be given, as by saving points set by hand."""
         return settings
 
-    def tell(self, words: str, colour: str = USED) -> None:
+    def tell(self, words: str, colour: str = BLUE) -> None:
         """Say something below the picture."""
-        self._said.object = sentence(words, colour, "phantom-told")
+        self._words.object = sentence(words, colour, "phantom-told")
 
-    def mark_used(self, frames: dict[int, str]) -> None:
-        """Say which frames have something, and forget what became of them before."""
-        self._used, self._dropped = frames, {}
+    def mark_frames(self, uses: dict[int, str], refusals: dict[int, str] | None = None) -> None:
+        """Say which frames have something and which not, in place of what became of them before."""
+        self._uses, self._refusals = uses, refusals or {}
         self._show()
 
-    @batched
+    @batch_changes
     def _show(self, *_: Any) -> None:
         try:
             settings = self.settings()
         except Speckle3DError as error:
-            self.tell(str(error), DROPPED)
+            self.tell(str(error), ORANGE)
             return
         left_out = dict.fromkeys(settings.frames_left_out, BY_HAND)
-        self._strip.show(self.frame, self._used, self._dropped, left_out)
+        self._strip.show(self.frame, self._uses, self._refusals, left_out)
         image = self.frame_plot.show_frame(self.frame, settings.corners)
         try:
             self.tell(self.show(image, settings))
         except Speckle3DError as error:
-            self.tell(str(error), DROPPED)
-
-    def _to_run(self) -> ScanSettings:
-        if "reflector" in self.widgets and not self.widgets["reflector"].value:
-            raise InvalidInputError("say first what the plane is: a bare wall, or a thin bar")
-        return self.settings()
+            self.tell(str(error), ORANGE)
 
     def _toggle(self, frame: int) -> None:
         with suppress(Speckle3DError):  # which is shown
@@ -184,32 +200,38 @@ class PhantomViewer:
         # A mouse knows no more than a tenth of a pixel, and a command can be given that.
         self.widgets["region"].value = " ".join(f"{column:.1f},{row:.1f}" for column, row in corners)
 
-    @batched
-    def _solved(self, run: Solved) -> None:
-        self._used = {} if run.seen is None else dict.fromkeys(map(int, run.seen.frame), "found")
-        self._dropped = {} if run.seen is None else dict(run.seen.dropped)
-        if run.outcome is not None:
-            frames = run.outcome.calibration.frames
-            self._used, self._dropped = dict.fromkeys(frames.used, "used"), dict(frames.dropped)
-        self._show()
+    async def _calibrate(self, _: object) -> None:
+        points, self._note.object, self._save.disabled = None, "", True
+        try:
+            if "reflector" in self.widgets and not self.widgets["reflector"].value:
+                raise InvalidInputError("say first what the plane is: a bare wall, or a thin bar")
+            settings = self.settings()
+            points = await run_in_thread(self._button, partial(self.find, settings))
+            outcome = await run_in_thread(self._button, partial(solved, self.recording, points, settings))
+        except Speckle3DError as error:
+            self._verdict.object, self._table.object = sentence(f"No calibration: {error}", ORANGE), ""
+            uses = {} if points is None else dict.fromkeys(map(int, points.frame), "found")
+            self.mark_frames(uses, {} if points is None else dict(points.dropped))
+            return
+        self._result, self._save.disabled = (settings, outcome), False
+        calibration, lacking = outcome.calibration, outcome.solution.adequacy.missing
+        self._verdict.object = sentence(calibration.verdict, _AMBER if lacking else BLUE)
+        table = text_report(calibration, outcome.beam, remarks(outcome))
+        self._table.object = f"<pre class='calibration' style='margin:0'>{html.escape(table)}</pre>"
+        self.mark_frames(dict.fromkeys(calibration.frames.used, "used"), dict(calibration.frames.dropped))
 
-
-def widget(settings: BaseModel, name: str) -> Any:
-    """Make the widget of a setting, which has its value; its description is the field's."""
-    field, value = type(settings).model_fields[name], getattr(settings, name)
-    label, look = name.replace("_", " "), {"width": _WIDTH_PX, "margin": (2, 8)}
-    options = {"description": field.description, **look}
-    if name in _SLIDERS:
-        label, low, high, step = _SLIDERS[name]
-        kind = pn.widgets.IntSlider if isinstance(field.default, int) else pn.widgets.FloatSlider
-        value, default = value or 0.0, field.default or 0.0
-        ends = {"start": min(low, value), "end": max(high, value), "step": step}
-        return kind(name=f"{label} (default {default:g})", value=value, **ends, **look)
-    if isinstance(field.default, bool):
-        return pn.widgets.Checkbox(name=field.description, value=value, **look)
-    if get_origin(field.annotation) is Literal:
-        return pn.widgets.Select(name=label, options=list(get_args(field.annotation)), value=value, **options)
-    if isinstance(field.default, float):
-        return pn.widgets.FloatInput(name=f"{label} (default {field.default:g})", value=value, **options)
-    text = "" if value is None else str(value)
-    return pn.widgets.TextInput(name=label, value=text, placeholder=field.description, **look)
+    def _write_result(self, _: object) -> None:
+        if self._result is None:
+            return
+        (settings, outcome), name = self._result, self._name.value or ""
+        try:
+            out = self.folder.place(name if name.endswith(".h5") else f"{name}.h5")
+            for suffix in BESIDE:
+                self.folder.place(out.with_suffix(suffix).name)
+            settings = self.before_saving(settings, out)
+            files = write_outcome(outcome, settings, self.images, out, remarks(outcome)).files
+        except Speckle3DError as error:
+            self._note.object = sentence(str(error), ORANGE)
+            return
+        names = ", ".join(path.name for path in files)
+        self._note.object = sentence(f"Saved {names} in {self.folder.path}", BLUE)

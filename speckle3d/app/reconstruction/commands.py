@@ -32,14 +32,18 @@ def reslice_command(
     sweep_file : path, optional
         The sweep, if it is not where the reconstruction says.
     """
-    words = ["speckle3d", "reslice", str(source), "-o", out]
-    for mode in modes:
-        words += ["--mode", mode]
-    if len(modes) > 1:
-        words += ["--difference-to", modes[0]]
+    words = [
+        "speckle3d",
+        "reslice",
+        source,
+        "-o",
+        out,
+        *(word for mode in modes for word in ("--mode", mode)),
+    ]
+    words += ["--difference-to", modes[0]] if len(modes) > 1 else []
     for name, value in place.items():
         words += ["--" + name.replace("_", "-"), f"{value:g}"]
-    return shlex.join([*words, *(["--sweep", str(sweep_file)] if sweep_file else [])])
+    return shlex.join([*map(str, words), *(["--sweep", str(sweep_file)] if sweep_file else [])])
 
 
 def measure_command(source: Path, mode: str, points_mm: Sequence[FloatArray]) -> str:

@@ -29,11 +29,11 @@ class CutPlot(ImagePlot):
         Of the plot's model, by which it is found.
     colours : tuple of str
         Of the upright and of the level line of the cross hair: those of the sliders that move them.
-    tapped : callable
+    on_tap : callable
         Called with the point of the world that was clicked on, shape (3,), mm.
     """
 
-    def __init__(self, name: str, colours: tuple[str, str], tapped: Callable[[FloatArray], None]) -> None:
+    def __init__(self, name: str, colours: tuple[str, str], on_tap: Callable[[FloatArray], None]) -> None:
         super().__init__("", "", name=f"cut-{name}", title=" ", active_drag=None)
         self.plane: ReslicePlane | None = None
         self.plot.title.update(text_font_size="12px", text_font_style="normal")
@@ -47,24 +47,23 @@ class CutPlot(ImagePlot):
         self.plot.line("x", "y", color="white", line_dash=[4, 3], source=self._points)
         self.plot.scatter("x", "y", size=8, color="#ff3030", line_color="white", source=self._points)
         self.plot.text("x", "y", "number", x_offset=6, y_offset=-3, color="#ffe600", source=self._points)
-        self.plot.on_event(Tap, lambda event: self._tapped(tapped, event))
+        self.plot.on_event(Tap, lambda event: self._tell(on_tap, event))
 
-    def show_cut(self, picture: CutPicture, mode: str, other: str | None) -> None:
+    def show_cut(self, picture: CutPicture, mode: str, overlay: str | None) -> None:
         """Show a cut at the poses of one mode, or of another (magenta) laid over it (green)."""
-        drawn = picture.cuts[mode]
-        assert isinstance(drawn.cut, ReslicePlane)  # only along a curve there is another kind
-        low, high = picture.levels
-        if other is None:
-            colours = greys(drawn.image, low, high)
+        image, plane = picture.cuts[mode].image, picture.cuts[mode].cut
+        assert isinstance(plane, ReslicePlane)  # only along a curve there is another kind
+        if overlay is None:
+            colours = greys(image, *picture.levels)
         else:
             # Of what the other is laid over: dark and bright, so that the colours are strong.
-            dark, bright = np.nanpercentile(drawn.image, _OVERLAY_PERCENTILES)
-            both = np.stack([picture.cuts[other].image, drawn.image])
-            magenta, green = np.nan_to_num(np.clip((both - dark) / max(bright - dark, 1e-3), 0.0, 1.0))
-            seen = np.isfinite(both).any(axis=0)
-            colours = np.rint(255 * np.dstack([magenta, green, magenta, seen])).astype(np.uint8)
-        self.show(colours, drawn.cut.first_mm, (drawn.cut.pixel_mm,) * 2)
-        self.plane = drawn.cut
+            dark, bright = np.nanpercentile(image, _OVERLAY_PERCENTILES)
+            layers = np.stack([picture.cuts[overlay].image, image])
+            magenta, green = np.nan_to_num(np.clip((layers - dark) / max(bright - dark, 1e-3), 0.0, 1.0))
+            alpha = np.isfinite(layers).any(axis=0)
+            colours = np.rint(255 * np.dstack([magenta, green, magenta, alpha])).astype(np.uint8)
+        self.show(colours, plane.first_mm, (plane.pixel_mm,) * 2)
+        self.plane = plane
         self.plot.title.text = picture.place.split(", seen")[0]
         self.plot.xaxis.axis_label, self.plot.yaxis.axis_label = (f"{name} / mm" for name in picture.axes)
 
@@ -80,6 +79,6 @@ class CutPlot(ImagePlot):
         numbers = [str(k + 1) for k in range(len(points_mm))]
         self._points.data = {"x": x[1:], "y": y[1:], "number": numbers}
 
-    def _tapped(self, told: Callable[[FloatArray], None], event: Tap) -> None:
+    def _tell(self, on_tap: Callable[[FloatArray], None], event: Tap) -> None:
         if self.plane is not None and event.x is not None and event.y is not None:
-            told(self.plane.world_from_mm(event.x, event.y))
+            on_tap(self.plane.world_from_mm(event.x, event.y))

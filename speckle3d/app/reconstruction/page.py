@@ -13,7 +13,7 @@ import param
 from panel.viewable import Viewable
 
 from speckle3d.app.folder import Folder
-from speckle3d.app.look import batched
+from speckle3d.app.look import batch_changes
 from speckle3d.app.reconstruction.commands import code, measure_command, reslice_command
 from speckle3d.app.reconstruction.cut_plot import CutPlot
 from speckle3d.core.arrays import FloatArray
@@ -76,32 +76,32 @@ class ReconstructionPage:
         mode: str = "image",
     ) -> None:
         self.reconstruction, self.mode, self.folder = reconstruction, mode, folder
-        self.source = Path(folder.opened.name)
-        stored = Path(reconstruction.provenance.input_path)
-        is_there = sweep_file is None and (folder.path / stored).exists()
-        self.sweep_file = None if is_there else (sweep_file or stored).resolve()
+        self.source = Path(folder.file.name)
+        recording = Path(reconstruction.provenance.input_path)
+        is_there = sweep_file is None and (folder.path / recording).exists()
+        self.sweep_file = None if is_there else (sweep_file or recording).resolve()
         poses = reconstruction.poses[mode]
-        self._posed = PosedSweep(sweep, np.arange(len(sweep)), poses, mode, reconstruction)
+        self._sweep = PosedSweep(sweep, np.arange(len(sweep)), poses, mode, reconstruction)
         self.reference = find_reference(sweep)
         whole = self.reference is not None and self.reference.covered.all()
         self.modes = (*reconstruction.poses, *([self.reference.name] if self.reference and whole else []))
         # Images reach twice as far as the sweep's longest steps, so that no gaps show.
         steps = np.linalg.norm(np.diff(poses.apply(reconstruction.grid.centre_mm), axis=0), axis=1)
         self.reach_mm = max(_LEAST_REACH_MM, round(2.0 * float(np.percentile(steps, 99)), 1))
-        self.calibrations = [used.path for used in reconstruction.provenance.calibrations]
-        self.opened = lru_cache(self._opened)
+        self.calibrations = [source.path for source in reconstruction.provenance.calibrations]
+        self.posed = lru_cache(self._at_modes)
 
     def view(self) -> Viewable:
         """Cuts, trajectories and what is measured in them."""
         return _Viewer(self).layout()
 
-    def _opened(self, mode: str, other: str | None) -> OpenedModes:
-        return at_modes(self._posed, [mode, *([other] if other else [])], mode)
+    def _at_modes(self, mode: str, overlay: str | None) -> OpenedModes:
+        return at_modes(self._sweep, [mode, *([overlay] if overlay else [])], mode)
 
     @cached_property
     def images(self) -> tuple[Images, ImageGrid]:
         """Images to cut, log-compressed, and their grid."""
-        images, grid = self._posed.images(RANGE_DB)
+        images, grid = self._sweep.images(RANGE_DB)
         read = images if callable(images) else images.__getitem__
         return lru_cache(max(KEPT_BYTES // (4 * grid.vectors * grid.samples), 1))(read), grid
 
@@ -110,7 +110,7 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
     """What one viewer sees: modes, where the cross hair is, and measured points."""
 
     mode = param.Selector(label="mode")
-    other = param.Selector(label="compared with")
+    overlay = param.Selector(label="compared with")
     frame = param.Integer(label="frame")
     lateral_mm = param.Number(label="lateral / mm", step=0.05)
     depth_mm = param.Number(label="depth / mm", step=0.05)
@@ -120,13 +120,13 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
         self._page = page
         grid = self._grid = page.reconstruction.grid
         modes = {label_of(mode): mode for mode in page.modes}
-        self.param.mode.objects, self.param.other.objects = modes, {"(nothing)": "", **modes}
+        self.param.mode.objects, self.param.overlay.objects = modes, {"(nothing)": "", **modes}
         self.param.frame.bounds = (0, len(page.reconstruction.frame_time_s) - 1)
         middle_mm = grid.extent_mm.mean(axis=0).round(2).tolist()
         self.param.lateral_mm.bounds, self.param.depth_mm.bounds = map(tuple, grid.extent_mm.T.tolist())
         super().__init__(
             mode=page.mode,
-            other="",
+            overlay="",
             frame=self.param.frame.bounds[1] // 2,
             lateral_mm=middle_mm[0],
             depth_mm=middle_mm[1],
@@ -135,25 +135,23 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
             name: CutPlot(name, (_COLOURS[upright], _COLOURS[level]), self._go)
             for name, (_, (upright, level)) in _CUTS.items()
         }
-        self._told, self._commands = pn.pane.HTML(_HELP, width=_SIDE_PX), pn.pane.HTML("", width=_SIDE_PX)
+        self._words, self._commands = pn.pane.HTML(_HELP, width=_SIDE_PX), pn.pane.HTML("", width=_SIDE_PX)
         self._lengths = pn.pane.HTML("", width=_SIDE_PX)
         for name, (slider, _) in _CUTS.items():
-            self.param.watch(lambda *_, name=name: self._cut(name), ["mode", "other", slider])
+            self.param.watch(lambda *_, name=name: self._cut(name), ["mode", "overlay", slider])
             self._cut(name)
         # After the cuts that it is drawn in.
-        self.param.watch(self._placed, [*_COLOURS, "mode", "other", "points_mm"], precedence=1)
+        self.param.watch(self._draw_points, [*_COLOURS, "mode", "overlay", "points_mm"], precedence=1)
         self.param.watch(lambda _: setattr(self, "points_mm", []), "mode")
-        self.param.watch(self._measured, "points_mm")
+        self.param.watch(self._measure, "points_mm")
         self._space = pn.pane.Plotly(None)
-        self._placed()
+        self._draw_points()
 
     def layout(self) -> Viewable:
         """Sliders and measurements on the left, then two tall cuts, the third, and the trajectories."""
-        chosen: dict[str, Any] = {name: {"bar_color": colour} for name, colour in _COLOURS.items()}
-        chosen |= {name: {"width": _SIDE_PX} for name in ("mode", "other")}
-        controls = pn.Param(
-            self, parameters=["mode", "other", *_COLOURS], widgets=chosen, show_name=False, width=_SIDE_PX
-        )
+        looks: dict[str, Any] = {name: {"width": _SIDE_PX} for name in ("mode", "overlay")}
+        looks |= {name: {"bar_color": colour} for name, colour in _COLOURS.items()}
+        controls = pn.Param(self, parameters=[*looks], widgets=looks, show_name=False, width=_SIDE_PX)
         half = {"width": _SIDE_PX // 2 - 10}
         add = pn.widgets.Button(name="Add the point", button_type="primary", **half)
         remove = pn.widgets.Button(name="Remove the last", **half)
@@ -167,7 +165,7 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
                 "<br>".join(f"calibration used: {escape(path)}" for path in self._page.calibrations)
             ),
             pn.Row(add, remove, margin=0),
-            self._told,
+            self._words,
             commands,
             width=_SIDE_PX + 40,
             scroll="y-auto",
@@ -182,7 +180,7 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
     def _trajectories(self) -> Viewable:
         """Outlines of frames in space, and length and angles over the frames, of all modes."""
         page = self._page
-        poses = {mode: page.opened(mode, None).poses[mode] for mode in page.modes}
+        poses = {mode: page.posed(mode, None).poses[mode] for mode in page.modes}
         self._space = pn.pane.Plotly(plot_outlines(poses, self._grid), sizing_mode="stretch_both")
         self._space.object.update_layout(
             height=None,
@@ -216,7 +214,7 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
 
     def _draw_planes(self) -> None:
         """Draw where the cuts are in space."""
-        first = self._page.opened(*self._pair).poses[self.mode][0].inv()
+        first = self._page.posed(*self._pair).poses[self.mode][0].inv()
         hulls = [first.apply(plot.plane.hull_mm) for plot in self._plots.values() if plot.plane is not None]
         # Of the first pixels of all columns and the last ones, the first and the last column's.
         corners = [
@@ -228,46 +226,42 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
         self._space.param.trigger("object")
 
     @property
-    def _modes(self) -> list[str]:
-        return [mode for mode in self._pair if mode]
-
-    @property
     def _cross_mm(self) -> FloatArray:
         """Where the cross hair is in the world of the mode, shape (3,)."""
-        pose = self._page.opened(*self._pair).poses[self.mode][self.frame]
+        pose = self._page.posed(*self._pair).poses[self.mode][self.frame]
         return np.asarray(pose.apply([self.lateral_mm, self.depth_mm, 0.0]))
 
     @property
     def _pair(self) -> tuple[str, str | None]:
-        return self.mode, self.other if self.other not in ("", self.mode) else None
+        return self.mode, self.overlay if self.overlay not in ("", self.mode) else None
 
     def _slider(self, name: str) -> dict[str, Any]:
         """Name and value of the slider that moves a cut."""
         slider = _CUTS[name][0]
         return {slider: getattr(self, slider)}
 
-    @batched
+    @batch_changes
     def _cut(self, name: str) -> None:
-        opened, plot = self._page.opened(*self._pair), self._plots[name]
+        posed, plot = self._page.posed(*self._pair), self._plots[name]
         try:
             (images, grid), reach_mm = self._page.images, self._page.reach_mm
             if name == "frame":
-                place = in_frame(opened, grid, self.frame, reach_mm=reach_mm)
+                place = in_frame(posed, grid, self.frame, reach_mm=reach_mm)
             else:
-                place = along_sweep(opened, grid, **self._slider(name))
-            picture = cut_posed(opened, place, RANGE_DB, (images, grid), reach_mm=reach_mm)
+                place = along_sweep(posed, grid, **self._slider(name))
+            picture = cut_posed(posed, place, RANGE_DB, (images, grid), reach_mm=reach_mm)
         except Speckle3DError as error:
             plot.plot.title.text = str(error).split(";")[0]
             return
         plot.show_cut(picture, *self._pair)
-        said = "".join(f"{label_of(mode)}: {length}<br>" for mode, length in picture.lengths.items())
+        words = "".join(f"{label_of(mode)}: {length}<br>" for mode, length in picture.lengths.items())
         if self._pair[1]:
-            said += "green: this mode alone, magenta: the other alone, grey: both"
-        self._lengths.object = said
+            words += "green: this mode alone, magenta: the other alone, grey: both"
+        self._lengths.object = words
 
     def _go(self, point_mm: FloatArray) -> None:
         """Put the cross hair where the nearest frame has a point; beside the images, leave it."""
-        inside = self._page.opened(*self._pair).poses[self.mode].inv().apply(point_mm)
+        inside = self._page.posed(*self._pair).poses[self.mode].inv().apply(point_mm)
         away = np.abs(inside[:, 2])
         away[self.frame] -= 1e-6  # of frames that lie as near, the one that is shown
         frame = int(np.argmin(away))
@@ -276,8 +270,8 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
         if left <= lateral <= right and top <= depth <= bottom and away[frame] <= self._page.reach_mm:
             self.param.update(frame=frame, lateral_mm=lateral, depth_mm=depth)
 
-    @batched
-    def _placed(self, *_: Any) -> None:
+    @batch_changes
+    def _draw_points(self, *_: Any) -> None:
         """Draw the cross hair and the points, and write the commands."""
         page = self._page
         points = np.array(self.points_mm).reshape(-1, 3)
@@ -288,7 +282,7 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
                 reslice_command(
                     page.source,
                     f"{name}.png",
-                    self._modes,
+                    [mode for mode in self._pair if mode],
                     {**self._slider(name), "reach_mm": page.reach_mm},
                     page.sweep_file,
                 )
@@ -302,7 +296,7 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
         """Measure from and to where the cross hair is."""
         self.points_mm = [*self.points_mm, np.round(self._cross_mm, _DIGITS)]
 
-    def _measured(self, *_: Any) -> None:
+    def _measure(self, *_: Any) -> None:
         """Say what is between the points, as `speckle3d measure` does, and give its command."""
         page, points = self._page, np.array(self.points_mm).reshape(-1, 3)
         lines = [
@@ -311,7 +305,7 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
         command = ""
         if len(points) > 1:
             try:
-                lines += [found.line for found in measure(page.reconstruction, points, self.mode)]
+                lines += [row.line for row in measure(page.reconstruction, points, self.mode)]
                 picked_mm = PICKED * self._grid.vector_pitch_mm
                 lines.append(
                     f"mode {self.mode}; points picked to {picked_mm:.2g} mm per axis; "
@@ -321,6 +315,6 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
                 command = code(measure_command(page.source, self.mode, list(points)))
             except Speckle3DError as error:
                 lines.append(str(error))
-        self._told.object = (
+        self._words.object = (
             "".join(f"<p style='margin:3px 0'>{escape(line)}</p>" for line in lines) + command or _HELP
         )

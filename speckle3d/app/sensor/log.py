@@ -50,7 +50,7 @@ class LogReadings:
 
     def columns(self) -> Columns:
         """Readings at the times of the orientation, or at all where there is none."""
-        log, found, stream = self._log, self._orientation, self._stream
+        log, orientation, stream = self._log, self._orientation, self._stream
         at = slice(None) if stream is None else np.searchsorted(log.time_s, stream[0] - 1e-9)
         time_s = log.time_s[at]
         columns = {name: np.full(len(time_s), np.nan) for name in COLUMNS} | {"t": time_s - self._start_s}
@@ -64,12 +64,13 @@ class LogReadings:
         heading = np.degrees(heading_rad(stream[1]))
         columns |= {"heading": heading, "low": heading, "high": heading}
         if field is not None:
-            there = np.flatnonzero(np.isfinite(field).all(axis=1))
-            columns["dip"][there] = np.degrees(dip_rad(stream[1][there].apply(field[there])))
-        if isinstance(found, Orientation):
-            half = NORMAL_95 * np.degrees(found.standard_deviation_rad[:, 2])
+            rows = np.flatnonzero(np.isfinite(field).all(axis=1))
+            columns["dip"][rows] = np.degrees(dip_rad(stream[1][rows].apply(field[rows])))
+        if isinstance(orientation, Orientation):
+            half = NORMAL_95 * np.degrees(orientation.standard_deviation_rad[:, 2])
             columns |= {"low": heading - half, "high": heading + half}
-            columns["doubt"] = np.where(found.disturbed & found.magnetic, columns["field"], np.nan)
+            doubtful = orientation.disturbed & orientation.magnetic
+            columns["doubt"] = np.where(doubtful, columns["field"], np.nan)
         return columns
 
     def gaps_s(self) -> list[float]:
@@ -78,13 +79,13 @@ class LogReadings:
 
     def judgement(self) -> tuple[Trust, str]:
         """Whether the magnetometer can be trusted here, and why."""
-        field, found = self._log.magnetometer_au, self._orientation
+        field, orientation = self._log.magnetometer_au, self._orientation
         if field is None or not np.isfinite(field).any():
             return Trust.UNKNOWN, "The magnetometer cannot be judged here: the log has no readings of one."
-        if isinstance(found, str):
-            return Trust.UNKNOWN, f"The magnetometer cannot be judged here: {found}."
-        judged = field_of(self._log, found)
-        return judged.trust, judged.sentence()
+        if isinstance(orientation, str):
+            return Trust.UNKNOWN, f"The magnetometer cannot be judged here: {orientation}."
+        judgement = field_of(self._log, orientation)
+        return judgement.trust, judgement.sentence()
 
     def orientation_at(self, time_s: float) -> Rotation | None:
         """World from sensor at a time from zero; the nearest before and after the stream."""
@@ -97,30 +98,26 @@ class LogReadings:
 
     def facts(self, time_s: float) -> list[tuple[str, str]]:
         """How it was held at a time, and what the log is."""
-        log, found, held = self._log, self._orientation, self.orientation_at(time_s)
-        rows = [] if held is None else [angles(held)]
-        north = "magnetic north, y west"
-        if isinstance(found, Orientation):
-            at = min(int(np.searchsorted(found.rotations.time_s, time_s + self._start_s)), len(found) - 1)
-            *inclination, heading = NORMAL_95 * np.degrees(found.standard_deviation_rad[at])
+        log, orientation, rotation = self._log, self._orientation, self.orientation_at(time_s)
+        rows = [] if rotation is None else [angles(rotation)]
+        north, notes, losses = "magnetic north, y west", log.notes, "none"
+        if isinstance(orientation, Orientation):
+            times_s, last = orientation.rotations.time_s, len(orientation) - 1
+            at = min(int(np.searchsorted(times_s, time_s + self._start_s)), last)
+            *inclination, heading = NORMAL_95 * np.degrees(orientation.standard_deviation_rad[at])
             rows.append(("known to (95 %)", f"inclination {max(inclination):.1f}°, heading {heading:.1f}°"))
-            rows.append(("state", "at rest" if found.resting[at] else "moving"))
-            north = north if found.magnetic else "where it was at the start, y to its left"
-        longest = max((gap.duration_s for gap in log.gaps), default=0.0)
-        lost = (
-            f"{log.lost} samples in {len(log.gaps)} gaps, the longest of {longest:.3f} s"
-            if log.gaps
-            else "none"
-        )
-        notes = (*log.notes, *(found.notes if isinstance(found, Orientation) else ()))
+            rows.append(("state", "at rest" if orientation.resting[at] else "moving"))
+            north = north if orientation.magnetic else "where it was at the start, y to its left"
+            notes = (*notes, *orientation.notes)
+        if log.gaps:
+            longest_s = max(gap.duration_s for gap in log.gaps)
+            losses = f"{log.lost} samples in {len(log.gaps)} gaps, the longest of {longest_s:.3f} s"
+        origin = "none: neither its own nor by its readings" if self._stream is None else self._stream[2]
         return [
             *rows,
             ("log", f"{len(log)} samples, {log.duration_s:.1f} s, {log.rate_hz:.1f} per second"),
-            ("lost", lost),
-            (
-                "orientation",
-                "none: neither its own nor by its readings" if self._stream is None else self._stream[2],
-            ),
+            ("lost", losses),
+            ("orientation", origin),
             ("world", f"x {north}, z up"),
             *(("note", text) for text in notes),
         ]

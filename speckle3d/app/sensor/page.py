@@ -15,10 +15,10 @@ from panel.viewable import Viewable
 from plotly import graph_objects as go
 from scipy.spatial.transform import Rotation
 
-from speckle3d.app.look import batched
+from speckle3d.app.look import batch_changes
 from speckle3d.app.plots import time_plot
-from speckle3d.app.sensor.source import Source
-from speckle3d.app.sensor.watch import SHOWN_S
+from speckle3d.app.sensor.log import LogReadings
+from speckle3d.app.sensor.watch import SHOWN_S, SensorWatch
 from speckle3d.core.arrays import FloatArray
 from xsens.fusion.field import Trust
 
@@ -44,6 +44,7 @@ _PLOTS = {
     "dip, °": ("dip",),
     "heading, °": ("heading",),
 }
+Source = LogReadings | SensorWatch
 _REFRESH_MS, _STEP_S = 125, 0.1
 _LEFT_PX = 350
 _KEY = (
@@ -58,8 +59,8 @@ class SensorPage:
 
     Parameters
     ----------
-    source : Source
-        `LogReadings` of a log, or a `SensorWatch` that runs.
+    source : LogReadings or SensorWatch
+        Of a log, or of a sensor at work.
     sensor_from_image : Rotation, optional
         How the sensor sits on the probe.
 
@@ -106,12 +107,12 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
 
     def layout(self) -> Viewable:
         """Lay everything out, and begin to follow a live sensor."""
-        shown = {
+        lines = {
             label: names
             for label, names in _PLOTS.items()
             if self._source.is_live or np.isfinite(self._data.data[names[0]]).any()
         }
-        plots = [self._plot(label, names) for label, names in (shown or _PLOTS).items()]
+        plots = [self._plot(label, names) for label, names in (lines or _PLOTS).items()]
         plots[-1].xaxis.axis_label = "time before now, s" if self._source.is_live else "time, s"
         left: list[Any] = [self._probe, self._facts]
         if self._source.is_live:
@@ -150,19 +151,19 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
         low, high = self.param.step.bounds
         self.step = int(np.clip(round(time_s / _STEP_S), low, high))
 
-    @batched
+    @batch_changes
     def _refresh(self) -> None:
         self._data.data = self._source.columns()
         self._show()
 
-    @batched
+    @batch_changes
     def _show(self, *_: Any) -> None:
         """Show how it is held, and what is to say."""
         time_s = _STEP_S * self.step
         self._cursor.location = time_s
-        held = self._source.orientation_at(time_s)
-        if held is not None:
-            turn_probe(self._probe.object, held if self._mounting is None else held * self._mounting)
+        rotation = self._source.orientation_at(time_s)
+        if rotation is not None:
+            turn_probe(self._probe.object, rotation * (self._mounting or Rotation.identity()))
             self._probe.param.trigger("object")
         rows = self._source.facts(time_s)
         if self._mounting is None:
@@ -204,5 +205,5 @@ def figure_probe() -> go.Figure:
 def turn_probe(figure: go.Figure, world_from_image: Rotation) -> None:
     """Show the probe as it is held."""
     for trace, corners in zip(figure.data, _PARTS.values(), strict=False):
-        turned: FloatArray = world_from_image.apply(corners)
-        trace.update(dict(zip("xyz", turned.T, strict=True)))
+        world: FloatArray = world_from_image.apply(corners)
+        trace.update(dict(zip("xyz", world.T, strict=True)))

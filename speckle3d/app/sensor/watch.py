@@ -81,14 +81,14 @@ class SensorWatch:
 
     def columns(self) -> Columns:
         """The last minute, by the time before now."""
-        rows = np.array([_row(state) for state in list(self.states)], dtype=float).reshape(-1, len(COLUMNS))
-        columns = dict(zip(COLUMNS, rows.T, strict=True))
+        table = np.array([_row(state) for state in list(self.states)], dtype=float).reshape(-1, len(COLUMNS))
+        columns = dict(zip(COLUMNS, table.T, strict=True))
         columns["t"] = columns["t"] - columns["t"][-1:]
-        there = np.isfinite(columns["heading"])
-        heading = columns["heading"][there]
-        columns["heading"][there] = np.degrees(np.unwrap(np.radians(heading)))
+        rows = np.isfinite(columns["heading"])
+        heading = columns["heading"][rows]
+        columns["heading"][rows] = np.degrees(np.unwrap(np.radians(heading)))
         for end in ("low", "high"):
-            columns[end][there] += columns["heading"][there] - heading
+            columns[end][rows] += columns["heading"][rows] - heading
         return columns
 
     def gaps_s(self) -> list[float]:
@@ -102,17 +102,19 @@ class SensorWatch:
         states = list(self.states)
         if not states:
             return Trust.UNKNOWN, "Waiting for the sensor's first samples."
-        now = states[-1]
-        if not now.connected:
-            return Trust.UNKNOWN, f"The sensor is not connected: {now.note or 'waiting for it'}."
-        if now.fused is None or not np.isfinite(now.field):
-            lacking = "gyroscope or accelerometer" if now.fused is None else "the magnetometer"
+        last = states[-1]
+        if not last.connected:
+            return Trust.UNKNOWN, f"The sensor is not connected: {last.note or 'waiting for it'}."
+        if last.fused is None or not np.isfinite(last.field):
+            lacking = "gyroscope or accelerometer" if last.fused is None else "the magnetometer"
             return Trust.UNKNOWN, f"The magnetometer cannot be judged here: {lacking} is missing."
-        if not now.fused.started:
+        if not last.fused.started:
             return Trust.UNKNOWN, "Hold the sensor still: its filter is finding up and north."
-        known = [state.fused.disturbed for state in states if state.fused is not None and state.fused.started]
-        found = field_now(now.fused, float(np.mean(known)))
-        return found.trust, found.sentence()
+        doubts = [
+            state.fused.disturbed for state in states if state.fused is not None and state.fused.started
+        ]
+        judgement = field_now(last.fused, float(np.mean(doubts)))
+        return judgement.trust, judgement.sentence()
 
     def orientation_at(self, time_s: float) -> Rotation | None:
         """World from sensor now."""
@@ -122,15 +124,15 @@ class SensorWatch:
         """How it is held, and what has arrived."""
         if not self.states:
             return []
-        now = self.states[-1]
-        kept = f"in {self._record}" if self._record else "nowhere: named with --record they are kept"
+        last = self.states[-1]
+        place = f"in {self._record}" if self._record else "nowhere: named with --record they are kept"
         return [
-            ("sensor", f"on {self._port}" if now.connected else f"NOT CONNECTED: {now.note}"),
-            *([] if now.world_from_sensor is None else [angles(now.world_from_sensor)]),
-            ("samples", f"{now.samples} in {now.elapsed_s:.0f} s, {now.rate_hz:.1f} per second"),
-            ("lost", f"{now.lost} samples, {now.interruptions} interruptions"),
+            ("sensor", f"on {self._port}" if last.connected else f"NOT CONNECTED: {last.note}"),
+            *([] if last.world_from_sensor is None else [angles(last.world_from_sensor)]),
+            ("samples", f"{last.samples} in {last.elapsed_s:.0f} s, {last.rate_hz:.1f} per second"),
+            ("lost", f"{last.lost} samples, {last.interruptions} interruptions"),
             ("world", "x magnetic north, y west, z up"),
-            ("its bytes", kept),
+            ("its bytes", place),
         ]
 
 

@@ -64,10 +64,8 @@ class FrameFindings:
     def judge_next(self) -> None:
         """Look at one more frame; after the last all have their flags."""
         samples = read_frame(self._sweep.frames, len(self._features))
-        intensity, is_bmode = (
-            self._extractor.intensity(samples),
-            isinstance(self._sweep.signal, BModeSettings),
-        )
+        intensity = self._extractor.intensity(samples)
+        is_bmode = isinstance(self._sweep.signal, BModeSettings)
         self._features.append(inspect_frame(samples, intensity, self._patches, is_bmode, self._quality))
         if len(self._features) == len(self._sweep):
             self.flags = flag_frames(self._features, self._quality)

@@ -12,11 +12,11 @@ import panel as pn
 import param
 from panel.viewable import Viewable
 
-from speckle3d.app.look import batched
+from speckle3d.app.look import batch_changes
 from speckle3d.app.plots import greys
 from speckle3d.app.sweep.findings import FrameFindings
 from speckle3d.app.sweep.pairs import NEIGHBOURS, PatchValues, SweepPairs
-from speckle3d.app.sweep.plots import FLAGGED, PatchPlot, TimePlots
+from speckle3d.app.sweep.plots import FLAG_COLOUR, PatchPlot, TimePlots
 from speckle3d.config import Config, stored_config
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.doubts import Doubt
@@ -90,13 +90,13 @@ class _Player(param.Parameterized):  # type: ignore[misc]
     def __init__(self, page: SweepPage) -> None:
         self._page, self._findings = page, page.findings
         last = len(page.sweep) - 1
-        quantities = ["distance", "sigma", "correlation"] if page.pairs.are_reconstructed else ["correlation"]
+        quantities = ["distance", "sigma", "correlation"] if page.pairs.have_distances else ["correlation"]
         self.param.frame.bounds = (0, max(last, 1))
         self.param.colour.objects = ["none", *quantities]
-        super().__init__(colour=quantities[0] if page.pairs.are_reconstructed else "none")
+        super().__init__(colour=quantities[0] if page.pairs.have_distances else "none")
         self._picture = PatchPlot(page.pairs.patch_mm)
         self._times = TimePlots(page.sweep, self.go)
-        self._told = pn.pane.HTML("", sizing_mode="stretch_width")
+        self._text = pn.pane.HTML("", sizing_mode="stretch_width")
         self._state = pn.pane.HTML("", sizing_mode="stretch_width")
         self.param.watch(self._draw, ["frame", "colour", "lag", "range_db"])
         self._draw()
@@ -115,7 +115,7 @@ class _Player(param.Parameterized):  # type: ignore[misc]
             **wide,
         )
         colour = pn.widgets.RadioButtonGroup.from_param(self.param.colour, button_style="outline")
-        streams = [pn.pane.Bokeh(self._times.stream(*each), **wide) for each in streams_of(sweep)]
+        streams = [pn.pane.Bokeh(self._times.stream(*stream), **wide) for stream in streams_of(sweep)]
         if self._findings.flags is None:
             self._clock = pn.state.add_periodic_callback(self._judge, period=_JUDGING_MS)
         right = pn.Column(
@@ -125,7 +125,7 @@ class _Player(param.Parameterized):  # type: ignore[misc]
                 pn.widgets.IntSlider.from_param(self.param.lag, width=215),
                 pn.widgets.IntSlider.from_param(self.param.range_db, width=215),
             ),
-            self._told,
+            self._text,
             self._state,
             *(pn.pane.HTML(f"&bull; {escape(doubt.consequence)}") for doubt in self._findings.doubts),
             pn.pane.Bokeh(self._times.marks, **wide),
@@ -150,45 +150,45 @@ class _Player(param.Parameterized):  # type: ignore[misc]
             self._draw()
         self._draw_findings()
 
-    @batched
+    @batch_changes
     def _draw_findings(self) -> None:
         self._times.mark(self._findings.flags, self._findings.doubts)
         self._state.object = escape(self._findings.state())
 
-    @batched
+    @batch_changes
     def _draw(self, *_: Any) -> None:
         frame, pairs = self.frame, self._page.pairs
         # Where the sweep ends, the other way.
-        other = frame + self.lag if 0 <= frame + self.lag < len(self._page.sweep) else frame - self.lag
+        partner = frame + self.lag if 0 <= frame + self.lag < len(self._page.sweep) else frame - self.lag
         values = None
-        if self.colour != "none" and self.lag and 0 <= other < len(self._page.sweep):
-            values = pairs.values(frame, other, self.colour == "correlation")
+        if self.colour != "none" and self.lag and 0 <= partner < len(self._page.sweep):
+            values = pairs.values(frame, partner, self.colour == "correlation")
         self._picture.show(greys(self._page.image(frame), -self.range_db, 0.0), *self._page.place)
         self._picture.colour(values, self.colour, pairs.most(self.colour))
         self._times.move(frame)
-        self._told.object = "<br>".join(self._words(frame, other, values))
+        self._text.object = "<br>".join(self._words(frame, partner, values))
 
-    def _words(self, frame: int, other: int, values: PatchValues | None) -> Iterator[str]:
+    def _words(self, frame: int, partner: int, values: PatchValues | None) -> Iterator[str]:
         """What is shown, as HTML."""
         time_s = self._page.sweep.frame_time_s
         yield f"<b>Frame {frame}</b> of 0 to {len(time_s) - 1}, at {time_s[frame] - time_s[0]:.3f} s"
         for reason in self._findings.reasons(frame):
-            yield f'<span style="color:{FLAGGED}">&#9873; {escape(reason)}</span>'
+            yield f'<span style="color:{FLAG_COLOUR}">&#9873; {escape(reason)}</span>'
         if values is None:
             return
-        words = [f"<b>With frame {other}</b>"]
-        if values.moved_mm is not None:
-            moved, sigma = values.moved_mm
+        words = [f"<b>With frame {partner}</b>"]
+        if values.elevation_mm is not None:
+            elevation, sigma = values.elevation_mm
             words.append(
-                f"the image's centre is {moved:.3f} mm away, elevational (standard deviation {sigma:.3f})"
+                f"the image's centre is {elevation:.3f} mm away, elevational (standard deviation {sigma:.3f})"
             )
         if np.isfinite(values.correlation).any():
             words.append(f"median correlation {np.nanmedian(values.correlation):.3f}, computed anew")
         yield "; ".join(words)
-        if values.used is not None:
-            left_out = np.isfinite(values.distance_mm) & ~values.used
-            yield f"{values.used.sum()} patches used, {left_out.sum()} left out (red crosses)"
-        elif self._page.pairs.are_reconstructed:
+        if values.inliers is not None:
+            left_out = np.isfinite(values.distance_mm) & ~values.inliers
+            yield f"{values.inliers.sum()} patches used, {left_out.sum()} left out (red crosses)"
+        elif self._page.pairs.have_distances:
             yield "The reconstruction did not use this pair."
 
 

@@ -1,4 +1,4 @@
-"""What a frame's pairs with others say of its patches, by what a reconstruction keeps or computed anew."""
+"""Values of a frame's patches by its pairs with others: from a reconstruction, or computed anew."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ class PatchValues:
         By which they are turned there, a fan's vectors included.
     correlation, distance_mm, sigma_mm : ndarray, shape (p,)
         NaN where there is none.
-    used : ndarray of bool, shape (p,), or None
+    inliers : ndarray of bool, shape (p,), or None
         Patches that the plane of the pair rests on; None for a pair that was not reconstructed.
-    moved_mm : tuple of (float, float) or None
+    elevation_mm : tuple of (float, float) or None
         How far the image's centre is from the other frame along its elevational axis, and standard deviation.
     """
 
@@ -43,8 +43,8 @@ class PatchValues:
     correlation: FloatArray
     distance_mm: FloatArray
     sigma_mm: FloatArray
-    used: BoolArray | None = None
-    moved_mm: tuple[float, float] | None = None
+    inliers: BoolArray | None = None
+    elevation_mm: tuple[float, float] | None = None
 
 
 class SweepPairs:
@@ -64,7 +64,7 @@ class SweepPairs:
         self._ready = lru_cache(4)(self._make_ready)  # the next frame is most often compared with this one
 
     @property
-    def are_reconstructed(self) -> bool:
+    def have_distances(self) -> bool:
         """Whether there are distances."""
         return self._pairs is not None and len(self._pairs) > 0
 
@@ -80,7 +80,7 @@ class SweepPairs:
             return 1.0
         return float(np.nanpercentile(getattr(self._pairs, f"{by}_mm"), 99))
 
-    def values(self, frame: int, other: int, with_correlation: bool) -> PatchValues:
+    def values(self, frame: int, partner: int, with_correlation: bool) -> PatchValues:
         """Patches of a frame by its pair with another.
 
         Parameters
@@ -88,20 +88,21 @@ class SweepPairs:
         with_correlation : bool
             Whether to correlate the two frames, which takes as long as some pictures.
         """
-        first, second = sorted((frame, other))
+        first, second = sorted((frame, partner))
         row, nothing = self._row(first, second), np.full(len(self._matcher.patches), np.nan)
         correlation, first_from_second = nothing, RigidTransform.identity()
         if with_correlation or row is None:
-            correlation, first_from_second = self._matched(first, second)
-        kept: dict[str, Any] = {"distance_mm": nothing, "sigma_mm": nothing}
+            correlation, first_from_second = self._match(first, second)
+        columns: dict[str, Any] = {"distance_mm": nothing, "sigma_mm": nothing}
         if row is not None and (pairs := self._pairs) is not None:
             first_from_second = RigidTransform.from_matrix(pairs.first_from_second[row])
-            apart = abs(float(first_from_second.apply(self._matcher.centre_mm)[2]))
-            kept = {name: getattr(pairs, name)[row].astype(float) for name in kept}
-            kept |= {"used": pairs.used[row], "moved_mm": (apart, float(pairs.covariance[row, 2, 2] ** 0.5))}
-        return PatchValues(*self._placed(first_from_second, frame == second), correlation, **kept)
+            elevation = abs(float(first_from_second.apply(self._matcher.centre_mm)[2]))
+            columns = {name: getattr(pairs, name)[row].astype(float) for name in columns}
+            columns["inliers"] = pairs.used[row]
+            columns["elevation_mm"] = elevation, float(pairs.covariance[row, 2, 2] ** 0.5)
+        return PatchValues(*self._places(first_from_second, frame == second), correlation, **columns)
 
-    def _matched(self, first: int, second: int) -> tuple[FloatArray, RigidTransform]:
+    def _match(self, first: int, second: int) -> tuple[FloatArray, RigidTransform]:
         """Correlation of every patch, and the motion in the plane if the frames have anything in common."""
         fixed, moving = self._ready(first), self._ready(second)
         start = self._matcher.search(fixed, moving)
@@ -109,12 +110,10 @@ class SweepPairs:
         correlation = table.correlation[0].astype(float)
         if table.median[0] < self._config.trajectory.least_correlation:
             return correlation, RigidTransform.identity()
-        (x_mm, y_mm, roll_rad), centre = (
-            table.inplane[0],
-            RigidTransform.from_translation(self._matcher.centre_mm),
-        )
-        moved = RigidTransform.from_components([x_mm, y_mm, 0.0], Rotation.from_rotvec([0.0, 0.0, roll_rad]))
-        return correlation, centre * moved * centre.inv()
+        x_mm, y_mm, roll_rad = table.inplane[0]
+        centre = RigidTransform.from_translation(self._matcher.centre_mm)
+        motion = RigidTransform.from_components([x_mm, y_mm, 0.0], Rotation.from_rotvec([0.0, 0.0, roll_rad]))
+        return correlation, centre * motion * centre.inv()
 
     def _make_ready(self, frame: int) -> Frame:
         return self._matcher.prepare(self._matcher.echo(read_frame(self._sweep.frames, frame)))
@@ -125,14 +124,14 @@ class SweepPairs:
         rows = np.flatnonzero((self._pairs.first == first) & (self._pairs.second == second))
         return int(rows[0]) if rows.size else None
 
-    def _placed(self, first_from_second: RigidTransform, in_second: bool) -> tuple[FloatArray, FloatArray]:
+    def _places(self, first_from_second: RigidTransform, in_second: bool) -> tuple[FloatArray, FloatArray]:
         """Centres of the patches, which tile the earlier frame, in it or in the later one, and their turn."""
         at, angle = self._matcher.patches.centre_mm, self._matcher.patches.angle_rad
         if not in_second:
             return at, -angle
-        there = first_from_second.inv()
-        inside = there.apply(np.column_stack([at, np.zeros(len(at))]))[:, :2]
-        return inside, float(there.rotation.as_euler("zyx")[0]) - angle
+        second_from_first = first_from_second.inv()
+        centre_mm = second_from_first.apply(np.column_stack([at, np.zeros(len(at))]))[:, :2]
+        return centre_mm, float(second_from_first.rotation.as_euler("zyx")[0]) - angle
 
     @cached_property
     def _matcher(self) -> FrameMatcher:

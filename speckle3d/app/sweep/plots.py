@@ -1,4 +1,4 @@
-"""The plots of a sweep: the image with its patches in mm, and what was found and sensed over the time."""
+"""The plots of a sweep: the image with its patches in mm; flags, doubts and sensors over the time."""
 
 from __future__ import annotations
 
@@ -18,8 +18,7 @@ from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.doubts import Doubt
 from speckle3d.core.sweep import Sweep
 
-FLAGGED, DOUBTED = "#d55e00", "#7b3fa0"
-_REJECTED = "#ff4d4d"
+FLAG_COLOUR, _DOUBT_COLOUR, _OUTLIER_COLOUR = "#d55e00", "#7b3fa0", "#ff4d4d"
 _OPACITY = 0.5
 _LINES = ("#0072b2", "#d55e00", "#009e73")
 """Of three quantities, told apart by the colour-blind (Okabe and Ito)."""
@@ -53,14 +52,16 @@ class PatchPlot(ImagePlot):
             fill_color={"field": "value", "transform": self._colours},
             fill_alpha=_OPACITY,
         )
-        self.plot.scatter("x", "y", marker="x", size="cross", line_color=_REJECTED, source=self._patches)
-        told = [
+        self.plot.scatter(
+            "x", "y", marker="x", size="cross", line_color=_OUTLIER_COLOUR, source=self._patches
+        )
+        tips = [
             ("patch", "@state"),
             ("distance", "@distance{0.000} mm"),
             ("correlation", "@correlation{0.000}"),
             ("standard deviation of the distance", "@sigma{0.000} mm"),
         ]
-        self.plot.add_tools(HoverTool(renderers=[patches], tooltips=told))
+        self.plot.add_tools(HoverTool(renderers=[patches], tooltips=tips))
         self._bar = ColorBar(color_mapper=self._colours, width=10, padding=4, visible=False)
         self.plot.add_layout(self._bar, "right")
 
@@ -70,10 +71,9 @@ class PatchPlot(ImagePlot):
         if patches is None:
             self._patches.data = {name: [] for name in _PATCHES}
             return
-        known = np.isfinite(patches.distance_mm)
-        used = np.ones(len(known), bool) if patches.used is None else patches.used
-        rejected = known & ~used
-        unmeasured = "correlated" if patches.used is None else "without a distance"
+        has_distance = np.isfinite(patches.distance_mm)
+        outlier = has_distance & np.logical_not(True if patches.inliers is None else patches.inliers)
+        without = "correlated" if patches.inliers is None else "without a distance"
         columns = {
             "distance": patches.distance_mm,
             "sigma": patches.sigma_mm,
@@ -85,9 +85,9 @@ class PatchPlot(ImagePlot):
             "y": patches.centre_mm[:, 1],
             "angle": patches.turn_rad,
             "value": columns[by],
-            "line": np.where(rejected, _REJECTED, "#ffffff"),
-            "cross": np.where(rejected, 16, 0),
-            "state": np.where(rejected, "left out", np.where(known, "used", unmeasured)),
+            "line": np.where(outlier, _OUTLIER_COLOUR, "#ffffff"),
+            "cross": np.where(outlier, 16, 0),
+            "state": np.where(outlier, "left out", np.where(has_distance, "used", without)),
         }
 
 
@@ -123,12 +123,14 @@ class TimePlots:
     def mark(self, flags: IntArray | None, doubts: Sequence[Doubt]) -> None:
         """Mark flagged frames, a row for every kind of flag there is, and stretches in doubt."""
         marks = [
-            (name_of(flag), frame, frame, FLAGGED, reason)
+            (name_of(flag), frame, frame, FLAG_COLOUR, reason)
             for flag, reason in REASONS.items()
             for frame in ([] if flags is None else np.flatnonzero(flags & int(flag)).tolist())
         ]
         marks += [
-            (doubt.about, *ends, DOUBTED, doubt.consequence) for doubt in doubts for ends in doubt.frames
+            (doubt.about, *ends, _DOUBT_COLOUR, doubt.consequence)
+            for doubt in doubts
+            for ends in doubt.frames
         ]
         rows = list(dict.fromkeys(row for row, *_ in marks))
         self.marks.y_range.factors = rows[::-1] or ["no frame"]

@@ -151,7 +151,12 @@ def surface(
     $ speckle3d surface volume.nrrd -o cyst.stl --level 60 --below --largest
     """
     from speckle3d.core.labels import EMPTY
-    from speckle3d.imaging.measures.surface import largest_part, smoothed, surface_of, surfaces_of_labels
+    from speckle3d.imaging.measures.surface import (
+        largest_part,
+        smooth_surface,
+        surface_of,
+        surfaces_of_labels,
+    )
     from speckle3d.io.hdf5 import require_suffix
     from speckle3d.io.shapes.surfaces import SUFFIXES, write_surface
     from speckle3d.io.voxels.volumes import read_states, read_volume
@@ -170,7 +175,7 @@ def surface(
     sizes = []
     for place, rough in surfaces.items():
         whole = largest_part(rough) if largest else rough
-        final = smoothed(whole, smooth) if smooth else whole
+        final = smooth_surface(whole, smooth) if smooth else whole
         write_surface(place, final)
         sizes.append(_sizes(place, final, *(errors or ())))
     return sizes, "\n".join(map(_line, sizes))

@@ -74,8 +74,8 @@ def view(
     $ speckle3d view bath.h5 --calibrate plane
     """
     require_extra("app", "view", "panel")
-    from speckle3d.app.opened import opened
-    from speckle3d.app.phantom.pages import phantom_pages
+    from speckle3d.app.opened import open_pages
+    from speckle3d.app.phantom.pages import PhantomPage
     from speckle3d.app.server import AppServer
     from speckle3d.calibrating.settings import model_of
     from speckle3d.io.import_settings import ImportSettings
@@ -91,11 +91,12 @@ def view(
                 ImportSettings,
             )
             pages = running.enter_context(
-                opened(file, record, reconstruction=reconstruction, sweep=sweep_file, settings=settings)
+                open_pages(file, record, reconstruction=reconstruction, sweep=sweep_file, settings=settings)
             )
         else:
             chosen = scan.model_dump(exclude_unset=True) | plane.model_dump(exclude_unset=True)
-            pages = phantom_pages(file, validated(chosen, f"--calibrate {calibrate}", model_of(calibrate)))
+            page = PhantomPage(file, validated(chosen, f"--calibrate {calibrate}", model_of(calibrate)))
+            pages = [page]
         server = AppServer(pages, file.name, port)
         note(server.address)
         if browser:

@@ -129,7 +129,7 @@ def live(
     require_extra("live", "live", "pyigtl", "fastcrc")
     if view:
         require_extra("app", "live --view", "panel")
-        from speckle3d.app.live import LivePage, watched
+        from speckle3d.app.live import LivePage, watch
     from speckle3d.io.curves import read_curves
     from speckle3d.io.igtl.link import Connection, Server
     from speckle3d.io.load import load_sweep
@@ -164,7 +164,7 @@ def live(
         session, ends = Session(connection, outlets, curves, settings, first), list[str]()
         if view:
             page = LivePage(session, lambda: ends[-1] if ends else _trouble(connection.state, server))
-            address, address_for_once = pages.enter_context(watched(page))
+            address, address_for_once = pages.enter_context(watch(page))
             note(address)
             webbrowser.open(address_for_once)
         _run(session, duration_s, connection, server)

@@ -1,4 +1,4 @@
-"""Planes to cut along that are placed anywhere, and as large as what a sweep or a volume shows of them."""
+"""Oblique planes, placed anywhere, and as large as what a sweep shows of them."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ def spanned_plane(origin_mm: npt.ArrayLike, right: npt.ArrayLike, down: npt.Arra
     InvalidInputError
         If a direction has no length, both are along one line, or the origin is not finite.
     """
-    ways = np.array([right, down], dtype=float)
+    vectors = np.array([origin_mm, right, down], dtype=float)
     with np.errstate(invalid="ignore"):
-        x, y = ways / np.linalg.norm(ways, axis=1, keepdims=True)
+        x, y = vectors[1:] / np.linalg.norm(vectors[1:], axis=1, keepdims=True)
     normal = np.cross(x, y)
     sine = np.linalg.norm(normal)
-    if not (sine >= _LEAST_SINE and np.isfinite(origin_mm).all()):
-        got = " and ".join(vector_words(np.asarray(vector)) for vector in (origin_mm, right, down))
-        raise InvalidInputError(f"plane: expected an origin and two directions that span it, got {got}")
+    if not (sine >= _LEAST_SINE and np.isfinite(vectors[0]).all()):
+        words = " and ".join(map(vector_words, vectors))
+        raise InvalidInputError(f"plane: expected an origin and two directions that span it, got {words}")
     axes = Rotation.from_matrix(np.column_stack([x, np.cross(normal / sine, x), normal / sine]))
-    return RigidTransform.from_components(np.asarray(origin_mm, dtype=float), axes)
+    return RigidTransform.from_components(vectors[0], axes)
 
 
 def turned_frame_plane(
@@ -50,7 +50,7 @@ def turned_frame_plane(
 
 
 def covering_plane(
-    placed: RigidTransform,
+    world_from_plane: RigidTransform,
     grid: ImageGrid,
     world_from_image: RigidTransform,
     reach_mm: float,
@@ -60,7 +60,7 @@ def covering_plane(
 
     Parameters
     ----------
-    placed : RigidTransform, single
+    world_from_plane : RigidTransform, single
         Its x and y are the plane; the picture's axes count from its origin.
     grid : ImageGrid
     world_from_image : RigidTransform, length n
@@ -74,9 +74,9 @@ def covering_plane(
         If no frame comes near the plane; says where the sweep is.
     """
     outlines = frame_outlines(grid, world_from_image)
-    corners = placed.inv().apply(outlines.reshape(-1, 3))
+    corners = world_from_plane.inv().apply(outlines.reshape(-1, 3))
     away = np.abs(corners[:, 2])
-    lines = crossings(outlines, placed).reshape(-1, 2)
+    lines = crossings(outlines, world_from_plane).reshape(-1, 2)
     points = np.concatenate([corners[away <= reach_mm, :2], lines[np.isfinite(lines[:, 0])]])
     if not len(points):
         low, high = outlines.min(axis=(0, 1)), outlines.max(axis=(0, 1))
@@ -84,7 +84,7 @@ def covering_plane(
             f"plane: expected one that meets a frame within {reach_mm:g} mm, all between {vector_words(low)} "
             f"and {vector_words(high)} mm, got one {away.min():.1f} mm from there"
         )
-    return plane_part(placed, points.min(axis=0), points.max(axis=0), pixel_mm)
+    return plane_part(world_from_plane, points.min(axis=0), points.max(axis=0), pixel_mm)
 
 
 def vector_words(vector: Iterable[float]) -> str:

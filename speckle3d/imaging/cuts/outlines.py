@@ -50,17 +50,16 @@ def crossings(outlines_mm: FloatArray, world_from_plane: RigidTransform) -> Floa
         Both ends of each frame's line, x and y in the plane, the end nearer to the probe first; NaN for
         frames that do not cross it.
     """
-    n = len(outlines_mm)
-    placed = world_from_plane.inv().apply(outlines_mm.reshape(-1, 3)).reshape(n, 5, 3)
-    placed[np.abs(placed[..., 2]) < _ON_PLANE_MM, 2] = 0.0
+    corners = world_from_plane.inv().apply(outlines_mm.reshape(-1, 3)).reshape(-1, 5, 3)
+    corners[np.abs(corners[..., 2]) < _ON_PLANE_MM, 2] = 0.0
     # Along each edge of the outline from 0 at its first corner; edges count from the top one, clockwise.
-    start, change = placed[:, :-1], np.diff(placed, axis=1)
+    start, change = corners[:, :-1], np.diff(corners, axis=1)
     # A corner on the plane counts as in front of it, so that every line has two ends.
-    crossed = (start[..., 2] < 0) != (placed[:, 1:, 2] < 0)
-    share = -start[..., 2] / np.where(crossed, change[..., 2], 1.0)
+    crosses = (start[..., 2] < 0) != (corners[:, 1:, 2] < 0)
+    share = -start[..., 2] / np.where(crosses, change[..., 2], 1.0)
     at = start[..., :2] + share[..., None] * change[..., :2]
-    depth = np.where(crossed, np.array([0.0, 0.0, 1.0, 1.0]) + share * [0.0, 1.0, 0.0, -1.0], np.inf)
+    depth = np.where(crosses, np.array([0.0, 0.0, 1.0, 1.0]) + share * [0.0, 1.0, 0.0, -1.0], np.inf)
     nearer = np.argsort(depth, axis=1, kind="stable")[:, :2]
     ends = np.take_along_axis(at, nearer[..., None], axis=1)
-    ends[crossed.sum(axis=1) != 2] = np.nan
+    ends[crosses.sum(axis=1) != 2] = np.nan
     return ends

@@ -15,7 +15,6 @@ from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.grid import ImageGrid
 from speckle3d.imaging.axes import line_along
-from speckle3d.imaging.images import require_poses
 
 MAX_PIXELS = 100_000_000
 """Largest reslice, to catch wrong units: 100 mm x 100 mm at 0.01 mm."""
@@ -111,8 +110,6 @@ class ReslicePlane(Cut):
     first_mm: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
-        if not self.world_from_plane.single:
-            raise InvalidInputError("world_from_plane: expected a single transform, got a row of them")
         require_pixels(self.width_mm, self.height_mm, self.pixel_mm)
 
     @cached_property
@@ -129,9 +126,8 @@ class ReslicePlane(Cut):
     def world_from_mm(self, x_mm: npt.ArrayLike, y_mm: npt.ArrayLike) -> FloatArray:
         """Points of the world by what the picture's axes say, shape (..., 3), mm."""
         x, y = np.broadcast_arrays(np.asarray(x_mm, dtype=float), np.asarray(y_mm, dtype=float))
-        right = self.world_from_plane.rotation.apply([1.0, 0.0, 0.0])
-        along = (x - self.first_mm[0])[..., None] * right + (y - self.first_mm[1])[..., None] * self.down
-        return np.asarray(self.world_from_plane.translation + along)
+        inside = np.stack([x - self.first_mm[0], y - self.first_mm[1], np.zeros_like(x)], axis=-1)
+        return self.world_from_plane.apply(inside.reshape(-1, 3)).reshape(inside.shape)
 
 
 def require_pixels(width_mm: float, height_mm: float, pixel_mm: float) -> None:
@@ -155,17 +151,16 @@ def image_plane(world_from_image: RigidTransform, grid: ImageGrid, pixel_mm: flo
 
 def lateral_line(grid: ImageGrid, lateral_mm: float) -> FloatArray:
     """Line of an image down its depth at one lateral position, shape (2, 3), mm."""
-    ends = np.column_stack([grid.extent_mm, np.zeros(2)])
-    return _line(ends, 0, "lateral_mm", lateral_mm)
+    return _line(grid, 0, "lateral_mm", lateral_mm)
 
 
 def depth_line(grid: ImageGrid, depth_mm: float) -> FloatArray:
     """Line of an image across its width at one depth, shape (2, 3), mm."""
+    return _line(grid, 1, "depth_mm", depth_mm)
+
+
+def _line(grid: ImageGrid, axis: int, name: str, value: float) -> FloatArray:
     ends = np.column_stack([grid.extent_mm, np.zeros(2)])
-    return _line(ends, 1, "depth_mm", depth_mm)
-
-
-def _line(ends: FloatArray, axis: int, name: str, value: float) -> FloatArray:
     low, high = ends[:, axis]
     if not low <= value <= high:
         raise InvalidInputError(
@@ -197,31 +192,36 @@ def planes_from_first_frame(
 
     Raises
     ------
-    InvalidInputError
-        If there are no poses.
     InsufficientDataError
         If the sweep moves along the line.
     """
-    placed = {mode: _travelled(path, line_mm) for mode, path in poses.items()}
-    ends = np.concatenate([points for _, points in placed.values()])
+    planes = {mode: _plane_of_travel(path, line_mm) for mode, path in poses.items()}
+    ends = np.concatenate([points for _, points in planes.values()])
     low = np.maximum(ends.min(axis=0), np.negative(largest_mm))
     high = np.min([ends.max(axis=0), largest_mm, low + largest_mm], axis=0)
     # Depth counts from the probe, lateral from the first vector.
     begin = line_mm[0] @ (line_mm[1] != line_mm[0])
-    return {mode: plane_part(axes, low, high, pixel_mm, begin) for mode, (axes, _) in placed.items()}
+    return {mode: plane_part(axes, low, high, pixel_mm, begin) for mode, (axes, _) in planes.items()}
 
 
 def plane_part(
-    placed: RigidTransform, low: FloatArray, high: FloatArray, pixel_mm: float, begin_mm: float = 0.0
+    world_from_plane: RigidTransform,
+    low: FloatArray,
+    high: FloatArray,
+    pixel_mm: float,
+    begin_mm: float = 0.0,
 ) -> ReslicePlane:
-    """Rectangle of a placed plane; its axes count from the origin, y with `begin_mm` there."""
+    """Rectangle of a plane; its axes count from the plane's origin, y with `begin_mm` there."""
     start = RigidTransform.from_translation([*low, 0.0])
     width, height = np.maximum(high - low, pixel_mm).tolist()
-    return ReslicePlane(placed * start, width, height, pixel_mm, (float(low[0]), float(low[1] + begin_mm)))
+    first_mm = (float(low[0]), float(low[1] + begin_mm))
+    return ReslicePlane(world_from_plane * start, width, height, pixel_mm, first_mm)
 
 
-def _travelled(world_from_image: RigidTransform, line_mm: FloatArray) -> tuple[RigidTransform, FloatArray]:
-    """Place a plane in the first frame's line and the mean travel, and say where on it all lines' ends are.
+def _plane_of_travel(
+    world_from_image: RigidTransform, line_mm: FloatArray
+) -> tuple[RigidTransform, FloatArray]:
+    """Place a plane in the first frame's line and the mean travel; also where on it all lines' ends are.
 
     Its origin is where the first frame's line begins, and its y is that line.
 
@@ -229,7 +229,6 @@ def _travelled(world_from_image: RigidTransform, line_mm: FloatArray) -> tuple[R
     -------
     (RigidTransform, ndarray, shape (2 n, 2))
     """
-    require_poses(world_from_image)
     ends = np.stack([world_from_image.apply(point) for point in line_mm])
     # A micrometre is no travel to take a direction from.
     forward = 1e-3 * world_from_image[:1].rotation.apply([0.0, 0.0, 1.0])
@@ -240,5 +239,5 @@ def _travelled(world_from_image: RigidTransform, line_mm: FloatArray) -> tuple[R
     if length < _LEAST_ACROSS:
         raise InsufficientDataError("the poses move along the line to show: expected travel across it")
     axes = Rotation.from_matrix(np.column_stack([right / length, down, np.cross(right / length, down)]))
-    placed = RigidTransform.from_components(ends[0, 0], axes)
-    return placed, placed.inv().apply(ends.reshape(-1, 3))[:, :2]
+    world_from_plane = RigidTransform.from_components(ends[0, 0], axes)
+    return world_from_plane, world_from_plane.inv().apply(ends.reshape(-1, 3))[:, :2]

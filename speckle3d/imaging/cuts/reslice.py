@@ -58,11 +58,11 @@ def reslice_at(
     .. [1] W. Wein et al., "Backward-warping ultrasound reconstruction for improving diagnostic value and
        registration", MICCAI, 2006.
     """
-    sought = [
+    targets = [
         NearestImages(
             PosedImages(images, grid, poses), cut.lines(), cut.shape[0], cut.hull_mm, max_distance_mm
         )
         for poses, cut in cuts
     ]
-    look_up(sought, region)
-    return [np.ascontiguousarray(points.blended()[0].T) for points in sought]
+    look_up(targets, region)
+    return [np.ascontiguousarray(points.blend()[0].T) for points in targets]

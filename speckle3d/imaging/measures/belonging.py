@@ -50,9 +50,11 @@ def require_inside(
     InvalidInputError
         Naming the first point that lies outside.
     """
-    lost = np.flatnonzero(~np.isfinite(points_mm).all(axis=1))
-    if lost.size:
-        raise InvalidInputError(f"point {lost[0] + 1}: expected a point in the sweep, got one beyond the cut")
+    beyond = np.flatnonzero(~np.isfinite(points_mm).all(axis=1))
+    if beyond.size:
+        raise InvalidInputError(
+            f"point {beyond[0] + 1}: expected a point in the sweep, got one beyond the cut"
+        )
     near = belonging_of(points_mm, grid, world_from_image)
     outside = np.flatnonzero(near.gap_mm > reach_mm)
     if outside.size:

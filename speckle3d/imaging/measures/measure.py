@@ -67,10 +67,10 @@ class Measurement:
         return f"{self.kind} {numbers}: {value:.2f} +- {sigma:.2f} {unit} [{low:.2f}, {high:.2f}] ({errors})"
 
 
-def measured(
+def measure_points(
     points_mm: FloatArray, belonging: Belonging, errors: PoseErrors, pick_mm: float
 ) -> list[Measurement]:
-    """Measure what points have between them: distances in a row, their sum, angles at the points between.
+    """Measure distances of points in a row, their sum, and the angles at the points between.
 
     Parameters
     ----------
@@ -95,11 +95,11 @@ def measured(
         first = int(np.flatnonzero(steps < LEAST_MM)[0]) + 1
         raise InvalidInputError(f"points {first} and {first + 1}: expected two places, got one")
 
-    def row(kind: str, chosen: range, value_of: Valued, unit: str = "mm") -> Measurement:
-        value, gradient = value_of(points[chosen])
-        by_poses = errors.of_gradient(points[chosen], gradient, belonging.of_points(np.array(chosen)))
+    def row(kind: str, numbers: range, quantity: Quantity, unit: str = "mm") -> Measurement:
+        value, gradient = quantity(points[numbers])
+        by_poses = errors.of_gradient(points[numbers], gradient, belonging.of_points(np.array(numbers)))
         pose_sigma, pick_sigma = float(np.linalg.norm(by_poses)), pick_mm * float(np.linalg.norm(gradient))
-        return Measurement(kind, tuple(chosen), value, pose_sigma, pick_sigma, unit)
+        return Measurement(kind, tuple(numbers), value, pose_sigma, pick_sigma, unit)
 
     rows = [row("distance", range(k, k + 2), length) for k in range(len(points) - 1)]
     rows += [row("length", range(len(points)), length)] if len(points) > 2 else []
@@ -107,7 +107,7 @@ def measured(
     return rows
 
 
-Valued = Callable[[FloatArray], tuple[float, FloatArray]]
+Quantity = Callable[[FloatArray], tuple[float, FloatArray]]
 """Value of some points, and its derivative with respect to each, shape (k, 3)."""
 
 

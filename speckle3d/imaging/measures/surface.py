@@ -47,7 +47,7 @@ def surface_of(
     known : ndarray of bool, optional
         Voxels with a value, in the volume's shape; without it as `known_voxels` has them.
     smooth : int
-        Passes of smoothing; see `smoothed`.
+        Passes of smoothing; see `smooth_surface`.
 
     Returns
     -------
@@ -85,8 +85,8 @@ def surface_of(
     if not (values.size and values.min() <= level <= values.max()):
         among = f"{values.min():g} to {values.max():g}" if values.size else "of which there is none"
         raise InvalidInputError(f"level: expected a grey level of the volume, {among}, got {level:g}")
-    surface = _marched(volume, volume.voxels, level, inside, known)
-    return smoothed(surface, smooth) if smooth else surface
+    surface = _march(volume, volume.voxels, level, inside, known)
+    return smooth_surface(surface, smooth) if smooth else surface
 
 
 def surfaces_of_labels(volume: Volume) -> dict[int, Surface]:
@@ -107,9 +107,9 @@ def surfaces_of_labels(volume: Volume) -> dict[int, Surface]:
         raise InvalidInputError(
             f"labels: expected whole numbers, at most {MAX_LABELS}, got others: are these grey levels?"
         )
-    every, surfaces = np.ones(volume.shape, dtype=bool), {}
-    for label in (int(label) for label in labels if label != 0):
-        surface = _marched(volume, (voxels == label).astype(np.float32), 0.5, "above", every)
+    everywhere, surfaces = np.ones(volume.shape, dtype=bool), {}
+    for label in labels[labels != 0].astype(int).tolist():
+        surface = _march(volume, (voxels == label).astype(np.float32), 0.5, "above", everywhere)
         surfaces[label] = replace(surface, fields={**surface.fields, "label": str(label)})
     if not surfaces:
         raise InsufficientDataError("labels: expected voxels other than 0, got none")
@@ -128,7 +128,7 @@ def known_voxels(volume: Volume) -> BoolArray:
     return np.asarray(ndimage.binary_fill_holes(voxels != 0))
 
 
-def smoothed(surface: Surface, passes: int) -> Surface:
+def smooth_surface(surface: Surface, passes: int) -> Surface:
     """Smooth a surface: each vertex towards its neighbours' mean and back out, so that it hardly shrinks.
 
     Vertices of open borders stay.
@@ -138,8 +138,8 @@ def smoothed(surface: Surface, passes: int) -> Surface:
     .. [1] G. Taubin, "A signal processing approach to fair surface design", SIGGRAPH, 1995.
     """
     n, edges = len(surface.vertices_mm), surface.triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
-    both = np.concatenate([edges, edges[:, ::-1]])
-    neighbours = coo_array((np.ones(len(both)), both.T), shape=(n, n)).tocsr()
+    edges = np.concatenate([edges, edges[:, ::-1]])
+    neighbours = coo_array((np.ones(len(edges)), edges.T), shape=(n, n)).tocsr()
     neighbours.data[:] = 1.0
     mean = diags_array(1.0 / np.maximum(neighbours.sum(axis=1), 1.0)) @ neighbours
     free = ~np.isin(np.arange(n), surface.open_edges())[:, None]
@@ -184,15 +184,15 @@ def measures_of(
     """
     edges = surface.open_edges()
     open_mm = float(np.linalg.norm(np.diff(surface.vertices_mm[edges], axis=1), axis=2).sum())
-    closed = _closed_part(surface, edges)
-    volume = closed.volume_mm3 if len(closed) else None
+    body = _closed_part(surface, edges)
+    volume = body.volume_mm3 if len(body) else None
     area_sigma = volume_sigma = None
     if errors is not None and grid is not None:
         corners = surface.vertices_mm[surface.triangles]
         opposite = np.roll(corners, -2, axis=1) - np.roll(corners, -1, axis=1)
         area_sigma = _sigma(surface, np.cross(surface.normals[:, None], opposite) / 2.0, errors, grid)
         if volume is not None:
-            volume_sigma = _sigma(closed, np.repeat(closed.normals_mm2 / 3.0, 3, axis=0), errors, grid)
+            volume_sigma = _sigma(body, np.repeat(body.normals_mm2 / 3.0, 3, axis=0), errors, grid)
     return PartMeasures(len(surface), surface.area_mm2, volume, open_mm, area_sigma, volume_sigma)
 
 
@@ -229,8 +229,8 @@ def _sigma(surface: Surface, gradient: FloatArray, errors: PoseErrors, grid: Ima
     return float(np.linalg.norm(by_errors))
 
 
-def _marched(volume: Volume, values: FloatArray, level: float, inside: Inside, known: BoolArray) -> Surface:
-    """Marching cubes over the cells whose eight voxels are known, in the world."""
+def _march(volume: Volume, values: FloatArray, level: float, inside: Inside, mask: BoolArray) -> Surface:
+    """Marching cubes over the cells whose eight voxels are in a mask, in the world."""
     marching_cubes = extra_module("skimage.measure", "surface", "a surface").marching_cubes
     if min(volume.shape) < 2:
         raise InsufficientDataError(f"surface: expected two voxels along every axis, got {volume.shape}")
@@ -241,8 +241,8 @@ def _marched(volume: Volume, values: FloatArray, level: float, inside: Inside, k
             level,
             spacing=volume.spacing_mm[::-1],
             gradient_direction="descent" if inside == "above" else "ascent",
-            # Cells all of whose corners are known, at the index of the farthest corner.
-            mask=ndimage.minimum_filter(known.T, 2),
+            # Cells all of whose corners are in it, at the index of the farthest corner.
+            mask=ndimage.minimum_filter(mask.T, 2),
         )
     except RuntimeError:
         raise InsufficientDataError(

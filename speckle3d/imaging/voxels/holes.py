@@ -78,6 +78,6 @@ def boxes_within(radius_mm: float, spacing_mm: tuple[float, float, float]) -> In
         )
     # A hair more, so that rounding does not leave a voxel out that lies right at the radius.
     hair, spacing = 1 + 1e-9, np.array(spacing_mm, dtype=float)[::-1]
-    reached = [step * np.arange(1, int(radius_mm / step * hair) + 1) for step in spacing]
-    half_edges = np.floor(np.concatenate(reached)[:, None] / spacing * hair).astype(np.int64)
+    distances = [step * np.arange(1, int(radius_mm / step * hair) + 1) for step in spacing]
+    half_edges = np.floor(np.concatenate(distances)[:, None] / spacing * hair).astype(np.int64)
     return np.asarray(np.unique(half_edges, axis=0).reshape(-1, 3))

@@ -29,7 +29,7 @@ import numpy.typing as npt
 from speckle3d.core.arrays import BoolArray, ByteArray, Float32Array, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError, MismatchError
 from speckle3d.core.threads import cores, in_parallel
-from speckle3d.imaging.images import PosedImages
+from speckle3d.imaging.images import PosedImages, any_thread
 from speckle3d.imaging.voxels.grid import VoxelGrid
 from speckle3d.imaging.voxels.settings import Rule, Splat
 from speckle3d.kernels.samples import PLUS_BITS, POSITION_BITS, SHARE_BITS, Samples
@@ -93,16 +93,18 @@ def splat_images(
     near = _frames_near(maps, source, voxel_grid, share > 0)
     if not near.size:
         return np.full(shape, np.nan, np.float32), np.zeros(shape, np.uint8)
-    first = source.read_as_stored(int(near[0]))
+    first = source.read(int(near[0]))
     if rule == "plus":
         if first.dtype.name not in ("uint8", "float32"):
             raise InvalidInputError(f"rule plus: expected grey levels of 0 to 255, got {first.dtype}")
         mask = mask & ~np.isnan(first)  # outside a fan there is nothing
     kernel, tables = _kernel(splat, rule, shape)
-    turned = rule == "plus" or (first.flags.f_contiguous and not first.flags.c_contiguous)
-    spans = _spans(mask, turned)
-    for images, frames in _batches(source, near, first, turned, rule == "plus"):
-        fixed = _fixed_maps(maps[frames], splat, PLUS_BITS if rule == "plus" else POSITION_BITS, turned)
+    transpose = rule == "plus" or (first.flags.f_contiguous and not first.flags.c_contiguous)
+    if transpose:
+        mask, maps = mask.T, maps[:, :, [1, 0, 2]]
+    spans = _spans(mask)
+    for images, frames in _batches(source, near, first, transpose, rule == "plus"):
+        fixed = _fixed_maps(maps[frames], splat, PLUS_BITS if rule == "plus" else POSITION_BITS)
         tag = int(frames[0]) + 1 if rule == "latest" else 0
         samples = Samples(images, share[frames], fixed, spans, tag, splat == "linear")
         _share_out(partial(kernel, samples), tables, fixed, images.shape[1])
@@ -154,13 +156,13 @@ def index_from_sample(source: PosedImages, voxel_grid: VoxelGrid) -> FloatArray:
 
 
 def _frames_near(
-    maps: FloatArray, source: PosedImages, voxel_grid: VoxelGrid, counted: BoolArray
+    maps: FloatArray, source: PosedImages, voxel_grid: VoxelGrid, has_weight: BoolArray
 ) -> IntArray:
-    """Frames that may have a sample within one voxel of the grid, of those that count."""
+    """Frames with a weight that may have a sample within one voxel of the grid."""
     v, s = source.grid.vectors - 1, source.grid.samples - 1
     corners = maps @ np.array([[0, 0, 1], [v, 0, 1], [0, s, 1], [v, s, 1]]).T
     low, high = corners.min(axis=2), corners.max(axis=2)
-    near = counted & ((high > -1.5) & (low < np.array(voxel_grid.shape) + 0.5)).all(axis=1)
+    near = has_weight & ((high > -1.5) & (low < np.array(voxel_grid.shape) + 0.5)).all(axis=1)
     if (np.maximum(-low, high)[near] > _FARTHEST).any():
         raise InvalidInputError(
             f"images: expected to reach less than {_FARTHEST:.0f} voxels beyond the grid: take larger "
@@ -170,49 +172,49 @@ def _frames_near(
 
 
 def _batches(
-    source: PosedImages, frames: IntArray, first: npt.NDArray[Any], turned: bool, whole: bool
+    source: PosedImages, frames: IntArray, first: npt.NDArray[Any], transpose: bool, whole: bool
 ) -> Iterator[tuple[npt.NDArray[Any], IntArray]]:
     """Read frames a few at a time: images, shape (n, line, sample), and their numbers.
 
-    Images keep the order that the first has in memory, since turning them takes as long as the work on them.
+    Images keep the order that the first has in memory: to transpose them takes as long as the work on them.
     With `whole` they become whole grey levels.
     """
     direct = first.dtype.name in _DIRECT and first.dtype.isnative
     kind = np.dtype(np.uint8 if whole else first.dtype if direct else np.float32)
     size = min(max(_BATCH_BYTES // (first.size * kind.itemsize), 1), _BATCH_FRAMES, frames.size)
-    images = np.empty((size, *(first.T if turned else first).shape), kind)
+    images = np.empty((size, *(first.T if transpose else first).shape), kind)
 
-    def read(some: IntArray, low: int, stop: int) -> None:
+    def read(numbers: IntArray, low: int, stop: int) -> None:
         for n in range(low, stop):
-            image = source.read_as_stored(int(some[n]))
+            image = source.read(int(numbers[n]))
             if image.dtype != first.dtype:
                 raise MismatchError(
-                    f"images[{some[n]}]: expected {first.dtype} as the others, got {image.dtype}"
+                    f"images[{numbers[n]}]: expected {first.dtype} as the others, got {image.dtype}"
                 )
             if whole and image.dtype != np.uint8:
                 image = np.nan_to_num(np.rint(image)).clip(0, 255)
-            images[n] = image.T if turned else image
+            images[n] = image.T if transpose else image
 
     for start in range(0, frames.size, size):
-        some = frames[start : start + size]
-        if source.any_thread:
-            in_parallel(partial(read, some), some.size)
+        numbers = frames[start : start + size]
+        if any_thread(source.images):
+            in_parallel(partial(read, numbers), numbers.size)
         else:
-            read(some, 0, some.size)
-        yield images[: some.size], some
+            read(numbers, 0, numbers.size)
+        yield images[: numbers.size], numbers
 
 
-def _spans(mask: BoolArray, turned: bool) -> IntArray:
+def _spans(mask: BoolArray) -> IntArray:
     """Runs of samples that count: line, first and end of each, shape (m, 3)."""
-    inside = np.pad(mask.T if turned else mask, ((0, 0), (1, 1)))
+    inside = np.pad(mask, ((0, 0), (1, 1)))
     line, first = np.nonzero(inside[:, 1:] & ~inside[:, :-1])
     _, stop = np.nonzero(~inside[:, 1:] & inside[:, :-1])
     return np.stack([line, first, stop], axis=1).astype(np.int64)
 
 
-def _fixed_maps(maps: FloatArray, splat: Splat, bits: int, turned: bool) -> IntArray:
+def _fixed_maps(maps: FloatArray, splat: Splat, bits: int) -> IntArray:
     """Maps from (line, sample, 1) to positions in units of 2^-40 voxel, rounded to so many bits."""
-    fixed = np.rint((maps[:, :, [1, 0, 2]] if turned else maps) * 2.0**bits).astype(np.int64)
+    fixed = np.rint(maps * 2.0**bits).astype(np.int64)
     if bits == PLUS_BITS:
         ahead = 0.5 if splat == "nearest" else 0.0
     else:

@@ -131,8 +131,8 @@ def compound(
     source = PosedImages(images, grid, world_from_image)
     if voxel_grid is None:
         voxel_grid = grid_around(grid, world_from_image, float(voxel_mm or 0.0), world_from_axes)
-    checked = validated({"voxel_type": "float32", **settings}, "compound", CompoundingSettings)
-    return compound_onto(voxel_grid, source, checked, weights, region)
+    model = validated({"voxel_type": "float32", **settings}, "compound", CompoundingSettings)
+    return compound_onto(voxel_grid, source, model, weights, region)
 
 
 def compound_onto(
@@ -164,8 +164,8 @@ def compound_onto(
             fill_holes(voxels, state, settings.fill_radius)
     if not state.any():
         raise InsufficientDataError("volume: expected samples with values inside the grid, got none")
-    typed = voxels if kind == "float32" else _rounded(voxels, state, kind)
-    return CompoundedVolume(typed.T, voxel_grid.spacing_mm, voxel_grid.world_from_grid, state=state.T)
+    levels = voxels if kind == "float32" else _whole_levels(voxels, state, kind)
+    return CompoundedVolume(levels.T, voxel_grid.spacing_mm, voxel_grid.world_from_grid, state=state.T)
 
 
 def look_up_voxels(
@@ -218,11 +218,11 @@ def look_up_voxels(
     look_up([nearest], region)
     # Half a voxel along the axis that an image is most nearly perpendicular to, of the most upright one.
     normals = source.world_from_image.rotation.apply([0.0, 0.0, 1.0])
-    voxels, state = nearest.blended(0.5 * float(np.abs(normals @ steps).max()))
+    voxels, state = nearest.blend(0.5 * float(np.abs(normals @ steps).max()))
     return voxels.reshape(n_k, n_j, n_i), state.reshape(n_k, n_j, n_i)
 
 
-def _rounded(voxels: Float32Array, state: ByteArray, voxel_type: VoxelType) -> npt.NDArray[Any]:
+def _whole_levels(voxels: Float32Array, state: ByteArray, voxel_type: VoxelType) -> npt.NDArray[Any]:
     """Voxels rounded and clipped to a type of whole numbers, empty ones 0."""
     limits, out = np.iinfo(voxel_type), np.empty(voxels.shape, voxel_type)
 

@@ -28,7 +28,7 @@ class _Bytes:
         return len(self.source), self.source.grid.vectors, self.source.grid.samples
 
     def __getitem__(self, index: int) -> ByteArray:
-        image: npt.NDArray[Any] = self.source.read_as_stored(index)
+        image: npt.NDArray[Any] = self.source.read(index)
         # Outside a fan there is nothing.
         return np.asarray(np.clip(np.rint(np.nan_to_num(image)), 0, 255), dtype=np.uint8)
 
