@@ -4,5 +4,5 @@ from browsers import chromium
 
 @pytest.fixture(scope="module")
 def browser():
-    with chromium() as started:
-        yield started
+    with chromium() as browser:
+        yield browser

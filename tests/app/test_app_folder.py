@@ -14,7 +14,7 @@ def folder(tmp_path):
     return Folder(tmp_path / "sweep.h5")
 
 
-def test_only_a_new_name_in_it_is_taken(folder, tmp_path):
+def test_a_name_must_be_new_and_in_the_folder(folder, tmp_path):
     os.symlink(tmp_path.parent / "elsewhere.csv", tmp_path / "link.csv")
     for wrong in ("", "../a.csv", "/x/a.csv", ".hidden", "a\0.csv", "sweep.h5", "link.csv"):
         with pytest.raises(InvalidInputError):

@@ -8,7 +8,7 @@ from commands import RF, command, free_port, read_until
 pytestmark = needs_browser
 
 
-def test_picture_length_and_end_are_shown(browser, data_folder, tmp_path, monkeypatch):
+def test_the_page_has_picture_length_and_end(browser, data_folder, tmp_path, monkeypatch):
     monkeypatch.setenv("BROWSER", "true")  # the one that this test brings looks at it
     port = free_port()
     # Slowly: a page on a busy machine takes seconds to open.

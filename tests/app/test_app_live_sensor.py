@@ -15,8 +15,8 @@ pytestmark = needs_browser
 def sensor(tmp_path):
     from simulated_device import SimulatedDevice  # not everywhere are there pseudo-terminals
 
-    with SimulatedDevice(tmp_path / "port", kind="mtdata2", rate_hz=100.0) as simulated:
-        yield simulated
+    with SimulatedDevice(tmp_path / "port", kind="mtdata2", rate_hz=100.0) as device:
+        yield device
 
 
 def scratch_folders():

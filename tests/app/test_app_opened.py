@@ -11,8 +11,8 @@ from xsens.logs.samples import ImuLog
 from xsens.logs.textlogs import write_csv
 
 
-def titles(path, **more):
-    return [page.title for page in pages_of(path, **more)]
+def titles(path, **options):
+    return [page.title for page in pages_of(path, **options)]
 
 
 @pytest.fixture
@@ -44,18 +44,18 @@ def test_what_has_no_page_is_one_line_and_exit_code_2(data_folder, log, tmp_path
         monkeypatch.setattr("sys.argv", ["speckle3d", "view", "--no-browser", *map(str, arguments)])
         with pytest.raises(SystemExit) as end:
             main()
-        told = capsys.readouterr().err.splitlines()
-        assert (end.value.code, len(told)) == (2, 1), (arguments, told)
-        assert "expected" in told[0]
+        lines = capsys.readouterr().err.splitlines()
+        assert (end.value.code, len(lines)) == (2, 1), (arguments, lines)
+        assert "expected" in lines[0]
 
 
 def test_a_notebook_shows_the_same_pages(log):
     from bokeh.document import Document
 
     document = Document()
-    shown = speckle3d.app.view(log)
-    document.add_root(shown.get_root(document))
+    page = speckle3d.app.view(log)
+    document.add_root(page.get_root(document))
     document.to_json()  # as it is sent to the notebook
     assert len(document.roots) == 1
-    (drawn,) = (model.data for model in document.models if "heading" in getattr(model, "data", {}))
-    assert np.isfinite(drawn["dip"]).any()
+    (columns,) = (model.data for model in document.models if "heading" in getattr(model, "data", {}))
+    assert np.isfinite(columns["dip"]).any()

@@ -25,29 +25,29 @@ def readings(motion):
 
 
 @pytest.fixture(scope="module")
-def found(motion):
+def orientation(motion):
     return orient(motion.log)
 
 
-def test_columns_are_those_of_the_fusion(readings, motion, found):
+def test_columns_are_those_of_the_fusion(readings, motion, orientation):
     columns = readings.columns()
-    at = np.searchsorted(motion.log.time_s, found.rotations.time_s - 1e-9)
+    at = np.searchsorted(motion.log.time_s, orientation.rotations.time_s - 1e-9)
     np.testing.assert_allclose(columns["z"], np.degrees(motion.log.gyroscope_rad_s[at, 2]))
     assert np.abs(np.diff(columns["heading"])).max() < 20.0
     np.testing.assert_array_equal(
-        np.isfinite(columns["doubt"]), found.disturbed & np.isfinite(columns["field"])
+        np.isfinite(columns["doubt"]), orientation.disturbed & np.isfinite(columns["field"])
     )
     # The fields of these scenes: 45 down over 18 north.
     assert np.nanmedian(columns["dip"]) == pytest.approx(np.degrees(np.arctan2(45, 18)), abs=1.0)
 
 
-def live(elapsed_s, heading_deg=0.0, started=True, stray=0.01, disturbed=False, **more):
-    held = Rotation.from_euler("z", heading_deg, degrees=True)
-    fused = OnlineState(held, np.full(3, 0.02), np.zeros(3), disturbed, False, started, stray, 0.0)
-    usual = {"connected": True, "field": 1.0, "dip_rad": 1.1, "note": "", "fused": fused}
+def live(elapsed_s, heading_deg=0.0, running=True, stray=0.01, doubtful=False, **options):
+    pose = Rotation.from_euler("z", heading_deg, degrees=True)
+    state = OnlineState(pose, np.full(3, 0.02), np.zeros(3), doubtful, False, running, stray, 0.0)
+    usual = {"connected": True, "field": 1.0, "dip_rad": 1.1, "note": "", "fused": state}
     return LiveState(
-        elapsed_s=elapsed_s, samples=100, lost=0, interruptions=0, rate_hz=100.0, world_from_sensor=held,
-        rate_rad_s=np.zeros(3), **(usual | more),
+        elapsed_s=elapsed_s, samples=100, lost=0, interruptions=0, rate_hz=100.0, world_from_sensor=pose,
+        rate_rad_s=np.zeros(3), **(usual | options),
     )  # fmt: skip
 
 
@@ -71,11 +71,11 @@ def test_live_columns_run_to_now_without_a_jump_of_the_heading():
     ("states", "trust", "words"),
     [
         ([live(1.0, connected=False, note="the port is gone")], Trust.UNKNOWN, "the port is gone"),
-        ([live(0.1 * k, disturbed=k > 7) for k in range(10)], Trust.CARE, "20.0"),
+        ([live(0.1 * k, doubtful=k > 7) for k in range(10)], Trust.CARE, "20.0"),
         ([live(1.0, stray=0.08)], Trust.NO, "8.0"),
     ],
 )
 def test_the_live_sentence_is_from_the_filters_numbers(states, trust, words):
-    found, sentence = watch(states).judgement()
-    assert found is trust
+    judgement, sentence = watch(states).judgement()
+    assert judgement is trust
     assert words in sentence

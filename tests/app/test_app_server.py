@@ -36,19 +36,19 @@ def test_it_opens_without_complaint_and_asks_nobody_else(browser, address):
     page.click("text=Sensor")
     page.wait_for_selector(".magnetometer")
     assert page.complaints == []
-    own = address.split("?")[0]
-    assert [each for each in page.requests if not each.startswith(own)] == []
+    origin = address.split("?")[0]
+    assert [url for url in page.requests if not url.startswith(origin)] == []
     assert page.evaluate("document.documentElement.scrollWidth") <= 1366
     page.close()
 
 
-def test_without_a_signature_it_is_closed(address):
-    bare, _, signed = address.partition("?bokeh-session-id=")
-    forged = generate_session_id(b"another key" * 4, signed=True)
+def test_without_its_signature_an_address_is_refused(address):
+    bare, _, signature = address.partition("?bokeh-session-id=")
+    forgery = generate_session_id(b"another key" * 4, signed=True)
     assert status(address) == 200
     assert status(bare) == 403
-    assert status(f"{bare}?bokeh-session-id={forged}") == 403
-    assert status(f"{bare}?bokeh-session-id={signed[:-3]}abc") == 403
+    assert status(f"{bare}?bokeh-session-id={forgery}") == 403
+    assert status(f"{bare}?bokeh-session-id={signature[:-3]}abc") == 403
     assert status(f"{bare}autoload.js?bokeh-autoload-element=1") == 403
 
 

@@ -72,13 +72,13 @@ def test_the_calibration_is_the_commands_to_the_last_digit(page, recording, tmp_
     page.wait_for_timeout(300)
     table = run_and_save(page, "tuned.h5")
     assert "left out by hand" in table
-    saved = recording[0].with_name("tuned.h5")
-    line = saved.with_suffix(".txt").read_text().split("made by: ")[1]
+    file = recording[0].with_name("tuned.h5")
+    line = file.with_suffix(".txt").read_text().split("made by: ")[1]
     for option in ("--columns 58", "--smoothing-mm 0.75", "--leave-out 0,7", "--region '12.5,20 280,20"):
         assert option in line
     out = tmp_path / "again.h5"
-    assert by_command(saved, out) == table.strip()
-    found, again = read_calibration(saved), read_calibration(out)
-    assert (found.parameters, found.frames) == (again.parameters, again.frames)
-    assert not {0, 7} & {*found.frames.used}
-    assert found.pixel_mm == pytest.approx(PIXEL_MM, rel=0.01)
+    assert by_command(file, out) == table.strip()
+    tuned, again = read_calibration(file), read_calibration(out)
+    assert (tuned.parameters, tuned.frames) == (again.parameters, again.frames)
+    assert not {0, 7} & {*tuned.frames.used}
+    assert tuned.pixel_mm == pytest.approx(PIXEL_MM, rel=0.01)

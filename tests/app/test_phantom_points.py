@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from browsers import needs_browser, open_page, viewing
+from browsers import needs_browser, opened, viewing
 from phantom_pages import place, text_match
 from phantom_recordings import wire_recording
 
@@ -21,7 +21,7 @@ def recording(tmp_path_factory):
 def page(browser, recording):
     path = recording[0]
     with viewing(path, "--calibrate", "wires", "--phantom", path.with_suffix(".xml")) as address:
-        page = open_page(browser, address)
+        page = opened(browser, address)
         page.locator(".phantom-told").wait_for()
         page.get_by_role("button", name="Find points in all frames").click()
         text_match(page, "phantom-told", r"in \d+ frames")
@@ -30,7 +30,7 @@ def page(browser, recording):
         assert page.complaints == []
 
 
-def saved(page, path, name):
+def save_points(page, path, name):
     field = page.get_by_label("file of the points")
     field.fill(name)
     field.press("Enter")
@@ -42,24 +42,24 @@ def saved(page, path, name):
 def test_points_are_found_moved_deleted_and_added_by_mouse(page, recording):
     path, scene = recording
     text_match(page, "phantom-told", "frame 0: 9 points")
-    found = saved(page, path, "found.csv")
-    away = found.pixels - scene.pixels[found.frame, found.wire]
+    points = save_points(page, path, "found.csv")
+    away = points.pixels - scene.pixels[points.frame, points.wire]
     assert np.abs(away).max() < 2.0
-    first = found.pixels[0]
+    first = points.pixels[0]
     page.mouse.move(*place(page, *first))
     page.mouse.down()
     page.mouse.move(*place(page, first[0] + 30, first[1] - 12), steps=5)
     page.mouse.up()
     page.wait_for_timeout(400)
-    page.mouse.click(*place(page, *found.pixels[1]))
+    page.mouse.click(*place(page, *points.pixels[1]))
     page.wait_for_timeout(400)
     page.keyboard.press("Backspace")
     text_match(page, "phantom-told", "frame 0: 8 points; none on b")
-    changed = saved(page, path, "changed.csv")
-    assert changed.pixels[0] == pytest.approx(first + np.array([30, -12]), abs=1.5)
-    assert 1 not in changed.wire[changed.frame == 0]
+    edit = save_points(page, path, "changed.csv")
+    assert edit.pixels[0] == pytest.approx(first + np.array([30, -12]), abs=1.5)
+    assert 1 not in edit.wire[edit.frame == 0]
     # The wire that is missing is the next one.
     page.mouse.click(*place(page, *first))
     text_match(page, "phantom-told", "frame 0: 9 points")
-    again = saved(page, path, "again.csv")
+    again = save_points(page, path, "again.csv")
     assert again.pixels[(again.frame == 0) & (again.wire == 1)][0] == pytest.approx(first, abs=1.5)

@@ -29,7 +29,7 @@ def page(browser, small_sweeps, tmp_path_factory):
         page.set_default_timeout(20_000)
         yield page
         assert page.complaints == []
-        assert [each for each in page.requests if not each.startswith(address.split("?")[0])] == []
+        assert [url for url in page.requests if not url.startswith(address.split("?")[0])] == []
 
 
 def click(page, cut, x, y):
@@ -37,12 +37,12 @@ def click(page, cut, x, y):
     page.mouse.click(*page.evaluate(PLACE, [cut, x, y]))
 
 
-def test_a_click_moves_the_other_cuts_and_its_points_are_measured(page):
+def test_a_click_moves_the_other_cuts_and_measures_its_points(page):
     before = page.evaluate(TITLE, "cut-frame"), page.evaluate(TITLE, "cut-depth")
     for x, y in ((0.6, 3.0), (2.0, 9.0)):
-        shown = page.evaluate(TITLE, "cut-depth")
+        title = page.evaluate(TITLE, "cut-depth")
         click(page, "cut-along", x, y)
-        page.wait_for_function(f"shown => ({TITLE})('cut-depth') !== shown", arg=shown)
+        page.wait_for_function(f"before => ({TITLE})('cut-depth') !== before", arg=title)
         page.get_by_role("button", name="Add the point").click()
         page.wait_for_timeout(300)
     after = page.evaluate(TITLE, "cut-frame"), page.evaluate(TITLE, "cut-depth")

@@ -16,9 +16,9 @@ WIDTH = 160
 """Letters of a line that are shown."""
 
 
-def shortened(printed, shown):
+def shorten(output, text):
     """What was printed, cut where the page cuts it."""
-    lines, before = printed.splitlines(), shown.splitlines()
+    lines, before = output.splitlines(), text.splitlines()
     if "..." in before:
         first = before.index("...")
         last = len(before) - first - 1
@@ -28,15 +28,15 @@ def shortened(printed, shown):
 
 def write_outputs(page):
     """Run a page, and put what it prints in place of what it shows."""
-    text, printed = page.read_text(encoding="utf-8"), None
+    text, last = page.read_text(encoding="utf-8"), None
     with tempfile.TemporaryDirectory() as folder:
         empty = Path(folder) / "empty"
         empty.mkdir()
         for language, block, output in ran(page, empty):
-            if language == "text" and printed is not None:
-                text = text.replace(f"```text\n{block}```", f"```text\n{shortened(printed, block)}```", 1)
+            if language == "text" and last is not None:
+                text = text.replace(f"```text\n{block}```", f"```text\n{shorten(last, block)}```", 1)
             # What is only shown, as a console's lines, has not been run.
-            printed = output if language in ("sh", "python") else None
+            last = output if language in ("sh", "python") else None
     page.write_text(text, encoding="utf-8")
 
 

@@ -32,7 +32,7 @@ def commands_of(line):
             yield words[1:]
 
 
-def parsed(words):
+def parse(words):
     """Follow the groups of commands to a command, and parse the rest with it; nothing is run."""
     command, context = app, None
     while hasattr(command, "commands"):
@@ -49,7 +49,7 @@ def test_commands_that_are_shown_exist(page):
     for line in shown_commands(page):
         for words in commands_of(line):
             try:
-                parsed(words)
+                parse(words)
             except Exception as error:  # of any kind: the line is named
                 raise AssertionError(f"{page.name}: {line}\n{error}") from error
 

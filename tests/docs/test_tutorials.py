@@ -25,16 +25,16 @@ TUTORIALS = {
 
 @pytest.mark.parametrize("page", TUTORIALS)
 def test_a_tutorial_runs_and_makes_its_files(page, tmp_path):
-    words, files, refused = TUTORIALS[page]
-    folder, printed = run_tutorial(f"{page}.md", tmp_path)
-    assert words in printed
+    words, files, absent = TUTORIALS[page]
+    folder, output = run_tutorial(f"{page}.md", tmp_path)
+    assert words in output
     assert all((folder / name).exists() for name in files)
-    assert not (folder / refused).exists()
+    assert not (folder / absent).exists()
 
 
 def test_a_plane_calibrates_both_sensors_for_a_sweep_that_knew_neither(tmp_path):
-    folder, printed = run_tutorial("plane.md", tmp_path)
-    rows = [line.split() for line in printed.splitlines() if line.startswith("sweep  f")]
+    folder, output = run_tutorial("plane.md", tmp_path)
+    rows = [line.split() for line in output.splitlines() if line.startswith("sweep  f")]
     errors = {row[2]: abs(float(row[7])) for row in rows}
     # Of 5.5 mm the tracker's jitter alone is 4 %, and its calibration's error another.
     assert errors["pose"] < 10.0

@@ -27,9 +27,9 @@ def test_the_principal_box_is_the_smallest(seed, turns):
 
     axes = principal_axes(GRID, poses)
     box = np.prod(sizes(axes) + GRID.sample_spacing_mm)
-    for other in [Rotation.identity(), sweep_axes(poses), *Rotation.random(300, rng=rng)]:
+    for candidate in [Rotation.identity(), sweep_axes(poses), *Rotation.random(300, rng=rng)]:
         # What rounding to whole voxels and the tie in favour of plain axes may cost.
-        assert box <= 1.0002 * np.prod(sizes(other) + GRID.sample_spacing_mm)
+        assert box <= 1.0002 * np.prod(sizes(candidate) + GRID.sample_spacing_mm)
     shape, world = (grid_around(GRID, poses, 0.5, way).shape for way in (axes, Rotation.identity()))
     assert np.prod(np.subtract(shape, 1.0)) <= np.prod(np.add(world, 1.0))
     # Right-handed, and no other order or sign of its axes is nearer to those of the mean image.

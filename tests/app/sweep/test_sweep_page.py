@@ -16,7 +16,7 @@ from speckle3d.io.sweep_writer import write_sweep
 from speckle3d.study.details import recorded_doubts
 from speckle3d.study.job import run_job
 
-LIFTED = slice(30, 35)
+NO_CONTACT = slice(30, 35)
 
 
 @pytest.fixture(scope="module")
@@ -25,8 +25,8 @@ def files(sweep, curves, tmp_path_factory):
     folder = tmp_path_factory.mktemp("player")
     part = sweep.part(0, 48)
     frames = np.stack([part.frames[k] for k in range(len(part))])
-    noise = np.random.default_rng(2).normal(0.0, 3.5, frames[LIFTED].shape)
-    frames[LIFTED] = np.rint(noise)
+    noise = np.random.default_rng(2).normal(0.0, 3.5, frames[NO_CONTACT].shape)
+    frames[NO_CONTACT] = np.rint(noise)
     readings = part.tracker.readings
     poses = readings.world_from_sensor.as_matrix()
     # Less than what no hand does, which is left out as the file is read.
@@ -40,21 +40,20 @@ def files(sweep, curves, tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def made(files):
+def reconstruction(files):
     return read_reconstruction(files[1])
 
 
 @pytest.fixture
-def player(files, made):
-    recording, reconstruction = files
-    doubts = recorded_doubts(reconstruction, made.provenance)
-    player = _Player(SweepPage(load_sweep(recording), made, doubts))
+def player(files, reconstruction):
+    doubts = recorded_doubts(files[1], reconstruction.provenance)
+    player = _Player(SweepPage(load_sweep(files[0]), reconstruction, doubts))
     player.layout()
     return player
 
 
-def told(player):
-    return player._told.object
+def text(player):
+    return player._text.object
 
 
 def test_a_sample_lies_where_the_axes_say():
@@ -68,26 +67,27 @@ def test_a_sample_lies_where_the_axes_say():
     assert first_mm + rows.mean() * row_mm == pytest.approx(19.0, abs=0.03)
 
 
-def test_patches_of_a_pair_are_counted_as_the_file_has_them(player, made):
+def test_patches_of_a_pair_are_counted_as_the_file_has_them(player, reconstruction):
     player.param.update(frame=10, colour="distance", lag=-2)
-    row = int(np.flatnonzero((made.pairs.first == 8) & (made.pairs.second == 10))[0])
-    used, known = made.pairs.used[row], np.isfinite(made.pairs.distance_mm[row])
-    assert f"{used.sum()} patches used, {(known & ~used).sum()} left out" in told(player)
-    assert f"{abs(made.pairs.first_from_second[row] @ centre(player))[2]:.3f} mm away" in told(player)
-    shown = player._picture._patches.data
-    np.testing.assert_array_equal(shown["value"], made.pairs.distance_mm[row])
-    assert list(shown["state"]).count("left out") == (known & ~used).sum()
+    pairs = reconstruction.pairs
+    row = int(np.flatnonzero((pairs.first == 8) & (pairs.second == 10))[0])
+    inliers, has_distance = pairs.used[row], np.isfinite(pairs.distance_mm[row])
+    assert f"{inliers.sum()} patches used, {(has_distance & ~inliers).sum()} left out" in text(player)
+    assert f"{abs(pairs.first_from_second[row] @ centre(player))[2]:.3f} mm away" in text(player)
+    patches = player._picture._patches.data
+    np.testing.assert_array_equal(patches["value"], pairs.distance_mm[row])
+    assert list(patches["state"]).count("left out") == (has_distance & ~inliers).sum()
 
 
 def centre(player):
     return np.append(player._page.sweep.grid.centre_mm, 1.0)
 
 
-def test_flags_and_doubts_are_marked_at_their_frames_and_a_click_goes_there(player, made):
-    flagged = np.flatnonzero(made.trust.flags)
-    assert f"{len(flagged)} of 48 frames flagged" in player._state.object
-    player.frame = LIFTED.start
-    assert "lifted: no contact" in told(player)
+def test_flags_and_doubts_are_marked_at_their_frames_and_a_click_goes_there(player, reconstruction):
+    count = np.count_nonzero(reconstruction.trust.flags)
+    assert f"{count} of 48 frames flagged" in player._state.object
+    player.frame = NO_CONTACT.start
+    assert "lifted: no contact" in text(player)
     marks = player._times._marks.data
     (spikes,) = (at for at, words in enumerate(marks["words"]) if "(suspect: spikes)" in words)
     tracker = player._page.sweep.tracker
@@ -117,5 +117,5 @@ def test_in_the_browser_it_plays_and_the_image_fills_the_height(browser, files):
         page.locator("button.play").click()
         page.get_by_text("Frame 47", exact=True).wait_for()
         assert page.complaints == []
-        assert [each for each in page.requests if not each.startswith(address.split("?")[0])] == []
+        assert [url for url in page.requests if not url.startswith(address.split("?")[0])] == []
         page.close()

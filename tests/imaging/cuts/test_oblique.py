@@ -17,11 +17,11 @@ GRID = ImageGrid(11, 21, 0.5, 0.5, 1.0)
 def test_a_covering_plane_is_as_large_as_what_frames_show():
     poses = RigidTransform.from_translation(np.outer(np.arange(9.0), [0, 0, 1]))
     # Across all frames at depth 4, of a sweep 8 long and 5 wide.
-    placed = RigidTransform.from_components([-20.0, 4.0, 3.0], Rotation.from_euler("X", np.pi / 2))
-    plane = covering_plane(placed, GRID, poses, 0.5, 0.1)
+    world_from_plane = RigidTransform.from_components([-20.0, 4.0, 3.0], Rotation.from_euler("X", np.pi / 2))
+    plane = covering_plane(world_from_plane, GRID, poses, 0.5, 0.1)
     assert (plane.width_mm, plane.height_mm) == pytest.approx((5.0, 8.0))
     # Axes count from where the plane was placed.
-    np.testing.assert_allclose(plane.world_from_mm(22.0, 1.0), placed.apply([22.0, 1.0, 0.0]))
+    np.testing.assert_allclose(plane.world_from_mm(22.0, 1.0), world_from_plane.apply([22.0, 1.0, 0.0]))
     np.testing.assert_allclose(plane.world_from_plane.translation, [0, 4, 0], atol=1e-9)
     with pytest.raises(InvalidInputError, match=r"49\.0 mm"):
         covering_plane(RigidTransform.from_translation([0, 0, 57.0]), GRID, poses, 0.5)
@@ -30,22 +30,22 @@ def test_a_covering_plane_is_as_large_as_what_frames_show():
 def test_planes_of_several_modes_begin_with_one_line_and_show_what_became_longer():
     """Two worlds, one of them 6 % too long: the first frame's line has one place in both pictures."""
     way = np.arange(0, 20, 0.5)
-    moved = np.outer([*way, *way[::-1]], [0.1, 0.05, 1.0])
+    path = np.outer([*way, *way[::-1]], [0.1, 0.05, 1.0])
     rng, line = np.random.default_rng(4), lateral_line(GRID, 2.5)
     worlds = RigidTransform.from_components(rng.normal(0, 50, (2, 3)), Rotation.random(2, rng=rng))
     poses = {
-        "image": worlds[0] * RigidTransform.from_translation(1.06 * moved),
-        "truth": worlds[1] * RigidTransform.from_translation(moved),
+        "image": worlds[0] * RigidTransform.from_translation(1.06 * path),
+        "truth": worlds[1] * RigidTransform.from_translation(path),
     }
     planes = planes_from_first_frame(poses, line, 0.1)
     assert planes["image"].shape == planes["truth"].shape
     assert planes["image"].first_mm == planes["truth"].first_mm
-    travelled = []
+    lengths = []
     for mode, plane in planes.items():
         first = plane.world_from_mm([0, 0], line[:, 1])
         np.testing.assert_allclose(first, poses[mode][0].apply(line), atol=1e-9)
         far = poses[mode][way.size].apply(line[0])
-        travelled.append(np.linalg.norm(far - plane.world_from_mm(0.0, 1.0)))
-    assert travelled[0] / travelled[1] == pytest.approx(1.06)
+        lengths.append(np.linalg.norm(far - plane.world_from_mm(0.0, 1.0)))
+    assert lengths[0] / lengths[1] == pytest.approx(1.06)
     # Large enough for the longer one.
     assert planes["truth"].width_mm == pytest.approx(1.06 * 19.5 * np.hypot(1.0, 0.1), rel=1e-9)

@@ -14,9 +14,9 @@ def test_crossings_are_on_the_plane_and_on_the_outline():
     rng = np.random.default_rng(0)
     poses = RigidTransform.from_components(rng.normal(0, 3, (40, 3)), Rotation.random(40, rng=rng))
     plane = RigidTransform.from_components(rng.normal(0, 1, 3), Rotation.random(rng=rng))
-    found = crossings(frame_outlines(GRID, poses), plane)
-    for pose, line in zip(poses, found, strict=True):
-        normals = np.array([each.rotation.apply([0, 0, 1.0]) for each in (pose, plane)])
+    lines = crossings(frame_outlines(GRID, poses), plane)
+    for pose, line in zip(poses, lines, strict=True):
+        normals = np.array([frame.rotation.apply([0, 0, 1.0]) for frame in (pose, plane)])
         along = np.cross(*normals)
         offsets = [normals[0] @ pose.translation, normals[1] @ plane.translation, 0.0]
         base = np.linalg.solve([*normals, along], offsets)
@@ -30,4 +30,4 @@ def test_crossings_are_on_the_plane_and_on_the_outline():
         if y[inside][0] > y[inside][-1]:
             expected = expected[::-1]
         np.testing.assert_allclose(line, expected, atol=2e-3)
-    assert 5 < np.isfinite(found[:, 0, 0]).sum() < 40
+    assert 5 < np.isfinite(lines[:, 0, 0]).sum() < 40

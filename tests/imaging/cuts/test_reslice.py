@@ -17,8 +17,8 @@ def shaky_sweep(rng, frames, step_mm, shake_mm=0.2, shake_deg=3.0, reverse=True)
     """Irregular steps, some backwards, with jitter in all six directions."""
     z = np.cumsum(rng.uniform(-0.4 if reverse else 0.3, 1.6, frames) * step_mm)
     shake = rng.normal(0.0, shake_mm, (frames, 3)) * [1, 1, 0]
-    turned = Rotation.from_rotvec(rng.normal(0.0, np.deg2rad(shake_deg), (frames, 3)))
-    return RigidTransform.from_components(shake + z[:, None] * [0, 0, 1], turned)
+    turn = Rotation.from_rotvec(rng.normal(0.0, np.deg2rad(shake_deg), (frames, 3)))
+    return RigidTransform.from_components(shake + z[:, None] * [0, 0, 1], turn)
 
 
 def pixel_points(plane):
@@ -36,11 +36,11 @@ def test_matches_brute_force_for_any_plane(seed, max_distance_mm, moderate):
     poses = shaky_sweep(rng, 7, 0.5)
     images = rng.normal(size=(7, GRID.vectors, GRID.samples)).astype(np.float32)
     images[rng.integers(7), :3, :3] = np.nan
-    turned = Rotation.from_rotvec(rng.normal(0, 0.3, 3)) if moderate else Rotation.random(rng=rng)
-    plane = ReslicePlane(RigidTransform.from_components(rng.uniform(-1, 3, 3), turned), 4.0, 3.0, 0.21)
-    (got,) = reslice_at(images, GRID, [(poses, plane)], max_distance_mm)
+    turn = Rotation.from_rotvec(rng.normal(0, 0.3, 3)) if moderate else Rotation.random(rng=rng)
+    plane = ReslicePlane(RigidTransform.from_components(rng.uniform(-1, 3, 3), turn), 4.0, 3.0, 0.21)
+    (cut,) = reslice_at(images, GRID, [(poses, plane)], max_distance_mm)
     expected, _ = oracles.between_images(
         images, GRID, poses, pixel_points(plane).reshape(-1, 3), max_distance_mm
     )
     # Distances are kept in single precision: 1e-7 of mm against gaps between frames of down to 1e-3 mm.
-    np.testing.assert_allclose(got.ravel(), expected, atol=1e-3)
+    np.testing.assert_allclose(cut.ravel(), expected, atol=1e-3)

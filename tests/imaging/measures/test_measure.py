@@ -8,13 +8,13 @@ from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.grid import ImageGrid
 from speckle3d.core.pose_errors import PoseErrors
 from speckle3d.imaging.measures.belonging import belonging_of, require_inside
-from speckle3d.imaging.measures.measure import angle, length, measured
+from speckle3d.imaging.measures.measure import angle, length, measure_points
 
 GRID = ImageGrid(41, 81, 0.5, 0.5)
 WORLD = RigidTransform.from_components([20.0, -30.0, 5.0], Rotation.from_euler("ZYX", [1.1, -0.4, 0.7]))
 
 
-def swept(frames=21, length_mm=20.0):
+def bent_sweep(frames=21, length_mm=20.0):
     t = np.linspace(0, 1, frames)
     turns = Rotation.from_rotvec(np.column_stack([0.1 * t, 0.05 * np.sin(4 * t), 0.1 * t]))
     return WORLD * RigidTransform.from_components(np.column_stack([t, t**2, length_mm * t]), turns)
@@ -36,34 +36,34 @@ def inside(poses, places):
     return np.array([poses[f].apply([x, y, 0.0]) for f, (x, y, _) in zip(frames, places, strict=True)])
 
 
-def drawn(errors, frames, points, normal):
+def draw_points(errors, frames, points, normal):
     """Points after the frames they belong to have moved as rigid bodies, exactly: shape (draw, point, 3)."""
-    first, moved = errors.world_from_image[0].rotation, []
+    first, places = errors.world_from_image[0].rotation, []
     for frame, point in zip(frames, points, strict=True):
         error = normal @ errors.factors[:, frame]
         centre = errors.world_from_image[int(frame)].apply(errors.centre_mm)
         turn = first * Rotation.from_rotvec(error[:, 3:]) * first.inv()
-        moved.append(centre + turn.apply(point - centre) + first.apply(error[:, :3]))
-    return np.stack(moved, axis=1)
+        places.append(centre + turn.apply(point - centre) + first.apply(error[:, :3]))
+    return np.stack(places, axis=1)
 
 
 def test_standard_errors_are_those_of_repeated_draws():
     """Each frame moved as a rigid body by its error, exactly; first order is what is claimed."""
-    poses = swept()
+    poses = bent_sweep()
     errors = some_errors(poses)
     points = inside(poses, [(5, 10, 2), (15, 30, 9), (8, 20, 18)])
     near = belonging_of(points, GRID, poses)
     rng = np.random.default_rng(1)
-    moved = drawn(errors, near.frames[:, 0], points, rng.standard_normal((4000, 7)))
-    moved += 0.05 * rng.standard_normal(moved.shape)
-    values = [[length(p[:2])[0], length(p[1:])[0], length(p)[0], angle(p)[0]] for p in moved]
-    claimed = [row.sigma for row in measured(points, near, errors, 0.05)]
+    places = draw_points(errors, near.frames[:, 0], points, rng.standard_normal((4000, 7)))
+    places += 0.05 * rng.standard_normal(places.shape)
+    values = [[length(p[:2])[0], length(p[1:])[0], length(p)[0], angle(p)[0]] for p in places]
+    sigmas = [row.sigma for row in measure_points(points, near, errors, 0.05)]
     # 4000 draws: a deviation to 1.1 %, four times that; and what the second order adds.
-    np.testing.assert_allclose(np.std(values, axis=0), claimed, rtol=0.05)
+    np.testing.assert_allclose(np.std(values, axis=0), sigmas, rtol=0.05)
 
 
 def test_points_outside_the_sweep_are_refused_by_number():
-    poses = swept()
+    poses = bent_sweep()
     centre = poses[10].apply(GRID.centre_mm)
     with pytest.raises(InvalidInputError, match=r"point 2 .*3\.00 mm"):
         require_inside(np.array([centre, WORLD.apply([10, 20, -3.0])]), GRID, poses)

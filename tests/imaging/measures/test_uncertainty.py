@@ -13,7 +13,7 @@ from speckle3d.imaging.voxels.grid import VoxelGrid, grid_around
 GRID = ImageGrid(31, 41, 0.5, 0.5)
 
 
-def scaled(frames=41, turn_deg=0.0, sigma=0.05):
+def sweep_of_open_scale(frames=41, turn_deg=0.0, sigma=0.05):
     """A sweep of 20 mm whose scale is uncertain."""
     t = np.linspace(0, 1, frames)
     turns = Rotation.from_rotvec(np.deg2rad(turn_deg) * np.column_stack([0 * t, t, 0.5 * t]))
@@ -26,24 +26,24 @@ def scaled(frames=41, turn_deg=0.0, sigma=0.05):
 
 def test_interpolated_deviations_are_those_of_the_voxels_themselves():
     """A turning sweep: at voxels in it against the exact value there, to a hundredth of the largest."""
-    errors = scaled(turn_deg=8.0)
+    errors = sweep_of_open_scale(turn_deg=8.0)
     grid = grid_around(GRID, errors.world_from_image, 0.7, Rotation.from_euler("y", 0.3))
     index = np.moveaxis(np.indices(grid.shape), 0, -1).reshape(-1, 3)[::29]
     world = grid.world_from_grid.apply(index * np.array(grid.spacing_mm))
-    swept = belonging_of(world, GRID, errors.world_from_image).gap_mm < 1e-9
-    index, world = index[swept], world[swept]
-    found = deviation_volume(errors, GRID, grid)[tuple(index[:, ::-1].T)]
+    between = belonging_of(world, GRID, errors.world_from_image).gap_mm < 1e-9
+    index, world = index[between], world[between]
+    deviation = deviation_volume(errors, GRID, grid)[tuple(index[:, ::-1].T)]
     exact = deviations(errors, GRID, world)
     assert len(index) > 500
-    assert np.abs(found - exact).max() < 0.01 * exact.max()
+    assert np.abs(deviation - exact).max() < 0.01 * exact.max()
 
 
 def test_empty_voxels_have_no_value_and_one_voxel_has_its_own():
-    errors = scaled()
+    errors = sweep_of_open_scale()
     grid = grid_around(GRID, errors.world_from_image, 0.9)
     state = np.random.default_rng(0).integers(0, 3, grid.shape[::-1]).astype(np.uint8)
     np.testing.assert_array_equal(np.isnan(deviation_volume(errors, GRID, grid, state)), state == 0)
     centre = RigidTransform.from_translation(errors.world_from_image[20].apply(GRID.centre_mm))
-    one = deviation_volume(errors, GRID, VoxelGrid((1, 1, 1), (0.5, 0.5, 0.5), centre))
+    single = deviation_volume(errors, GRID, VoxelGrid((1, 1, 1), (0.5, 0.5, 0.5), centre))
     # Half of the sweep at 5 % of 20 mm.
-    assert one[0, 0, 0] == pytest.approx(0.5, rel=1e-3)
+    assert single[0, 0, 0] == pytest.approx(0.5, rel=1e-3)

@@ -56,14 +56,14 @@ def test_what_is_asked_for_is_had_to_the_last_bit():
 def test_the_spacing_within_a_memory_is_the_finest_round_one(seed, gigabytes):
     poses = hand_sweep(np.random.default_rng(seed), 8, 40.0)
     axes = sweep_axes(poses)
-    found = spacing_within(GRID, poses, gigabytes, axes)
+    spacing_mm = spacing_within(GRID, poses, gigabytes, axes)
 
     def memory(spacing):
         return grid_around(GRID, poses, spacing, axes).size_gb("uint8")
 
     steps = ("1.0", "1.2", "1.5", "2.0", "2.5", "3.0", "4.0", "5.0", "6.0", "8.0")
-    assert f"{found:.1e}".split("e")[0] in steps
-    assert memory(found) <= gigabytes
-    if found > 0.4:  # the samples' spacing, than which none is finer
+    assert f"{spacing_mm:.1e}".split("e")[0] in steps
+    assert memory(spacing_mm) <= gigabytes
+    if spacing_mm > 0.4:  # the samples' spacing, than which none is finer
         rounds = [float(f"{step}e{power}") for power in range(-2, 3) for step in steps]
-        assert memory(max(spacing for spacing in rounds if spacing < found)) > gigabytes
+        assert memory(max(spacing for spacing in rounds if spacing < spacing_mm)) > gigabytes

@@ -8,25 +8,25 @@ from speckle3d.core.labels import EMPTY, FILLED, MEASURED
 from speckle3d.imaging.voxels.holes import boxes_within, fill_holes
 
 
-def some_voxels(rng, shape, share_measured):
+def some_voxels(rng, shape, share):
     """Voxels and their states; what empty ones hold is nonsense."""
     voxels = rng.normal(100.0, 30.0, shape).astype(np.float32)
-    state = np.where(rng.random(shape) < share_measured, MEASURED, EMPTY).astype(np.uint8)
+    state = np.where(rng.random(shape) < share, MEASURED, EMPTY).astype(np.uint8)
     voxels[state == EMPTY] = rng.choice([np.nan, np.inf, 0.0, -1e30], (state == EMPTY).sum())
     return voxels, state
 
 
-def filled_by_definition(voxels, state, boxes):
+def fill_by_definition(voxels, state, boxes):
     """The definition, voxel by voxel, in the order of the boxes (k, j, i)."""
-    filled, marked = voxels.copy(), state.copy()
+    voxels_after, state_after = voxels.copy(), state.copy()
     for at in np.argwhere(state == EMPTY):
         for half in boxes:
             box = tuple(slice(max(c - h, 0), c + h + 1) for c, h in zip(at, half, strict=True))
-            measured = voxels[box][state[box] == MEASURED]
-            if measured.size:
-                filled[tuple(at)], marked[tuple(at)] = measured.mean(dtype=np.float64), FILLED
+            levels = voxels[box][state[box] == MEASURED]
+            if levels.size:
+                voxels_after[tuple(at)], state_after[tuple(at)] = levels.mean(dtype=np.float64), FILLED
                 break
-    return filled, marked
+    return voxels_after, state_after
 
 
 @settings(max_examples=20, deadline=None)
@@ -38,7 +38,7 @@ def filled_by_definition(voxels, state, boxes):
 def test_boxes_in_mm_are_those_of_brute_force(seed, spacing, radius_mm):
     voxels, state = some_voxels(np.random.default_rng(seed), (6, 7, 9), 0.05)
     boxes = boxes_within(radius_mm, spacing)
-    expected = filled_by_definition(voxels, state, boxes)
+    expected = fill_by_definition(voxels, state, boxes)
     fill_holes(voxels, state, radius_mm, spacing)
     np.testing.assert_array_equal(state, expected[1])
     np.testing.assert_array_equal(voxels[state == FILLED], expected[0][state == FILLED])

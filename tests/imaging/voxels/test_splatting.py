@@ -54,24 +54,24 @@ def index_of(voxel_grid, poses, skew=0.0):
     splat=st.sampled_from(SPLATS),
     rule=st.sampled_from(RULES),
     kind=st.sampled_from(TYPES),
-    turned=st.booleans(),
+    column_major=st.booleans(),
 )
-def test_matches_brute_force(seed, splat, rule, kind, turned):
+def test_matches_brute_force(seed, splat, rule, kind, column_major):
     rng = np.random.default_rng(seed)
     images, poses, voxel_grid = any_scene(rng, kind)
     skew, region = rng.uniform(-0.2, 0.2), rng.random((GRID.vectors, GRID.samples)) < 0.8
     weights = rng.integers(0, 3, FRAMES) * rng.uniform(0.5, 2, FRAMES)
-    each = np.broadcast_to(region, images.shape).astype(float)
+    shares = np.broadcast_to(region, images.shape).astype(float)
     if rule == "weighted":
-        each = each * weights[:, None, None]
+        shares = shares * weights[:, None, None]
     index = index_of(voxel_grid, poses, skew)
-    expected = oracles.splat(images, index, voxel_grid.shape, splat, rule, each)
+    expected = oracles.splat(images, index, voxel_grid.shape, splat, rule, shares)
     if np.isnan(expected).all():
         return
-    stored = [np.asfortranarray(image) for image in images] if turned else images
-    chosen = {"splat": splat, "rule": rule, "weights": weights, "region": region}
+    source = [np.asfortranarray(image) for image in images] if column_major else images
+    options = {"splat": splat, "rule": rule, "weights": weights, "region": region}
     volume = compound(
-        stored, replace(GRID, skew_rad=skew), poses, voxel_grid=voxel_grid, fill_radius=0, **chosen
+        source, replace(GRID, skew_rad=skew), poses, voxel_grid=voxel_grid, fill_radius=0, **options
     )
     # Sums in double precision, of levels up to 2^16; means in single.
     np.testing.assert_allclose(volume.voxels, expected, rtol=1e-6, atol=1e-9 * 2**16)
@@ -81,14 +81,14 @@ def test_matches_brute_force(seed, splat, rule, kind, turned):
 def test_samples_on_a_border_belong_to_the_voxel_above():
     grid = ImageGrid(1, 9, 1.0, 0.5)
     voxel_grid = VoxelGrid((1, 4, 1), (1.0, 1.0, 1.0), RigidTransform.identity())
-    for moved in (0.0, 1e-12, -1e-12):
-        pose = RigidTransform.from_translation([[0.0, moved, 0.0]])
+    for shift_mm in (0.0, 1e-12, -1e-12):
+        pose = RigidTransform.from_translation([[0.0, shift_mm, 0.0]])
         volume = compound(np.arange(9, dtype=np.uint8)[None, None], grid, pose, voxel_grid=voxel_grid)
         # Samples at 0; 0.5 and 1; 1.5 and 2; 2.5 and 3; at 3.5 and 4 outside.
         np.testing.assert_array_equal(volume.voxels[0, :, 0], [0, 1.5, 3.5, 5.5])
 
 
-def test_what_cannot_be_compounded_is_refused():
+def test_inputs_that_do_not_fit_are_errors():
     images, poses, voxel_grid = any_scene(np.random.default_rng(0), "uint8")
     scene = {"images": images, "grid": GRID, "world_from_image": poses, "voxel_grid": voxel_grid}
     for how, error in (
@@ -113,8 +113,8 @@ def test_the_rule_plus_keeps_whole_levels_also_of_a_fans_picture():
         compound(images, draw.grid, poses, 0.9, rule=rule, fill_radius=0) for rule in ("mean", "plus")
     )
     np.testing.assert_array_equal(plus.state, mean.state)
-    lost = (mean.voxels - plus.voxels)[plus.state > 0]
+    loss = (mean.voxels - plus.voxels)[plus.state > 0]
     # Places are rounded to 2^-14 voxel, each pixel loses less than a level.
-    assert lost.size > 0.3 * plus.state.size
-    assert 0 < lost.mean() < 4
+    assert loss.size > 0.3 * plus.state.size
+    assert 0 < loss.mean() < 4
     assert (plus.voxels == np.rint(plus.voxels))[plus.state > 0].all()
