@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import numpy as np
-from numba import njit
+from typing import Any
 
-from speckle3d.core.arrays import FloatArray
+import numpy as np
+import numpy.typing as npt
+from numba import njit
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
-def copy_into(target: FloatArray, source: FloatArray) -> None:
+def copy_into(target: npt.NDArray[Any], source: npt.NDArray[Any]) -> None:
     """Copy an array into another of its shape.
 
     ``target[:] = source`` does the same, and compiles for seconds, for numba's words about its shape.
