@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from browsers import needs_browser, opened, viewing
+from browsers import needs_browser, open_page, viewing
 from phantom_pages import place, text_match
 from phantom_recordings import wire_recording
 
@@ -21,7 +21,7 @@ def recording(tmp_path_factory):
 def page(browser, recording):
     path = recording[0]
     with viewing(path, "--calibrate", "wires", "--phantom", path.with_suffix(".xml")) as address:
-        page = opened(browser, address)
+        page = open_page(browser, address)
         page.locator(".phantom-told").wait_for()
         page.get_by_role("button", name="Find points in all frames").click()
         text_match(page, "phantom-told", r"in \d+ frames")
