@@ -55,8 +55,9 @@ def track(
     require_placed(matches.flags)
 
     tissue = tissue_curves(curves, matches.texture, matches.flags == 0)
-    image_plane = tissue.curves, matcher.patches, matcher.centre_mm
-    problem = MotionProblem(*image_plane, len(sweep), settings.planes, settings.trajectory)
+    problem = MotionProblem(
+        tissue.curves, matcher.patches, matcher.centre_mm, len(sweep), settings.planes, settings.trajectory
+    )
     motion = estimate_motion(problem, matches.table, matches.sound)
     flags = placed_flags(matches.flags, motion.unplaced)
 
