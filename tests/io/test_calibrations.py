@@ -16,14 +16,14 @@ def path(tmp_path):
     return tmp_path / "cal.h5"
 
 
-def test_both_sensors_are_calibrated_from_their_files_and_the_files_told(path):
+def test_a_calibration_file_for_each_sensor(path):
     turn = path.with_name("turn.h5")
     write_calibration(turn, example_calibration("orientation"))
-    sweep, held = apply_calibrations(sweep_examples.rf_sweep(), [path, turn])
+    sweep, files = apply_calibrations(sweep_examples.rf_sweep(), [path, turn])
     off = sweep.tracker.sensor_from_image.inv() * example_calibration().sensor_from_image
     np.testing.assert_allclose(off.as_matrix(), np.eye(4), atol=1e-9)
     assert (sweep.orientation.sensor_from_image.inv() * example_calibration().rotation).magnitude() < 1e-12
-    assert [(one.sensor, one.path, one.sha256) for one in held] == [
+    assert [(file.sensor, file.path, file.sha256) for file in files] == [
         ("tracker", str(path), sha256_of(path)),
         ("orientation", str(turn), sha256_of(turn)),
     ]

@@ -31,11 +31,11 @@ def test_a_scan_is_a_sweep(scan):
 
 def test_landmarks_are_counted_from_frame_0_and_pixel_1(scan):
     path, _, _, marks = scan
-    found = load_landmarks(path)
-    np.testing.assert_array_equal(found.frame, marks[:, 0])
-    np.testing.assert_allclose(found.points_mm[:, 0], (marks[:, 1] - 1) * 0.25)
-    np.testing.assert_allclose(found.points_mm[:, 1], (marks[:, 2] - 1) * 0.2)
-    assert not found.points_mm[:, 2].any()
+    landmarks = load_landmarks(path)
+    np.testing.assert_array_equal(landmarks.frame, marks[:, 0])
+    np.testing.assert_allclose(landmarks.points_mm[:, 0], (marks[:, 1] - 1) * 0.25)
+    np.testing.assert_allclose(landmarks.points_mm[:, 1], (marks[:, 2] - 1) * 0.2)
+    assert not landmarks.points_mm[:, 2].any()
 
 
 def test_a_test_scan_has_no_tracker_and_no_landmarks_and_needs_a_calibration(tmp_path):

@@ -31,7 +31,7 @@ def entry(node, index, value):
     return lambda file: file[node].__setitem__(index, value)
 
 
-def replaced(node, value):
+def replacement(node, value):
     def edit(file):
         attributes = dict(file[node].attrs)
         del file[node]
@@ -45,12 +45,12 @@ def replaced(node, value):
 WRONG = {
     "rf": [
         (drop("rf"), "rf, iq or bmode"),
-        (replaced("frame_time_s", np.arange(3.0)), "/rf"),
+        (replacement("frame_time_s", np.arange(3.0)), "/rf"),
         (entry("frame_time_s", 2, 0.0), r"/frame_time_s\[2\]"),
         (entry("tracker/world_from_sensor", 2, np.diag([1, 1, -1, 1])), r"/world_from_sensor\[2\]"),
         (attribute("rf", "sampling_rate_hz", "fast"), "/rf.*sampling_rate_hz"),
         (attribute("/", "version", 4), "version"),
-        (replaced("frame_time_s", h5py.ExternalLink("/etc/passwd", "/x")), "/frame_time_s"),
+        (replacement("frame_time_s", h5py.ExternalLink("/etc/passwd", "/x")), "/frame_time_s"),
     ],
     "calibration": [
         (entry("covariance", (1, 1), -1.0), "/covariance"),
@@ -70,10 +70,10 @@ def test_what_is_wrong_is_named_in_one_line(tmp_path, kind, edit, message):
     path.write_bytes((old_files.FOLDER / f"{kind}.h5").read_bytes())
     with h5py.File(path, "r+") as file:
         edit(file)
-    with pytest.raises(InvalidInputError, match=message) as caught:
+    with pytest.raises(InvalidInputError, match=message) as error:
         READ[kind](path)
-    assert str(caught.value).count(str(path)) == 1
-    assert "\n" not in str(caught.value)
+    assert str(error.value).count(str(path)) == 1
+    assert "\n" not in str(error.value)
 
 
 def test_curves_of_earlier_versions_are_read(tmp_path):

@@ -20,7 +20,7 @@ def write(folder, content, error=None):
             raise error
 
 
-def held(folder):
+def contents(folder):
     return {str(p.relative_to(folder)): p.read_text() for p in folder.rglob("*") if p.is_file()}
 
 
@@ -36,8 +36,8 @@ def test_a_set_takes_the_place_of_the_old_one_and_other_files_stay(tmp_path):
     with FILES.replaced(tmp_path) as part:
         for name in FILES.names:
             (part / name).write_text("new")
-        assert held(tmp_path).items() >= WHOLE["old"].items()
-    assert held(tmp_path) == WHOLE["new"] | {"mine.txt": "mine"}
+        assert contents(tmp_path).items() >= WHOLE["old"].items()
+    assert contents(tmp_path) == WHOLE["new"] | {"mine.txt": "mine"}
     assert tmp_path.stat().st_ino == before
 
 
@@ -52,7 +52,7 @@ def test_a_failure_leaves_everything_as_it_was(tmp_path, error):
     write(tmp_path, "old")
     with pytest.raises(kind):
         write(tmp_path, "new", error)
-    assert held(tmp_path) == WHOLE["old"]
+    assert contents(tmp_path) == WHOLE["old"]
 
 
 HOLDER = """
@@ -76,9 +76,9 @@ def test_a_second_run_is_refused_until_the_first_is_gone_however_it_went(tmp_pat
         with pytest.raises(FileError, match="no other run"):
             write(folder, "new")
         holder.kill()
-    assert held(folder).items() >= WHOLE["old"].items()
+    assert contents(folder).items() >= WHOLE["old"].items()
     write(folder, "new")
-    assert held(tmp_path) == {f"out/{name}": "new" for name in FILES.names}
+    assert contents(tmp_path) == {f"out/{name}": "new" for name in FILES.names}
 
 
 def test_broken_off_between_two_files_nothing_is_of_both_results(tmp_path, monkeypatch):
@@ -86,4 +86,4 @@ def test_broken_off_between_two_files_nothing_is_of_both_results(tmp_path, monke
     monkeypatch.setattr(fileset.shutil, "move", lambda *_: (_ for _ in ()).throw(OSError("broken off")))
     with pytest.raises(FileError):
         write(tmp_path, "new")
-    assert held(tmp_path) == {"main.h5": "old"}
+    assert contents(tmp_path) == {"main.h5": "old"}

@@ -16,22 +16,22 @@ SWEEPS = {
 }
 
 
-def growing(path, sweep, compression=None, **more):
-    return GrowingSweep(path, sweep.grid, sweep.signal, stored_dtype(sweep.frames), compression, **more)
+def growing(path, sweep, compression=None, **options):
+    return GrowingSweep(path, sweep.grid, sweep.signal, stored_dtype(sweep.frames), compression, **options)
 
 
 @pytest.mark.parametrize(("kind", "compression"), [("rf", None), ("iq", "gzip"), ("bmode", None)])
-def test_what_was_appended_is_read_while_it_grows_and_when_it_is_closed(tmp_path, kind, compression):
+def test_frames_are_read_while_a_file_grows_and_when_it_is_whole(tmp_path, kind, compression):
     sweep, path = SWEEPS[kind], tmp_path / "s.h5"
     with growing(path, sweep, compression) as target:
         for i in range(2):
             target.append(sweep.frames[i], sweep.frame_time_s[i])
-            found = load_sweep(path)
-            assert len(found) == len(target) == i + 1
-            np.testing.assert_array_equal(found.frames[i], sweep.frames[i])
-            assert (found.tracker, found.orientation) == (None, None)
+            sweep_so_far = load_sweep(path)
+            assert len(sweep_so_far) == len(target) == i + 1
+            np.testing.assert_array_equal(sweep_so_far.frames[i], sweep.frames[i])
+            assert (sweep_so_far.tracker, sweep_so_far.orientation) == (None, None)
             assert f"{i + 1} frames so far" in open_recording(path).notes[0]
-            found.frames.close()
+            sweep_so_far.frames.close()
     assert not any("frames" in note for note in open_recording(path).notes)
 
 
@@ -42,18 +42,18 @@ def test_a_file_that_is_there_stays_as_it_is(tmp_path):
     assert (tmp_path / "s.h5").read_text() == "mine"
 
 
-def test_what_is_refused_is_not_in_the_file_and_the_recording_goes_on(tmp_path):
+def test_an_error_leaves_nothing_in_the_file_and_the_recording_goes_on(tmp_path):
     sweep, path = SWEEPS["rf"], tmp_path / "s.h5"
     with growing(path, sweep, probe="L14") as target:
         target.append(sweep.frames[0], 10.0)
         target.append_pose(9.0, np.eye(4))
-        for refused in (
+        for append in (
             lambda: target.append_pose(9.0, np.eye(4)),
             lambda: target.append(sweep.frames[1], 10.0),
         ):
             with pytest.raises(InvalidInputError):
-                refused()
+                append()
         target.append(sweep.frames[1], 12.0)
-    found = load_sweep(path)
-    assert (found.probe, found.frame_time_s.tolist()) == ("L14", [10.0, 12.0])
-    assert len(found.tracker.readings) == 1
+    sweep_so_far = load_sweep(path)
+    assert (sweep_so_far.probe, sweep_so_far.frame_time_s.tolist()) == ("L14", [10.0, 12.0])
+    assert len(sweep_so_far.tracker.readings) == 1

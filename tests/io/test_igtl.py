@@ -24,19 +24,24 @@ SINGLE = 1e-5
 
 def by_pyigtl(message):
     fields = MessageBase.parse_header(message[:58])
-    made = MessageBase.create_message(fields["message_type"])
-    made.unpack(fields, message[58:])
-    return made
+    content = MessageBase.create_message(fields["message_type"])
+    content.unpack(fields, message[58:])
+    return content
 
 
 @pytest.mark.parametrize("version", [1, 2])
 def test_an_image_of_pyigtl_is_read(version):
     message, pixels, place = image(dtype="f4", version=version)
-    got = decode_whole(message)
-    assert (got.device, got.time_s, got.components, got.pixels.dtype) == ("Image_Reference", 12.25, 1, "f4")
-    np.testing.assert_array_equal(got.pixels, pixels)
-    np.testing.assert_allclose(got.image_to_world, place, atol=SINGLE)
-    np.testing.assert_allclose(got.spacing_mm, [0.3, 0.1, 2.0], atol=SINGLE)
+    ours = decode_whole(message)
+    assert (ours.device, ours.time_s, ours.components, ours.pixels.dtype) == (
+        "Image_Reference",
+        12.25,
+        1,
+        "f4",
+    )
+    np.testing.assert_array_equal(ours.pixels, pixels)
+    np.testing.assert_allclose(ours.image_to_world, place, atol=SINGLE)
+    np.testing.assert_allclose(ours.spacing_mm, [0.3, 0.1, 2.0], atol=SINGLE)
 
 
 @pytest.mark.parametrize("shape", [(6, 9), (6, 9, 4), (6, 9, 3)])
@@ -44,22 +49,24 @@ def test_pyigtl_and_we_read_an_image_of_ours(shape):
     pixels = np.random.default_rng(0).integers(0, 100, shape).astype(np.int16)
     colours, place = 3 if shape[-1] == 3 else 1, image()[2]
     message = packed_image("Volume", 1700000000.123456, pixels, place, colours)
-    theirs, ours = by_pyigtl(message), decode_whole(message)
+    reference, ours = by_pyigtl(message), decode_whole(message)
     whole = pixels[:, :, None] if pixels.ndim == 2 or colours == 3 else pixels
-    np.testing.assert_array_equal(theirs.image, whole.transpose(2, 1, 0, *range(3, whole.ndim)))
+    np.testing.assert_array_equal(reference.image, whole.transpose(2, 1, 0, *range(3, whole.ndim)))
     np.testing.assert_array_equal(ours.pixels, pixels)
     assert ours.components == colours
-    np.testing.assert_allclose([theirs.ijk_to_world_matrix, ours.image_to_world], [place, place], atol=SINGLE)
-    assert [theirs.timestamp, ours.time_s] == pytest.approx([1700000000.123456] * 2, abs=1e-6)
+    np.testing.assert_allclose(
+        [reference.ijk_to_world_matrix, ours.image_to_world], [place, place], atol=SINGLE
+    )
+    assert [reference.timestamp, ours.time_s] == pytest.approx([1700000000.123456] * 2, abs=1e-6)
 
 
-@pytest.mark.parametrize(("said", "valid"), [
+@pytest.mark.parametrize(("metadata", "valid"), [
     ({}, True),
     ({"TransformValid": "False"}, False),
     ({"TransformStatus": "OUT_OF_VIEW"}, False),
 ])  # fmt: skip
-def test_a_transform_of_plus_says_whether_the_tool_was_in_sight(said, valid):
-    message, matrix = transform(version=2, **said)
+def test_a_transform_of_plus_says_whether_the_tool_was_in_sight(metadata, valid):
+    message, matrix = transform(version=2, **metadata)
     assert decode_whole(message).valid == valid
     np.testing.assert_allclose(decode_whole(message).matrix, matrix, atol=SINGLE)
 
@@ -84,11 +91,11 @@ def until(is_so, timeout_s=WAIT_S):
         time.sleep(0.005)
 
 
-def taken(receiver, count):
-    got, end = [], time.monotonic() + WAIT_S
-    while len(got) < count and time.monotonic() < end:
-        got += receiver.receive(0.1)
-    return got
+def take(receiver, count):
+    messages, end = [], time.monotonic() + WAIT_S
+    while len(messages) < count and time.monotonic() < end:
+        messages += receiver.receive(0.1)
+    return messages
 
 
 @pytest.fixture
@@ -103,20 +110,20 @@ def test_every_message_comes_in_order_to_every_client_and_back():
     images = [packed_image("I", k, np.full((40, 300), k, np.int16), np.eye(4)) for k in range(50)]
     with (
         Server(0) as server,
-        Connection("127.0.0.1", server.port) as one,
-        Connection("127.0.0.1", server.port) as two,
+        Connection("127.0.0.1", server.port) as first,
+        Connection("127.0.0.1", server.port) as second,
     ):
         until(lambda: server.state.peers == 2)
         for message in images:
             server.send(message)
-        for client in (one, two):
-            got = taken(client, 50)
-            assert [message.time_s for message in got] == list(range(50))
-            assert all((message.pixels == k).all() for k, message in enumerate(got))
+        for client in (first, second):
+            messages = take(client, 50)
+            assert [message.time_s for message in messages] == list(range(50))
+            assert all((message.pixels == k).all() for k, message in enumerate(messages))
             assert (client.state.refused, client.state.dropped) == (0, 0)
         assert server.drain(WAIT_S)
-        one.send(packed_transform("Pose", 1.0, np.eye(4)))
-        assert [message.device for message in taken(server, 1)] == ["Pose"]
+        first.send(packed_transform("Pose", 1.0, np.eye(4)))
+        assert [message.device for message in take(server, 1)] == ["Pose"]
 
 
 def test_a_peer_that_is_too_slow_is_left_out_and_costs_others_nothing():
@@ -126,7 +133,7 @@ def test_a_peer_that_is_too_slow_is_left_out_and_costs_others_nothing():
             until(lambda: server.state.peers == 2)
             for _ in range(40):
                 server.send(message)
-                assert len(taken(quick, 1)) == 1
+                assert len(take(quick, 1)) == 1
             assert server.state.dropped > 0
             assert not server.drain(0.1)
         until(lambda: server.state.peers == 1)
@@ -143,7 +150,7 @@ def test_a_connection_waits_for_its_server_and_reconnects():
                 assert connection.wait_connected(WAIT_S)
                 assert server.wait_connected(WAIT_S)
                 server.send(LAST)
-                assert [message.device for message in taken(connection, 1)] == ["Last"]
+                assert [message.device for message in take(connection, 1)] == ["Last"]
             until(lambda: not connection.state.peers)
 
 
@@ -152,7 +159,7 @@ def test_a_damaged_body_is_refused_alone_and_a_damaged_header_ends_the_connectio
     with Connection("127.0.0.1", port) as connection:
         peer, _ = server.accept()
         peer.sendall(LAST + IMAGE[:-1] + bytes([IMAGE[-1] ^ 1]) + LAST)
-        assert len(taken(connection, 2)) == 2
+        assert len(take(connection, 2)) == 2
         state = connection.state
         assert (state.peers, state.refused) == (1, 1)
         assert "check sum" in state.last_refused
@@ -160,7 +167,7 @@ def test_a_damaged_body_is_refused_alone_and_a_damaged_header_ends_the_connectio
         again, _ = server.accept()
         assert "header" in connection.state.last_failure
         again.sendall(LAST)
-        assert len(taken(connection, 1)) == 1
+        assert len(take(connection, 1)) == 1
         peer.close()
         again.close()
 
@@ -172,7 +179,7 @@ def test_a_peer_that_dies_or_stalls_within_a_message_costs_that_message(listenin
     with Connection("127.0.0.1", port) as connection:
         peer, _ = server.accept()
         peer.sendall(LAST)
-        assert len(taken(connection, 1)) == 1
+        assert len(take(connection, 1)) == 1
         until(lambda: connection.state.silent_s > 0.5)  # silence between messages is no stall
         assert connection.state.peers
         peer.sendall(LAST + LAST[:70])
@@ -181,7 +188,7 @@ def test_a_peer_that_dies_or_stalls_within_a_message_costs_that_message(listenin
         again, _ = server.accept()
         assert ("within a message" if dies else "0.3 s") in connection.state.last_failure
         again.sendall(LAST)
-        assert len(taken(connection, 2)) == 2
+        assert len(take(connection, 2)) == 2
         peer.close()
         again.close()
 
@@ -195,7 +202,7 @@ def test_pyigtl_connects_to_our_server():
             server.send(packed_image("Volume", 1.5, np.ones((3, 4, 5), np.uint8), np.eye(4)))
             assert client.wait_for_message("Volume", WAIT_S).image.shape == (5, 4, 3)
             client.send_message(pyigtl.TransformMessage(np.eye(4), 2.0, "Back"), wait=False)
-            assert [message.device for message in taken(server, 1)] == ["Back"]
+            assert [message.device for message in take(server, 1)] == ["Back"]
         finally:
             if client is not None:
                 client.stop()

@@ -11,6 +11,6 @@ from speckle3d.io.toml import load_toml
 ])  # fmt: skip
 def test_slips_are_named_in_one_line(tmp_path, text):
     (tmp_path / "import.toml").write_text(text)
-    with pytest.raises(InvalidInputError, match=rf"import\.toml: {text.split()[0]}") as caught:
+    with pytest.raises(InvalidInputError, match=rf"import\.toml: {text.split()[0]}") as error:
         load_toml(ImportSettings, tmp_path / "import.toml")
-    assert "\n" not in str(caught.value)
+    assert "\n" not in str(error.value)

@@ -41,8 +41,8 @@ def test_what_settings_override_is_told_with_what_the_file_says(tmp_path):
         "vector pitch 0.05 mm, given: the file says 0.2 (ElementSpacing)"
         in open_recording(path, option).notes
     )
-    rated = ImportSettings(frame_rate_hz=20.0)
-    assert "frame rate 20 Hz, given: the file says 10 (of its times)" in open_recording(path, rated).notes
+    settings = ImportSettings(frame_rate_hz=20.0)
+    assert "frame rate 20 Hz, given: the file says 10 (of its times)" in open_recording(path, settings).notes
 
 
 def test_settings_that_were_in_force_are_told_and_a_sweep_file_has_none(tmp_path):

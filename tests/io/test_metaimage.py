@@ -147,11 +147,11 @@ def test_the_tool_is_what_the_image_is_on(tmp_path):
 
 
 @pytest.mark.parametrize("size", [b"5 4", b"0 0"])
-@pytest.mark.parametrize("packed", [b"False", b"True"])
-def test_frames_that_a_header_claims_beyond_its_bytes_are_refused_in_one_line(tmp_path, size, packed):
+@pytest.mark.parametrize("is_packed", [b"False", b"True"])
+def test_frames_that_a_header_claims_beyond_its_bytes_are_refused_in_one_line(tmp_path, size, is_packed):
     path = write_mha(tmp_path / "a.mha", grey(), frames=frame_fields(3)[2])
     content = path.read_bytes().replace(b"DimSize = 5 4 3", b"DimSize = " + size + b" 100000000000000")
-    path.write_bytes(content.replace(b"CompressedData = False", b"CompressedData = " + packed))
+    path.write_bytes(content.replace(b"CompressedData = False", b"CompressedData = " + is_packed))
     for read in (read_poses, lambda path: load_sweep(path, BMODE)):
         with pytest.raises((FileError, InvalidInputError)) as error:
             read(path)

@@ -13,33 +13,35 @@ from speckle3d.io.load import load_sweep
 from speckle3d.io.reconstructions import read_reconstruction
 
 
-def assert_same(got, expected, where=""):
+def assert_same(actual, expected, where=""):
     """Compare records field by field, whatever lazily read or nested they hold."""
     if isinstance(expected, Sweep):
         frames = [np.asarray(expected.frames[i]) for i in range(len(expected))]
-        np.testing.assert_array_equal([got.frames[i] for i in range(len(got))], frames, where)
+        np.testing.assert_array_equal([actual.frames[i] for i in range(len(actual))], frames, where)
     if hasattr(expected, "as_matrix"):
-        np.testing.assert_allclose(got.as_matrix(), expected.as_matrix(), atol=1e-12, err_msg=where)
+        np.testing.assert_allclose(actual.as_matrix(), expected.as_matrix(), atol=1e-12, err_msg=where)
     elif is_dataclass(expected):
         for field in fields(expected):
-            is_own = field.compare and (
+            compare = field.compare and (
                 field.name not in ("frames", "name") or not isinstance(expected, Sweep)
             )
-            if is_own:
-                assert_same(getattr(got, field.name), getattr(expected, field.name), f"{where}.{field.name}")
+            if compare:
+                assert_same(
+                    getattr(actual, field.name), getattr(expected, field.name), f"{where}.{field.name}"
+                )
     elif isinstance(expected, dict):
-        assert list(got) == list(expected), where
+        assert list(actual) == list(expected), where
         for name, value in expected.items():
-            assert_same(got[name], value, f"{where}[{name}]")
+            assert_same(actual[name], value, f"{where}[{name}]")
     elif isinstance(expected, tuple) and expected and is_dataclass(expected[0]):
-        assert len(got) == len(expected), where
-        for one, other in zip(got, expected, strict=True):
-            assert_same(one, other, where)
+        assert len(actual) == len(expected), where
+        for a, b in zip(actual, expected, strict=True):
+            assert_same(a, b, where)
     elif isinstance(expected, np.ndarray):
-        assert got.dtype == expected.dtype, where
-        np.testing.assert_array_equal(got, expected, where)
+        assert actual.dtype == expected.dtype, where
+        np.testing.assert_array_equal(actual, expected, where)
     else:
-        assert got == expected, where
+        assert actual == expected, where
 
 
 RECORDINGS = ("growing", "growing_gzip", "killed")
@@ -58,9 +60,9 @@ def folder(request, tmp_path_factory):
     """The set as version 0.1 wrote it, and written now."""
     if request.param == "version 0.1":
         return old_files.FOLDER
-    made = tmp_path_factory.mktemp("made")
-    old_files.write_all(made)
-    return made
+    target = tmp_path_factory.mktemp("made")
+    old_files.write_all(target)
+    return target
 
 
 def test_the_set_is_whole(folder):
@@ -68,16 +70,16 @@ def test_the_set_is_whole(folder):
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_a_file_is_read_as_what_was_written(folder, name):
+def test_a_file_holds_its_record(folder, name):
     read, content = FILES[name]
     assert_same(read(folder / f"{name}.h5"), content)
 
 
 @pytest.mark.parametrize("name", RECORDINGS)
-def test_a_recording_is_read_as_what_was_appended(folder, name):
-    whole, got = old_files.sweeps()["rf"][0], load_sweep(folder / f"{name}.h5")
-    assert_same(got.grid, whole.grid)
-    np.testing.assert_array_equal([got.frames[i] for i in range(len(got))], whole.frames)
-    assert_same(got.frame_time_s, whole.frame_time_s)
-    assert_same(got.tracker.readings.world_from_sensor, old_files.POSES[[0, 1, 3]])
-    assert_same(got.orientation.readings.world_from_sensor, old_files.TURNS)
+def test_a_recording_holds_its_frames_and_readings(folder, name):
+    whole, actual = old_files.sweeps()["rf"][0], load_sweep(folder / f"{name}.h5")
+    assert_same(actual.grid, whole.grid)
+    np.testing.assert_array_equal([actual.frames[i] for i in range(len(actual))], whole.frames)
+    assert_same(actual.frame_time_s, whole.frame_time_s)
+    assert_same(actual.tracker.readings.world_from_sensor, old_files.POSES[[0, 1, 3]])
+    assert_same(actual.orientation.readings.world_from_sensor, old_files.TURNS)

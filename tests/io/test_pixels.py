@@ -12,7 +12,7 @@ from speckle3d.io.import_settings import ImportSettings
 BMODE = ImportSettings(column_pitch_mm=0.1, row_spacing_mm=0.2, dynamic_range_db=60.0)
 
 
-def detached(folder, name, suffix=".mhd"):
+def header_and_pixels(folder, name, suffix=".mhd"):
     """A header whose pixels are in another file."""
     whole = write_mha(folder / "whole.mha", grey(), frames=frame_fields(3)[2]).read_bytes()
     head, _, pixels = whole.partition(b"LOCAL\n")
@@ -26,7 +26,7 @@ def detached(folder, name, suffix=".mhd"):
 @pytest.mark.parametrize(("start", "suffix"), [(0, ".mhd"), (7, ".mhd"), (-1, ".mhd"), (-1, ".nhdr")])
 def test_pixels_behind_bytes_of_another_program(tmp_path, start, suffix):
     """Of -1, as MetaIO and NRRD have it, they are the file's last bytes."""
-    path, pixels = detached(tmp_path, "pixels.raw", suffix)
+    path, pixels = header_and_pixels(tmp_path, "pixels.raw", suffix)
     field = f"HeaderSize = {start}\nElementDataFile" if suffix == ".mhd" else f"byte skip: {start}\nData File"
     text = path.read_bytes().decode()
     path.write_text(text.replace("ElementDataFile" if suffix == ".mhd" else "Data File", field))
@@ -42,6 +42,6 @@ def test_numbers_of_either_byte_order_are_read(tmp_path, kind, big):
     if big:
         head, _, _ = path.read_bytes().partition(b"LOCAL\n")
         path.write_bytes(head + b"LOCAL\n" + values.byteswap().tobytes())
-    got = read_header(path).numbers()
-    assert got.dtype == values.dtype
-    np.testing.assert_array_equal(got, values.ravel())
+    numbers = read_header(path).numbers()
+    assert numbers.dtype == values.dtype
+    np.testing.assert_array_equal(numbers, values.ravel())

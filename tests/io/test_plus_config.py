@@ -50,7 +50,7 @@ def test_the_phantoms_pose_is_read_either_way_round_by_the_names_of_the_set(
     tmp_path, phantom, reference, inverse
 ):
     tail = '<vtkPlusProbeCalibrationAlgo PhantomCoordinateFrame="Box" ReferenceCoordinateFrame="Table" />'
-    own = tail if phantom == "Box" else ""
-    path = device_set(tmp_path, transforms=POSE.format(phantom, reference), tail=own)
+    algorithm = tail if phantom == "Box" else ""
+    path = device_set(tmp_path, transforms=POSE.format(phantom, reference), tail=algorithm)
     pose = read_wire_phantom(path).phantom.world_from_phantom
     np.testing.assert_allclose((pose.inv() if inverse else pose).apply([1.0, 2.0, 3.0]), [8.0, 21.0, 33.0])

@@ -14,7 +14,7 @@ from speckle3d.io.pose_paths import checked_path
 TIMES_S = np.arange(40) / 20
 
 
-def checked(change):
+def path_after(change):
     """Readings that stay of a path of 0.5 mm a reading after a change of its places, and the notes."""
     places = np.array([100.0, 50.0, 0.0]) + np.arange(40)[:, None] * [0.0, 0.0, 0.5]
     change(places)
@@ -28,21 +28,21 @@ def checked(change):
 @pytest.mark.parametrize(
     ("rows", "place"), [(slice(10, 14), [0.0, 0.0, 0.0]), (slice(0, 3), [100.0, 72.0, 0.0])]
 )
-def test_poses_that_no_hand_reaches_are_left_out(rows, place):
+def test_poses_that_no_hand_reaches_are_no_readings(rows, place):
     """A lost tool that is written as the identity, and a jump of 22 mm at the beginning."""
-    times, notes = checked(lambda places: places.__setitem__(rows, place))
+    times, notes = path_after(lambda places: places.__setitem__(rows, place))
     np.testing.assert_array_equal(times, np.delete(TIMES_S, rows))
     assert f"{40 - times.size} of 40 left out" in notes[0]
 
 
 def test_single_placements_all_stay():
-    times, notes = checked(lambda places: places.__setitem__((slice(None), 0), 50 * (np.arange(40) % 2)))
+    times, notes = path_after(lambda places: places.__setitem__((slice(None), 0), 50 * (np.arange(40) % 2)))
     assert times.size == 40
     assert "all are kept" in notes[0]
 
 
-def test_a_tracker_that_stood_still_while_images_changed_is_told():
-    _, notes = checked(lambda places: places.__setitem__(slice(10, 30), places[10]))
+def test_a_tracker_at_rest_while_images_change_gives_a_note():
+    _, notes = path_after(lambda places: places.__setitem__(slice(10, 30), places[10]))
     assert "the longest of 20 poses, 0.95 s from 0.500 s" in notes[0]
-    _, notes = checked(lambda places: places.__imul__(1e-4))
+    _, notes = path_after(lambda places: places.__imul__(1e-4))
     assert "in metres" in notes[0]

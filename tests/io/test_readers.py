@@ -22,9 +22,9 @@ def test_a_recordings_own_file_comes_before_the_folders_and_options_before_both(
     assert load_sweep(images).signal == BModeSettings(60.0)
     images.with_name("a.mha.toml").write_text(BMODE.replace("60", "70"))
     assert load_sweep(images).signal == BModeSettings(70.0)
-    given = ImportSettings(dynamic_range_db=80.0)
-    assert load_sweep(images, given).signal == BModeSettings(80.0)
-    assert settings_for(images, given).column_pitch_mm == 0.1
+    options = ImportSettings(dynamic_range_db=80.0)
+    assert load_sweep(images, options).signal == BModeSettings(80.0)
+    assert settings_for(images, options).column_pitch_mm == 0.1
 
 
 def test_the_hash_of_a_recording_covers_what_stands_beside_it(images):
@@ -53,15 +53,15 @@ def test_settings_of_a_folder_stand_beside_it_or_in_it(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("name", "value", "said"),
+    ("name", "value", "message"),
     [
         ("column_pitch_mm", 300.0, "vector_pitch_mm: .*another unit"),
         ("row_spacing_mm", 0.0002, "sample_spacing_mm"),
         ("frame_rate_hz", 25000.0, "frame_interval_s"),
     ],
 )
-def test_numbers_in_another_unit_are_refused(tmp_path, name, value, said):
+def test_numbers_in_another_unit_are_errors(tmp_path, name, value, message):
     path = write_mha(tmp_path / "a.mha", grey())
-    given = {"column_pitch_mm": 0.1, "row_spacing_mm": 0.2, "dynamic_range_db": 60.0, "frame_rate_hz": 10.0}
-    with pytest.raises(InvalidInputError, match=rf"a\.mha: {said}"):
-        load_sweep(path, ImportSettings(**given | {name: value}))
+    options = {"column_pitch_mm": 0.1, "row_spacing_mm": 0.2, "dynamic_range_db": 60.0, "frame_rate_hz": 10.0}
+    with pytest.raises(InvalidInputError, match=rf"a\.mha: {message}"):
+        load_sweep(path, ImportSettings(**options | {name: value}))

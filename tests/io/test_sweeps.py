@@ -83,8 +83,9 @@ def test_images_beside_the_middle_stay_there(tmp_path, name):
     aside = replace(sweep, grid=replace(sweep.grid, first_vector_mm=5.0))
     write = write_sweep if name.endswith(".h5") else write_sequence
     write(tmp_path / name, aside)
-    got = load_sweep(tmp_path / name)
+    back = load_sweep(tmp_path / name)
     corners_mm = [
-        each.tracker.sensor_from_image.apply(np.append(each.grid.mm(0, 0), 0.0)) for each in (aside, got)
+        placement.tracker.sensor_from_image.apply(np.append(placement.grid.mm(0, 0), 0.0))
+        for placement in (aside, back)
     ]
     np.testing.assert_allclose(corners_mm[1], corners_mm[0], atol=1e-9)

@@ -33,7 +33,7 @@ def test_columns_are_metres_and_a_quaternion_scalar_last(tmp_path):
         "99 0 0 0 0 0 0 1",
     ],
 )
-def test_one_bad_line_is_left_out_and_counted(tmp_path, bad):
+def test_a_bad_line_costs_that_line(tmp_path, bad):
     lines = [f"{i} {i} 0 0 0 0 0 1" for i in range(6)]
     lines.insert(2, bad)
     (tmp_path / "a.tum").write_text("\n".join(lines))
@@ -54,7 +54,7 @@ def test_a_heading_says_that_quaternions_are_scalar_first(tmp_path, sign):
     np.testing.assert_allclose(rotation.as_quat(scalar_first=True), [[1, 0, 0, 0], [0, 0, 0, 1]], atol=1e-12)
 
 
-def test_a_file_says_its_own_unit_and_is_not_overruled(tmp_path):
+def test_a_file_says_its_own_unit_against_any_option(tmp_path):
     path, head = tmp_path / "windows.tum", b"# time_s x_mm y_mm z_mm qx qy qz qw\r\n"
     path.write_bytes(b"\xef\xbb\xbf" + head + b"0 1 0 0 0 0 0 1\r\n1 2 0 0 0 0 0 1\r\n")
     assert is_tum(path)

@@ -81,13 +81,13 @@ def test_a_segmentation_is_slicers(tmp_path):
     voxels = np.random.default_rng(9).integers(0, 3, (6, 5, 4)).astype(np.uint8)
     labels = LabelMap(voxels, (0.5, 0.25, 1.0), RigidTransform.identity(), {}, STATE_SEGMENTS)
     write_volume(tmp_path / "state.seg.nrrd", labels)
-    theirs = slicerio.read_segmentation(str(tmp_path / "state.seg.nrrd"))
-    np.testing.assert_array_equal(theirs["voxels"], voxels)
-    np.testing.assert_allclose(theirs["ijkToLPS"], labels.world_from_index)
-    assert [(s["labelValue"], s["name"], tuple(s["color"]), s["extent"]) for s in theirs["segments"]] == [
-        (s.value, s.name, s.colour, [0, 5, 0, 4, 0, 3]) for s in STATE_SEGMENTS
-    ]
-    slicerio.write_segmentation(str(tmp_path / "theirs.seg.nrrd"), theirs)
+    segmentation = slicerio.read_segmentation(str(tmp_path / "state.seg.nrrd"))
+    np.testing.assert_array_equal(segmentation["voxels"], voxels)
+    np.testing.assert_allclose(segmentation["ijkToLPS"], labels.world_from_index)
+    assert [
+        (s["labelValue"], s["name"], tuple(s["color"]), s["extent"]) for s in segmentation["segments"]
+    ] == [(s.value, s.name, s.colour, [0, 5, 0, 4, 0, 3]) for s in STATE_SEGMENTS]
+    slicerio.write_segmentation(str(tmp_path / "theirs.seg.nrrd"), segmentation)
     assert read_volume(tmp_path / "theirs.seg.nrrd").segments == STATE_SEGMENTS
 
 
@@ -100,9 +100,9 @@ def test_volumes_of_others_are_what_the_image_library_finds(tmp_path, suffix, dt
     image.SetOrigin((1.0, -2.0, 3.0))
     image.SetDirection(Rotation.random(rng=rng).as_matrix().ravel().tolist())
     SimpleITK.WriteImage(image, str(tmp_path / f"v{suffix}"), useCompression=compress)
-    got, (affine, voxels) = read_volume(tmp_path / f"v{suffix}"), by_itk(tmp_path / f"v{suffix}")
-    np.testing.assert_array_equal(got.voxels, voxels)
-    np.testing.assert_allclose(got.world_from_index, affine, atol=1e-5)
+    volume, (affine, voxels) = read_volume(tmp_path / f"v{suffix}"), by_itk(tmp_path / f"v{suffix}")
+    np.testing.assert_array_equal(volume.voxels, voxels)
+    np.testing.assert_allclose(volume.world_from_index, affine, atol=1e-5)
 
 
 def test_a_left_handed_file_is_turned_about_and_nothing_moves(tmp_path):
@@ -110,10 +110,10 @@ def test_a_left_handed_file_is_turned_about_and_nothing_moves(tmp_path):
     affine = np.diag([-0.5, 0.25, 2.0, 1.0])
     affine[:3, 3] = 10, 20, 30
     nibabel.save(nibabel.Nifti1Image(voxels, RAS_FROM_LPS @ affine), tmp_path / "left.nii.gz")
-    got = read_volume(tmp_path / "left.nii.gz")
-    np.testing.assert_array_equal(got.voxels, voxels[:, :, ::-1])
-    np.testing.assert_allclose(got.world_from_index @ [1, 2, 0, 1], affine @ [1, 2, 4, 1], atol=SINGLE_MM)
-    np.testing.assert_allclose(got.world_from_index @ [1, 2, 4, 1], affine @ [1, 2, 0, 1], atol=SINGLE_MM)
+    volume = read_volume(tmp_path / "left.nii.gz")
+    np.testing.assert_array_equal(volume.voxels, voxels[:, :, ::-1])
+    np.testing.assert_allclose(volume.world_from_index @ [1, 2, 0, 1], affine @ [1, 2, 4, 1], atol=SINGLE_MM)
+    np.testing.assert_allclose(volume.world_from_index @ [1, 2, 4, 1], affine @ [1, 2, 0, 1], atol=SINGLE_MM)
 
 
 @pytest.mark.parametrize(("unit", "factor"), [("meter", 1e3), (None, 1.0)])
@@ -139,7 +139,7 @@ def test_nrrd_is_in_its_own_unit_and_space(tmp_path):
     np.testing.assert_allclose(read_volume(tmp_path / "v.nrrd").world_from_index, expected)
 
 
-def test_an_origin_with_too_few_numbers_is_told(tmp_path):
+def test_an_origin_with_too_few_numbers_is_an_error(tmp_path):
     (tmp_path / "v.nrrd").write_bytes(
         b"NRRD0005\ntype: uint8\ndimension: 3\nsizes: 2 3 4\nspace: left-posterior-superior\n"
         b"kinds: domain domain domain\nspace directions: (1,0,0) (0,1,0) (0,0,1)\nspace origin: (1,2)\n"

@@ -20,34 +20,34 @@ from speckle3d.io.load import load_sweep
 TIMES_S = examples.bursts_s(100.0, 102.0)
 
 
-def require_equal(got, expected):
-    assert got.frames.shape == expected.frames.shape
+def require_equal(back, expected):
+    assert back.frames.shape == expected.frames.shape
     for i in range(len(expected)):
-        np.testing.assert_array_equal(got.frames[i], expected.frames[i])
-    assert got.frames.dtype == expected.frames.dtype
-    np.testing.assert_array_equal(got.frame_time_s, expected.frame_time_s)
+        np.testing.assert_array_equal(back.frames[i], expected.frames[i])
+    assert back.frames.dtype == expected.frames.dtype
+    np.testing.assert_array_equal(back.frame_time_s, expected.frame_time_s)
     # Places are printed in elements and samples, and come back to rounding.
-    assert sizes_of(got.grid) == pytest.approx(sizes_of(expected.grid), rel=1e-12)
-    assert got.signal == expected.signal
-    ours, theirs = got.orientation, expected.orientation
-    np.testing.assert_array_equal(ours.readings.time_s, theirs.readings.time_s)
-    apart = ours.readings.world_from_sensor.inv() * theirs.readings.world_from_sensor
+    assert sizes_of(back.grid) == pytest.approx(sizes_of(expected.grid), rel=1e-12)
+    assert back.signal == expected.signal
+    ours, reference = back.orientation, expected.orientation
+    np.testing.assert_array_equal(ours.readings.time_s, reference.readings.time_s)
+    apart = ours.readings.world_from_sensor.inv() * reference.readings.world_from_sensor
     assert apart.magnitude().max() < 1e-9
     for name in ("accelerometer_m_s2", "gyroscope_rad_s", "magnetometer_au"):
-        np.testing.assert_allclose(getattr(ours, name), getattr(theirs, name), rtol=1e-12, atol=1e-14)
+        np.testing.assert_allclose(getattr(ours, name), getattr(reference, name), rtol=1e-12, atol=1e-14)
 
 
 @pytest.mark.parametrize("kind", ["rf", "iq", "env"])
-@pytest.mark.parametrize(("packed", "place"), [(False, "folder"), (True, "package.tar")])
-def test_what_is_written_is_read(tmp_path, kind, packed, place):
+@pytest.mark.parametrize(("is_packed", "place"), [(False, "folder"), (True, "package.tar")])
+def test_what_is_written_is_read(tmp_path, kind, is_packed, place):
     sweep = sweep_of(kind)
-    got = load_sweep(examples.write_package(tmp_path / place, sweep, lzop=packed), IMPORT_SETTINGS)
-    require_equal(got, sweep)
-    assert got.probe == "Clarius L7HD3"
-    assert got.frames.stored_dtype == (np.uint8 if kind == "env" else np.int16)
+    back = load_sweep(examples.write_package(tmp_path / place, sweep, lzop=is_packed), IMPORT_SETTINGS)
+    require_equal(back, sweep)
+    assert back.probe == "Clarius L7HD3"
+    assert back.frames.stored_dtype == (np.uint8 if kind == "env" else np.int16)
 
 
-def test_an_archive_cut_short_is_refused(tmp_path):
+def test_an_archive_cut_short_is_no_recording(tmp_path):
     path = examples.write_package(tmp_path / "p.tar", sweep_of("rf"))
     path.write_bytes(path.read_bytes()[:3000])
     with pytest.raises((FileError, InvalidInputError), match=r"p\.tar"):
@@ -61,7 +61,7 @@ def test_rf_is_preferred_and_a_raw_file_gives_its_own_kind(tmp_path):
     require_equal(load_sweep(folder / f"{examples.NAME}_iq.raw", IMPORT_SETTINGS), iq)
 
 
-def test_what_lacks_beside_a_file_of_a_package_is_named(tmp_path):
+def test_a_file_without_its_package_names_what_lacks(tmp_path):
     name = f"{examples.NAME}_rf"
     files = examples.package_files(sweep_of("rf")) | {f"{name}.tgc": b"tgc"}
     folder = examples.write_files(tmp_path / "p", files)
@@ -76,17 +76,17 @@ def test_iq_of_a_falling_frequency_becomes_that_of_one(tmp_path):
     """Echoes of 7 MHz, shifted down by 9 to 6 MHz, are afterwards a constant frequency at all depths."""
     rate_hz, samples = 15e6, 600
     depth_mm = np.arange(samples) * 1540e3 / (2 * rate_hz)
-    slid = np.interp(depth_mm, [0, 40], [9e6, 6e6])
-    phase = 2 * np.pi * (7e6 * np.arange(samples) - np.cumsum(slid) + slid / 2) / rate_hz
+    oscillator_hz = np.interp(depth_mm, [0, 40], [9e6, 6e6])
+    phase = 2 * np.pi * (7e6 * np.arange(samples) - np.cumsum(oscillator_hz) + oscillator_hz / 2) / rate_hz
     sweep = sweep_of("iq", samples=samples)
     frames = np.tile(np.round(8000 * np.exp(1j * phase)), (len(sweep), 5, 1)).astype(np.complex64)
     sweep = replace(sweep, frames=frames, grid=replace(sweep.grid, first_sample_depth_mm=0.0))
     yml = examples.yml_text(sweep).split("focus:")[0] + examples.focus_text(9, 6)
-    got = load_sweep(examples.write_package(tmp_path / "p.tar", sweep, yml=yml), IMPORT_SETTINGS)
-    line = got.frames[1][2]
+    back = load_sweep(examples.write_package(tmp_path / "p.tar", sweep, yml=yml), IMPORT_SETTINGS)
+    line = back.frames[1][2]
     turn_hz = np.angle(line[1:] * line[:-1].conj()) * rate_hz / (2 * np.pi)
     # Rounding of 8000 to whole numbers: 1e-4 rad, 200 Hz.
-    np.testing.assert_allclose(turn_hz + got.signal.demodulation_frequency_hz, 7e6, atol=1e3)
+    np.testing.assert_allclose(turn_hz + back.signal.demodulation_frequency_hz, 7e6, atol=1e3)
 
 
 def samples_of(tmp_path, text):
@@ -107,8 +107,8 @@ def moving(degrees=25.0):
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_accelerometer_becomes_specific_force_whatever_its_sign(tmp_path, sign):
     sensor = moving()
-    other = replace(sensor, accelerometer_m_s2=sign * sensor.accelerometer_m_s2)
-    samples = samples_of(tmp_path, examples.sensor_text(other))
+    measured_as = replace(sensor, accelerometer_m_s2=sign * sensor.accelerometer_m_s2)
+    samples = samples_of(tmp_path, examples.sensor_text(measured_as))
     assert off_deg(samples) < 0.6  # noise of 0.05 m/s^2 tilts by 0.4 deg
     np.testing.assert_allclose(
         samples.orientation.accelerometer_m_s2, sensor.accelerometer_m_s2, rtol=1e-12, atol=1e-14
@@ -117,7 +117,7 @@ def test_accelerometer_becomes_specific_force_whatever_its_sign(tmp_path, sign):
     assert apart.magnitude().max() < 1e-9
 
 
-def test_a_quaternion_that_contradicts_gravity_is_not_used(tmp_path):
+def test_a_quaternion_against_gravity_gives_no_orientation(tmp_path):
     """Scalar last, as other makers write it."""
     text = examples.sensor_text(moving())
     for old, new in (("q0", "qw"), ("q1", "q0"), ("q2", "q1"), ("q3", "q2"), ("qw", "q3")):
@@ -128,7 +128,7 @@ def test_a_quaternion_that_contradicts_gravity_is_not_used(tmp_path):
 
 
 @pytest.mark.parametrize("bad", ["scope x: .nan #", "timestamp: {\n"])
-def test_one_bad_sample_is_left_out_and_counted(tmp_path, bad):
+def test_a_bad_sample_costs_that_sample(tmp_path, bad):
     rows = examples.sensor_text(moving()).split("---\n")
     whole = samples_of(tmp_path, "---\n".join(rows))
     rows[7] = rows[7].replace("scope x: ", bad) if bad.startswith("scope") else bad
@@ -148,11 +148,11 @@ def test_real_sensors(realdata, name, count, norm, off, dip_deg):
     assert samples.time_s.size == count
     assert off_deg(samples) == pytest.approx(off, abs=0.01)
     assert any("negated" in value for _, value, _ in samples.rows)
-    made = samples.orientation
-    assert np.median(np.linalg.norm(made.accelerometer_m_s2, axis=1)) == pytest.approx(
+    orientation = samples.orientation
+    assert np.median(np.linalg.norm(orientation.accelerometer_m_s2, axis=1)) == pytest.approx(
         norm * 9.80665, abs=0.01
     )
-    x, y, z = made.readings.world_from_sensor.apply(made.magnetometer_au).mean(axis=0)
+    x, y, z = orientation.readings.world_from_sensor.apply(orientation.magnetometer_au).mean(axis=0)
     assert np.rad2deg(np.arctan2(-z, np.hypot(x, y))) == pytest.approx(dip_deg, abs=1)
     assert abs(np.rad2deg(np.arctan2(y, x))) < 8
 
@@ -164,8 +164,8 @@ def test_real_packages(realdata):
     doppler = realdata / "clarius" / "carotid" / "doppler"
     with pytest.raises(InvalidInputError, match="steered"):
         load_sweep(doppler)
-    given = ImportSettings(vector_pitch_mm=0.1, dynamic_range_db=60.0)
-    envelope = load_sweep(doppler / "carotid_env.raw", given)
+    settings = ImportSettings(vector_pitch_mm=0.1, dynamic_range_db=60.0)
+    envelope = load_sweep(doppler / "carotid_env.raw", settings)
     assert envelope.frames.shape == (1, 304, 592)
     assert envelope.frames[0].max() == 255
     assert envelope.frame_time_s[0] == pytest.approx(272.547324170, abs=1e-9)
@@ -186,10 +186,10 @@ def test_lines_of_a_curved_array_spread_by_its_radius(tmp_path):
 
 def test_a_curved_model_without_its_radius_is_asked_for_it(tmp_path):
     path = examples.write_package(tmp_path / "folder", sweep_of("rf"))
-    curved = IMPORT_SETTINGS.model_copy(update={"probe": "Clarius C3 HD3", "element_pitch_mm": 0.35})
-    with pytest.raises(MissingSettingsError) as caught:
-        load_sweep(path, curved)
-    assert set(caught.value.settings) == {"array_radius_mm", "line_angles_deg"}
-    given = {"array_radius_mm": 45.0, "line_angles_deg": (-3.0, 3.0)}
-    grid = load_sweep(path, curved.model_copy(update=given)).grid
+    curved_probe = IMPORT_SETTINGS.model_copy(update={"probe": "Clarius C3 HD3", "element_pitch_mm": 0.35})
+    with pytest.raises(MissingSettingsError) as error:
+        load_sweep(path, curved_probe)
+    assert set(error.value.settings) == {"array_radius_mm", "line_angles_deg"}
+    settings = {"array_radius_mm": 45.0, "line_angles_deg": (-3.0, 3.0)}
+    grid = load_sweep(path, curved_probe.model_copy(update=settings)).grid
     np.testing.assert_allclose(np.rad2deg(grid.angle_rad([0, grid.vectors - 1])), [-3.0, 3.0])

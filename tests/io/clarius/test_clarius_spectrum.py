@@ -16,8 +16,8 @@ def echoes(low_hz, high_hz, snr_db, lines=40, samples=1024, seed=0):
     phase = (frequency - (low_hz + high_hz) / 2) / (high_hz - low_hz)
     weight = np.where(np.abs(phase) < 1, np.cos(np.pi / 2 * phase) ** 2, 0)
     white = rng.normal(size=(3, lines + 2, samples))
-    shared = white[:, :-2] + white[:, 1:-1] + white[:, 2:]
-    signal = np.fft.irfft(np.fft.rfft(shared) * weight, samples)
+    common = white[:, :-2] + white[:, 1:-1] + white[:, 2:]
+    signal = np.fft.irfft(np.fft.rfft(common) * weight, samples)
     signal *= 300 / signal.std()
     # Electronics of a receiver: constant, and coloured, of its own for each line.
     noise = np.diff(rng.normal(size=(*signal.shape[:2], samples + 1)))

@@ -20,24 +20,24 @@ def images(frames=4, rows=50, columns=30, seed=0):
     return np.random.default_rng(seed).integers(0, 256, (frames, rows, columns)).astype(np.uint8)
 
 
-def cropped(shown):
-    return shown[:, BOX[1] : BOX[3] + 1, BOX[0] : BOX[2] + 1].transpose(0, 2, 1)
+def tissue(pixels):
+    return pixels[:, BOX[1] : BOX[3] + 1, BOX[0] : BOX[2] + 1].transpose(0, 2, 1)
 
 
 @pytest.fixture
-def written(tmp_path):
-    def write(shown=None, regions=None, **elements):
+def write_image(tmp_path):
+    def write(pixels=None, regions=None, **elements):
         regions = [region(*BOX)] if regions is None else regions
-        return write_dicom(tmp_path / "arm.dcm", images() if shown is None else shown, regions, **elements)
+        return write_dicom(tmp_path / "arm.dcm", images() if pixels is None else pixels, regions, **elements)
 
     return write
 
 
-def test_the_region_of_tissue_with_its_scale_in_cm(written):
+def test_the_region_of_tissue_with_its_scale_in_cm(write_image):
     trace = region(0, 46, 29, 49, RegionSpatialFormat=4, RegionDataType=10, PhysicalUnitsXDirection=4)
-    path = written(regions=[trace, region(*BOX)])
+    path = write_image(regions=[trace, region(*BOX)])
     sweep = load_sweep(path, RANGE)
-    np.testing.assert_array_equal(frames_of(sweep), cropped(images()))
+    np.testing.assert_array_equal(frames_of(sweep), tissue(images()))
     assert sweep.grid == ImageGrid(20, 38, 10 * 0.011, 10 * 0.007, 10 * 0.25)
     np.testing.assert_allclose(sweep.frame_time_s, 0.04 * np.arange(4), rtol=1e-12)
     rows = describe(path)
@@ -46,10 +46,10 @@ def test_the_region_of_tissue_with_its_scale_in_cm(written):
     assert "Doe" not in repr(rows) + repr(sweep)
 
 
-def test_rows_that_run_upwards_are_turned_over(written):
+def test_rows_that_run_upwards_are_turned_over(write_image):
     """Depth of the region's last row by its reference pixel, 0.25 + (37 - 0) * -0.007 cm, is the first."""
-    sweep = load_sweep(written(regions=[region(*BOX, PhysicalDeltaY=-0.007)]), RANGE)
-    np.testing.assert_array_equal(frames_of(sweep), cropped(images())[:, :, ::-1])
+    sweep = load_sweep(write_image(regions=[region(*BOX, PhysicalDeltaY=-0.007)]), RANGE)
+    np.testing.assert_array_equal(frames_of(sweep), tissue(images())[:, :, ::-1])
     assert sweep.grid.first_sample_depth_mm == pytest.approx(10 * (0.25 - 37 * 0.007))
 
 
@@ -62,8 +62,8 @@ def test_rows_that_run_upwards_are_turned_over(written):
         ({"FrameTime": None}, None),
     ],
 )
-def test_times_of_frames(written, elements, times):
-    recording = open_recording(written(**elements), RANGE)
+def test_times_of_frames(write_image, elements, times):
+    recording = open_recording(write_image(**elements), RANGE)
     if times is None:
         with pytest.raises(MissingSettingsError, match="--frame-rate-hz"):
             _ = recording.sweep
@@ -72,38 +72,38 @@ def test_times_of_frames(written, elements, times):
     assert any("1 of 4 left out" in note for note in recording.notes) == (len(times) < 4)
 
 
-def test_grey_in_three_colours_and_inverted(written):
-    coloured = np.repeat(images()[..., None], 3, axis=3)
-    coloured[:, 0, 0] = 255, 0, 0  # outside the region
-    for shown, photometric, level in ((coloured, "RGB", 0), (images(), "MONOCHROME1", 255)):
-        sweep = load_sweep(written(shown, photometric=photometric), RANGE)
-        np.testing.assert_array_equal(frames_of(sweep), np.abs(level - cropped(images()).astype(int)))
-    coloured[3, 12, 9] = 200, 100, 0
+def test_grey_in_three_colours_and_from_white_to_black(write_image):
+    colours = np.repeat(images()[..., None], 3, axis=3)
+    colours[:, 0, 0] = 255, 0, 0  # outside the region
+    for pixels, photometric, level in ((colours, "RGB", 0), (images(), "MONOCHROME1", 255)):
+        sweep = load_sweep(write_image(pixels, photometric=photometric), RANGE)
+        np.testing.assert_array_equal(frames_of(sweep), np.abs(level - tissue(images()).astype(int)))
+    colours[3, 12, 9] = 200, 100, 0
     with pytest.raises(InvalidInputError, match="colour"):
-        load_sweep(written(coloured, photometric="RGB"), RANGE)
+        load_sweep(write_image(colours, photometric="RGB"), RANGE)
 
 
 @pytest.mark.parametrize("reference", [True, False])
-def test_columns_in_degrees_are_the_lines_of_a_fan(written, reference):
+def test_columns_in_degrees_are_the_lines_of_a_fan(write_image, reference):
     """Twenty columns of 2 degrees, the tenth straight down; the array's radius is asked for."""
     polar = {"PhysicalUnitsXDirection": 12, "PhysicalDeltaX": 2.0, "ReferencePixelX0": 10}
     polar |= {} if reference else {"ReferencePixelX0": None}
-    path = written(regions=[region(*BOX, **polar)])
-    with pytest.raises(MissingSettingsError) as caught:
+    path = write_image(regions=[region(*BOX, **polar)])
+    with pytest.raises(MissingSettingsError) as error:
         load_sweep(path, RANGE)
     angles = {} if reference else {"line_angles_deg": (-20.0, 18.0)}
-    assert set(caught.value.settings) == {"array_radius_mm", *angles}
+    assert set(error.value.settings) == {"array_radius_mm", *angles}
     sweep = load_sweep(path, RANGE.model_copy(update={"array_radius_mm": 45.0, **angles}))
-    np.testing.assert_array_equal(frames_of(sweep), cropped(images()))
+    np.testing.assert_array_equal(frames_of(sweep), tissue(images()))
     assert (sweep.grid.fan.radius_mm, sweep.grid.first_sample_depth_mm) == (45.0, 2.5)
     np.testing.assert_allclose(np.rad2deg(sweep.grid.angle_rad([0, 19])), [-20.0, 18.0])
 
 
-@pytest.mark.parametrize("kept", [0.5, 0.99])
-def test_a_file_cut_short_tells_how_many_frames_are_whole(written, kept):
-    shown = images(10)
-    path = written(shown)
+@pytest.mark.parametrize("share", [0.5, 0.99])
+def test_a_file_cut_short_tells_how_many_frames_are_whole(write_image, share):
+    pixels = images(10)
+    path = write_image(pixels)
     content = path.read_bytes()
-    path.write_bytes(content[: len(content) - shown.size + int(kept * shown.size)])
-    with pytest.raises(FileError, match=f"ends early: {int(10 * kept)} of 10 frames"):
+    path.write_bytes(content[: len(content) - pixels.size + int(share * pixels.size)])
+    with pytest.raises(FileError, match=f"ends early: {int(10 * share)} of 10 frames"):
         load_sweep(path, RANGE)

@@ -24,12 +24,12 @@ def page(project):
 
 def block(page, language, holding):
     texts = re.findall(rf"```{language}\n(.*?)```", page, flags=re.DOTALL)
-    (found,) = (text for text in texts if holding in text)
-    return found
+    (code,) = (text for text in texts if holding in text)
+    return code
 
 
 @pytest.fixture
-def installed(tmp_path, monkeypatch, page):
+def package(tmp_path, monkeypatch, page):
     """The page's package, as pip leaves it."""
     place = tmp_path / "site"
     project = tomllib.loads(block(page, "toml", "entry-points"))["project"]
@@ -49,19 +49,19 @@ def installed(tmp_path, monkeypatch, page):
     sys.modules.pop(module, None)
 
 
-def test_a_reader_of_ones_own(tmp_path, installed, page):
-    said = {"rig": 1, "frames": 4, "vectors": 6, "samples": 40, "rate_hz": 40e6, "transmit_hz": 6e6}
-    said |= {"time_s": [0.0, 0.1, 0.2, 0.3], "pitch_mm": 0.3}
-    (tmp_path / "arm.json").write_text(json.dumps(said))
+def test_a_reader_of_ones_own(tmp_path, package, page):
+    header = {"rig": 1, "frames": 4, "vectors": 6, "samples": 40, "rate_hz": 40e6, "transmit_hz": 6e6}
+    header |= {"time_s": [0.0, 0.1, 0.2, 0.3], "pitch_mm": 0.3}
+    (tmp_path / "arm.json").write_text(json.dumps(header))
     (tmp_path / "arm.bin").write_bytes(rf().tobytes())
-    with pytest.raises(MissingSettingsError) as caught:
+    with pytest.raises(MissingSettingsError) as error:
         load_sweep(tmp_path / "arm.json")
-    assert caught.value.settings == ("bandwidth_hz",)
+    assert error.value.settings == ("bandwidth_hz",)
     sweep = load_sweep(tmp_path / "arm.json", ImportSettings(bandwidth_hz=(4e6, 8e6)))
     np.testing.assert_array_equal(np.stack([sweep.frames[i] for i in range(4)]), rf())
     assert sweep.signal == RFSettings(40e6, 1540.0, 6e6, (4e6, 8e6))
     assert sweep.grid == ImageGrid(6, 40, 0.3, sweep.signal.sample_spacing_mm)
-    np.testing.assert_array_equal(sweep.frame_time_s, said["time_s"])
+    np.testing.assert_array_equal(sweep.frame_time_s, header["time_s"])
     assert recording_files(tmp_path / "arm.json")[1:] == [tmp_path / "arm.bin"]
 
 

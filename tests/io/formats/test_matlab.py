@@ -15,7 +15,7 @@ AXES = "sample, vector, frame"
 VERSIONS = pytest.mark.parametrize("new", [False, True], ids=["version 5", "version 7.3"])
 
 
-def saved(tmp_path, new=False, **more):
+def save(tmp_path, new=False, **changes):
     variables = {
         "RData": matlab_order(rf()),
         "Cells": [matlab_order(rf(5)), np.arange(3.0)],
@@ -23,19 +23,19 @@ def saved(tmp_path, new=False, **more):
         "band": np.array([4.0, 8.0]),
         "t": TIMES,
     }
-    return write_mat(tmp_path / "a.mat", new, **variables | more)
+    return write_mat(tmp_path / "a.mat", new, **variables | changes)
 
 
-def mapped(**arrays):
-    given = {"axes": AXES, "vector_pitch_mm": "Trans.spacingMm", "time_s": "t"} | arrays
-    given |= {"centre_frequency_hz": "Trans.frequency / 1e-6", "bandwidth_hz": "band * 1e6"}
-    return ImportSettings(sampling_rate_hz=40e6, arrays={k: v for k, v in given.items() if v is not None})
+def settings_of(**arrays):
+    names = {"axes": AXES, "vector_pitch_mm": "Trans.spacingMm", "time_s": "t"} | arrays
+    names |= {"centre_frequency_hz": "Trans.frequency / 1e-6", "bandwidth_hz": "band * 1e6"}
+    return ImportSettings(sampling_rate_hz=40e6, arrays={k: v for k, v in names.items() if v is not None})
 
 
 @VERSIONS
 @pytest.mark.parametrize(("array", "frames"), [("RData", rf()), ("Cells{1}", rf(5))])
 def test_rf_by_its_mapping(tmp_path, new, array, frames):
-    sweep = load_sweep(saved(tmp_path, new), mapped(rf=array))
+    sweep = load_sweep(save(tmp_path, new), settings_of(rf=array))
     np.testing.assert_array_equal(frames_of(sweep), frames)
     assert sweep.frames.dtype == np.int16
     assert sweep.signal == RFSettings(40e6, 1540.0, 6.25e6, (4e6, 8e6))
@@ -49,16 +49,16 @@ def test_axes_in_any_order(tmp_path, new, axes):
     names = [name.strip() for name in axes.split(",")]
     order = [("frame", "vector", "sample").index(name) for name in names if name != "-"]
     data = rf().transpose(order).reshape([1 if name == "-" else rf().shape[order.pop(0)] for name in names])
-    sweep = load_sweep(saved(tmp_path, new, data=data), mapped(rf="data", axes=axes))
+    sweep = load_sweep(save(tmp_path, new, data=data), settings_of(rf="data", axes=axes))
     np.testing.assert_array_equal(frames_of(sweep), rf())
 
 
 @VERSIONS
 def test_iq_as_complex_numbers_and_as_two_arrays(tmp_path, new):
-    turned = matlab_order(iq())
-    path = saved(tmp_path, new, IQ=turned, I=turned.real, Q=turned.imag)
-    given = {"demodulation_frequency_hz": "Trans.frequency * 1e6"}
-    for mapping in (mapped(iq="IQ", **given), mapped(i="I", q="Q", **given)):
+    echoes = matlab_order(iq())
+    path = save(tmp_path, new, IQ=echoes, I=echoes.real, Q=echoes.imag)
+    numbers = {"demodulation_frequency_hz": "Trans.frequency * 1e6"}
+    for mapping in (settings_of(iq="IQ", **numbers), settings_of(i="I", q="Q", **numbers)):
         sweep = load_sweep(path, mapping)
         np.testing.assert_array_equal(frames_of(sweep), iq())
         assert sweep.signal.demodulation_frequency_hz == 6.25e6
@@ -67,7 +67,7 @@ def test_iq_as_complex_numbers_and_as_two_arrays(tmp_path, new):
 @VERSIONS
 def test_grey_levels_saved_as_double_with_positions(tmp_path, new):
     x, z = 0.2 * np.arange(VECTORS) - 0.5, 1e-3 * (3 + 0.1 * np.arange(SAMPLES))
-    path = saved(tmp_path, new, image=matlab_order(grey()).astype(float), x=x, z=z)
+    path = save(tmp_path, new, image=matlab_order(grey()).astype(float), x=x, z=z)
     arrays = {"bmode": "image", "axes": AXES, "x_mm": "x", "z_mm": "z * 1e3", "time_s": "t"}
     sweep = load_sweep(path, ImportSettings(arrays=arrays, dynamic_range_db=55.0))
     np.testing.assert_array_equal(frames_of(sweep), grey())
@@ -78,11 +78,11 @@ def test_grey_levels_saved_as_double_with_positions(tmp_path, new):
 
 
 def test_an_element_of_an_array_of_structs(tmp_path):
-    path = saved(tmp_path, True)
+    path = save(tmp_path, True)
     with h5py.File(path, "r+") as file:  # each field is a list of references, as MATLAB writes them
         for k in range(3):
             file[f"#refs#/s{k}"] = rf(k)
         file["Receive/data"] = np.array([[file[f"#refs#/s{k}"].ref] for k in range(3)], dtype=h5py.ref_dtype)
-    np.testing.assert_array_equal(frames_of(load_sweep(path, mapped(rf="Receive(2).data"))), rf(1))
+    np.testing.assert_array_equal(frames_of(load_sweep(path, settings_of(rf="Receive(2).data"))), rf(1))
     with pytest.raises(InvalidInputError, match=r"Receive\.data"):
-        load_sweep(path, mapped(rf="Receive.data"))
+        load_sweep(path, settings_of(rf="Receive.data"))

@@ -40,8 +40,8 @@ def test_an_array_file_is_read(tmp_path):
     np.save(tmp_path / "rf.npy", GREY.astype(np.int16))
     names = ("sampling_rate_hz", "centre_frequency_hz", "bandwidth_hz")
     echoes = {name: getattr(RF, name) for name in names}
-    given = ImportSettings(vector_pitch_mm=0.3, frame_rate_hz=20, **echoes)
-    assert load_sweep(tmp_path / "rf.npy", given).signal == RF
+    settings = ImportSettings(vector_pitch_mm=0.3, frame_rate_hz=20, **echoes)
+    assert load_sweep(tmp_path / "rf.npy", settings).signal == RF
 
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg"])
@@ -50,14 +50,14 @@ def test_a_folder_of_pictures_is_read_in_the_order_of_its_numbers(tmp_path, suff
     for i, image in enumerate(flat):
         colour = np.stack([image] * 3, axis=-1) if suffix == ".jpg" else image
         Image.fromarray(colour).save(tmp_path / f"frame{i}{suffix}")
-    given = ImportSettings(**PIXELS, frame_rate_hz=20)
+    settings = ImportSettings(**PIXELS, frame_rate_hz=20)
     # JPEG keeps a flat picture to a level or two.
     np.testing.assert_allclose(
-        frames_of(load_sweep(tmp_path, given)).astype(int), flat.transpose(0, 2, 1), atol=2
+        frames_of(load_sweep(tmp_path, settings)).astype(int), flat.transpose(0, 2, 1), atol=2
     )
     Image.fromarray(flat[0, :, :4]).save(tmp_path / f"frame12{suffix}")
     with pytest.raises(InvalidInputError, match="frame12"):
-        frames_of(load_sweep(tmp_path, given))
+        frames_of(load_sweep(tmp_path, settings))
 
 
 @pytest.mark.parametrize("suffix", [".gif", ".mp4"])
@@ -70,8 +70,8 @@ def test_a_video_says_its_rate_or_is_asked_for_it(tmp_path, suffix):
     else:
         pytest.importorskip("av")
         iio.imwrite(path, images, fps=20, codec="mpeg4", plugin="pyav")
-    given = {} if suffix == ".mp4" else {"frame_rate_hz": 20}
-    sweep = load_sweep(path, ImportSettings(**PIXELS, **given))
+    settings = {} if suffix == ".mp4" else {"frame_rate_hz": 20}
+    sweep = load_sweep(path, ImportSettings(**PIXELS, **settings))
     assert sweep.frames.shape == (4, 48, 32)
     for i in (0, 1, 2, 3, 1, 0):
         # Of packing with loss.

@@ -36,20 +36,20 @@ def test_beamformed_data_as_pyuff_writes_them(tmp_path, frames):
     pyuff = pytest.importorskip("pyuff_ustb")
     x, z = axes()
     data = frames.reshape(len(frames), -1).T[:, None, None]
-    made = pyuff.BeamformedData(
+    data_set = pyuff.BeamformedData(
         data=data if len(frames) > 1 else data[..., 0],
         scan=pyuff.LinearScan(x_axis=x, z_axis=z),
         modulation_frequency=6e6,
         pulse=pyuff.Pulse(center_frequency=6e6, fractional_bandwidth=0.5, phase=0.0, waveform=np.ones(3)),
     )
-    made.write(str(tmp_path / "a.uff"), "b_data")
+    data_set.write(str(tmp_path / "a.uff"), "b_data")
     require(load_sweep(tmp_path / "a.uff", RATE), frames)
 
 
-@pytest.mark.parametrize("carried", [0.0, 6e6])
-def test_a_modulation_frequency_that_the_phase_contradicts_is_refused(tmp_path, carried):
-    frames = carrying(carried, sound_speed=1540.0)
-    right, wrong = (0.0, 6e6) if carried else (6e6, 0.0)
+@pytest.mark.parametrize("carrier_hz", [0.0, 6e6])
+def test_a_modulation_frequency_against_the_phase_is_an_error(tmp_path, carrier_hz):
+    frames = carrying(carrier_hz, sound_speed=1540.0)
+    right, wrong = (0.0, 6e6) if carrier_hz else (6e6, 0.0)
     sweep = load_sweep(write_uff(tmp_path / "a.uff", frames, right), RATE)
     assert sweep.signal.demodulation_frequency_hz == right
     path = write_uff(tmp_path / "b.uff", frames, wrong)

@@ -22,7 +22,7 @@ from speckle3d.core.sweep import BModeSettings, RFSettings
 from speckle3d.io.import_settings import ImportSettings, MissingSettingsError
 from speckle3d.io.load import load_sweep, open_recording
 
-GIVEN = ImportSettings(bandwidth_hz=(4.5e6, 7e6), frame_rate_hz=20.0)
+SETTINGS = ImportSettings(bandwidth_hz=(4.5e6, 7e6), frame_rate_hz=20.0)
 PLACES = "data/beamformed_data/coordinates"
 
 
@@ -49,7 +49,7 @@ def test_coordinates_on_a_polar_grid_are_the_lines_of_a_fan(tmp_path, radius_mm)
     with h5py.File(path, "a") as file:
         for k, place in zip((0, 2), places, strict=True):
             file[PLACES][..., k] = 1e-3 * place
-    sweep = load_sweep(path, GIVEN)
+    sweep = load_sweep(path, SETTINGS)
     np.testing.assert_array_equal(frames_of(sweep), rf())
     assert sweep.grid.fan.radius_mm == pytest.approx(radius_mm, abs=0.01)
     assert sweep.grid.first_sample_depth_mm == pytest.approx(FIRST_MM, abs=0.01)
@@ -57,14 +57,14 @@ def test_coordinates_on_a_polar_grid_are_the_lines_of_a_fan(tmp_path, radius_mm)
     np.testing.assert_allclose(sweep.grid.angle_rad([0, VECTORS - 1]), [-0.3, 0.2], atol=1e-5)
 
 
-@pytest.mark.parametrize(("carried", "middle"), [(0.0, 6e6), (6e6, 0.0), (None, None)])
-def test_iq_that_carry_their_frequency_or_do_not_are_told_by_their_phase(tmp_path, carried, middle):
-    frames = iq() if carried is None else carrying(carried)  # noise tells nothing
-    recording = open_recording(write_zea(tmp_path / "a.hdf5", frames), GIVEN)
+@pytest.mark.parametrize(("carrier_hz", "middle"), [(0.0, 6e6), (6e6, 0.0), (None, None)])
+def test_iq_that_carry_their_frequency_or_do_not_are_told_by_their_phase(tmp_path, carrier_hz, middle):
+    frames = iq() if carrier_hz is None else carrying(carrier_hz)  # noise tells nothing
+    recording = open_recording(write_zea(tmp_path / "a.hdf5", frames), SETTINGS)
     if middle is None:
-        with pytest.raises(MissingSettingsError) as caught:
+        with pytest.raises(MissingSettingsError) as error:
             _ = recording.sweep
-        assert caught.value.settings == ("demodulation_frequency_hz",)
+        assert error.value.settings == ("demodulation_frequency_hz",)
         return
     np.testing.assert_array_equal(frames_of(recording.sweep), frames)
     assert recording.sweep.signal.demodulation_frequency_hz == middle

@@ -31,6 +31,6 @@ def test_documents_are_told_apart(tmp_path, content, expected, option):
     assert kind_of(path) == rows["format"] == "PLUS document"
     assert expected.items() <= rows.items()
     assert option in rows["for"]
-    with pytest.raises(InvalidInputError, match=rf"a\.xml: expected a recording, got .*{option}") as caught:
+    with pytest.raises(InvalidInputError, match=rf"a\.xml: expected a recording, got .*{option}") as error:
         load_sweep(path)
-    assert rows["sweep"] == f"none: {caught.value}"
+    assert rows["sweep"] == f"none: {error.value}"

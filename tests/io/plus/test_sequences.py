@@ -24,27 +24,27 @@ RF = ImportSettings(
 
 @pytest.mark.parametrize("make", [sweep_examples.bmode_sweep, sweep_examples.rf_sweep])
 @pytest.mark.parametrize(
-    ("suffix", "compressed"),
+    ("suffix", "compress"),
     [(".mha", True), (".seq.nrrd", False)],
 )
-def test_a_sweep_with_sensors_is_interpolated_at_its_frames(tmp_path, make, suffix, compressed):
+def test_a_sweep_with_sensors_is_interpolated_at_its_frames(tmp_path, make, suffix, compress):
     sweep = make()
-    omitted = write_sequence(tmp_path / f"out{suffix}", sweep, compressed=compressed)
-    assert len(omitted) == 3  # readings of both sensors between frames, and the truth
-    got = load_sweep(tmp_path / f"out{suffix}")  # nothing is asked for
+    omissions = write_sequence(tmp_path / f"out{suffix}", sweep, compressed=compress)
+    assert len(omissions) == 3  # readings of both sensors between frames, and the truth
+    back = load_sweep(tmp_path / f"out{suffix}")  # nothing is asked for
     for i in range(len(sweep)):
-        np.testing.assert_array_equal(got.frames[i], sweep.frames[i])
-    assert got.frames.dtype == sweep.frames.dtype
-    assert (got.signal, got.grid, got.probe) == (sweep.signal, sweep.grid, sweep.probe)
-    np.testing.assert_array_equal(got.frame_time_s, sweep.frame_time_s)
-    for ours, theirs in ((got.tracker, sweep.tracker), (got.orientation, sweep.orientation)):
-        covered = theirs.covers(sweep.frame_time_s)
-        assert 0 < covered.sum() < len(sweep)  # the sensors end before the last frame
-        np.testing.assert_array_equal(ours.readings.time_s, sweep.frame_time_s[covered])
+        np.testing.assert_array_equal(back.frames[i], sweep.frames[i])
+    assert back.frames.dtype == sweep.frames.dtype
+    assert (back.signal, back.grid, back.probe) == (sweep.signal, sweep.grid, sweep.probe)
+    np.testing.assert_array_equal(back.frame_time_s, sweep.frame_time_s)
+    for ours, expected in ((back.tracker, sweep.tracker), (back.orientation, sweep.orientation)):
+        reach = expected.covers(sweep.frame_time_s)
+        assert 0 < reach.sum() < len(sweep)  # the sensors end before the last frame
+        np.testing.assert_array_equal(ours.readings.time_s, sweep.frame_time_s[reach])
         # Poses go through their matrices of doubles.
         np.testing.assert_allclose(
-            ours.world_from_image(sweep.frame_time_s[covered]).as_matrix(),
-            theirs.world_from_image(sweep.frame_time_s[covered]).as_matrix(),
+            ours.world_from_image(sweep.frame_time_s[reach]).as_matrix(),
+            expected.world_from_image(sweep.frame_time_s[reach]).as_matrix(),
             atol=1e-9,
         )
 
@@ -76,16 +76,16 @@ def test_a_skewed_calibration_survives_a_sweep_file_and_a_sequence(tmp_path):
         for i in range(3)
     ]
     path = write_mha(tmp_path / "a.mha", grey(), frames=frames)
-    given = ImportSettings(dynamic_range_db=60.0, image_to_probe=tuple(map(tuple, matrix)))
-    sweep = load_sweep(path, given)
+    settings = ImportSettings(dynamic_range_db=60.0, image_to_probe=tuple(map(tuple, matrix)))
+    sweep = load_sweep(path, settings)
     assert np.rad2deg(sweep.tracker.image_skew_rad) == pytest.approx(-2.745, abs=1e-3)
-    assert any("ImageToProbe * ProbeToTracker" in note for note in open_recording(path, given).notes)
+    assert any("ImageToProbe * ProbeToTracker" in note for note in open_recording(path, settings).notes)
     grid = replace(sweep.grid, skew_rad=sweep.tracker.image_skew_rad)
-    placed = sweep.tracker.sensor_from_image.as_matrix() @ grid.image_from_sample
-    np.testing.assert_allclose(placed, matrix[:, [0, 1, 3]], atol=1e-9)
+    pixel_places = sweep.tracker.sensor_from_image.as_matrix() @ grid.image_from_sample
+    np.testing.assert_allclose(pixel_places, matrix[:, [0, 1, 3]], atol=1e-9)
     write_sweep(tmp_path / "a.h5", sweep)
-    held = load_sweep(tmp_path / "a.h5")
-    write_sequence(tmp_path / "b.mha", held)
+    copy = load_sweep(tmp_path / "a.h5")
+    write_sequence(tmp_path / "b.mha", copy)
     back = load_sweep(tmp_path / "b.mha").tracker
     assert back.image_skew_rad == pytest.approx(sweep.tracker.image_skew_rad, abs=1e-9)
     np.testing.assert_allclose(
@@ -98,27 +98,32 @@ def test_poses_may_be_those_of_the_image_s_pixels(tmp_path, name):
     """Slicer and PLUS record ImageToReference, from pixels to mm."""
     pixels = np.array([[0.1, 0.008, 0, 0], [0, 0.2, 0, 0], [0, 0, 0.15, 0], [0, 0, 0, 1]])
     matrices = sweep_examples.poses(4).as_matrix() @ pixels
-    held = matrices if name == "ImageToRoom" else np.linalg.inv(matrices)
+    file_matrices = matrices if name == "ImageToRoom" else np.linalg.inv(matrices)
     frames = [
-        {"Timestamp": f"{5 + 0.1 * i}", f"{name}Transform": " ".join(map(repr, held[i].ravel().tolist()))}
+        {
+            "Timestamp": f"{5 + 0.1 * i}",
+            f"{name}Transform": " ".join(map(repr, file_matrices[i].ravel().tolist())),
+        }
         for i in range(4)
     ]
     frames[3][f"{name}TransformStatus"] = "INVALID"
     path = write_mha(tmp_path / "a.mha", grey(4), frames=frames)
-    given = ImportSettings(dynamic_range_db=60.0, tracker_transform="ImageToRoom", first_sample_depth_mm=2.0)
-    sweep = load_sweep(path, given)
+    settings = ImportSettings(
+        dynamic_range_db=60.0, tracker_transform="ImageToRoom", first_sample_depth_mm=2.0
+    )
+    sweep = load_sweep(path, settings)
     assert len(sweep.tracker.readings) == 3
     grid = replace(sweep.grid, skew_rad=sweep.tracker.image_skew_rad)
-    placed = sweep.tracker.world_from_image(sweep.frame_time_s[:3]).as_matrix() @ grid.image_from_sample
-    np.testing.assert_allclose(placed, matrices[:3, :, [0, 1, 3]], atol=1e-9)
+    pixel_places = sweep.tracker.world_from_image(sweep.frame_time_s[:3]).as_matrix() @ grid.image_from_sample
+    np.testing.assert_allclose(pixel_places, matrices[:3, :, [0, 1, 3]], atol=1e-9)
 
 
-@pytest.mark.parametrize("compressed", [True, False])
-def test_itk_reads_the_same_pixels(tmp_path, compressed):
+@pytest.mark.parametrize("compress", [True, False])
+def test_itk_reads_the_same_pixels(tmp_path, compress):
     import SimpleITK
 
     sweep = sweep_examples.rf_sweep()
     expected = np.stack([sweep.frames[i] for i in range(len(sweep))])
-    write_sequence(tmp_path / "a.mha", sweep, compressed=compressed)
+    write_sequence(tmp_path / "a.mha", sweep, compressed=compress)
     image = SimpleITK.ReadImage(str(tmp_path / "a.mha"))
     np.testing.assert_array_equal(SimpleITK.GetArrayFromImage(image), expected)

@@ -17,7 +17,7 @@ def path(request, tmp_path):
     return path
 
 
-def test_what_is_read_is_what_was_written(path):
+def test_a_surface_survives_its_file(path):
     back = read_surface(path)
     np.testing.assert_allclose(back.vertices_mm[back.triangles], CORNERS[FACES], atol=1e-5)
     assert back.volume_mm3 == pytest.approx(1 / 6)

@@ -13,20 +13,20 @@ def test_itk_takes_points_of_the_parent_to_the_image(tmp_path):
     """As in resampling; 3D Slicer shows the inverse as the transform to the parent."""
     pose = poses(3, seed=4)[1]
     write_transform(tmp_path / f"t{SUFFIX}", pose)
-    found = SimpleITK.ReadTransform(str(tmp_path / f"t{SUFFIX}"))
-    assert found.GetDimension() == 3
-    assert found.GetName() == "AffineTransform"
+    transform = SimpleITK.ReadTransform(str(tmp_path / f"t{SUFFIX}"))
+    assert transform.GetDimension() == 3
+    assert transform.GetName() == "AffineTransform"
     for point in POINTS:
-        back = found.TransformPoint(pose.apply(point).tolist())
+        back = transform.TransformPoint(pose.apply(point).tolist())
         np.testing.assert_allclose(back, point, atol=1e-12)
 
 
 def test_a_file_for_each_frame(tmp_path):
-    every = poses(12)
-    write_transforms(tmp_path / f"sweep{SUFFIX}", every)
+    poses_ = poses(12)
+    write_transforms(tmp_path / f"sweep{SUFFIX}", poses_)
     paths = transform_paths(tmp_path / f"sweep{SUFFIX}", 12)
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(path.name for path in paths)
     assert paths[11].name == f"sweep-0011{SUFFIX}"
-    for path, pose in zip(paths, every, strict=True):
-        found = SimpleITK.ReadTransform(str(path)).TransformPoint([1.0, 2.0, 3.0])
-        np.testing.assert_allclose(found, pose.inv().apply([1.0, 2.0, 3.0]), atol=1e-12)
+    for path, pose in zip(paths, poses_, strict=True):
+        transform = SimpleITK.ReadTransform(str(path)).TransformPoint([1.0, 2.0, 3.0])
+        np.testing.assert_allclose(transform, pose.inv().apply([1.0, 2.0, 3.0]), atol=1e-12)
