@@ -1,4 +1,4 @@
-"""What a person who holds the probe should do, in words, by the checks that the reconstruction uses."""
+"""Advice to the person who holds the probe, by the checks that the reconstruction uses."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SEEN_S, STAYS_S = 0.25, 1.0
 
 
 def words_for(pose: LivePose, settings: TrajectorySettings) -> str:
-    """What to say of one frame.
+    """Advice by one frame.
 
     A frame is like none before where no median correlation reaches `least_correlation`, below which the
     reconstruction uses no pair; it came too fast where it is less like the last one than `clear_correlation`,
@@ -41,7 +41,7 @@ def words_for(pose: LivePose, settings: TrajectorySettings) -> str:
 
 @dataclass
 class Words:
-    """Words that change slowly enough to be read.
+    """Advice that changes slowly enough to be read.
 
     Attributes
     ----------

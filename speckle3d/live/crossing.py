@@ -41,7 +41,7 @@ def words_of(crossing: CrossingSoFar, settings: CrossingSettings) -> str:
 
 
 class CrossingCheck:
-    """Lays the frames so far against the first sweep, now and then.
+    """Compares the frames so far with the first sweep, now and then.
 
     Parameters
     ----------

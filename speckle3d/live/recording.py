@@ -1,4 +1,4 @@
-"""What is received written down as it comes, on one clock, whatever is made of it later."""
+"""Record received images and transforms into a sweep file, on one clock."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A log of an orientation sensor on its own clock, from zero, with what its readings tell."""
+"""Readings of a log of an orientation sensor, and the orientation by them, from time zero on."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from xsens.logs.samples import ImuLog
 
 
 class LogReadings:
-    """What a log shows, found once for all viewers.
+    """Readings and orientation of a log, computed once for all viewers.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What is wrong with frames, in words."""
+"""Flags of frames and doubts about a recording, in words."""
 
 from __future__ import annotations
 
