@@ -9,7 +9,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from speckle3d.app.folder import Folder
 from speckle3d.app.page import Page
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
 from speckle3d.io.hdf5 import SIGNATURE
@@ -147,7 +146,7 @@ def _result_pages(path: Path, sweep_file: Path | None, file: Path) -> list[Page]
     mode = "image"
     with suppress(MismatchError):  # modes disagree: all can be looked at
         mode = default_mode(result)[0]
-    viewer = ReconstructionPage(result, sweep, Folder(path), sweep_file, mode)
+    viewer = ReconstructionPage(result, sweep, path, sweep_file, mode)
     # First what was asked for.
     return [viewer, *pages] if file == path else [pages[0], viewer, *pages[1:]]
 

@@ -4,32 +4,32 @@ import os
 
 import pytest
 
-from speckle3d.app.folder import Folder
+from speckle3d.app.folder import save_new
 from speckle3d.core.errors import FileError, InvalidInputError
 
 
 @pytest.fixture
 def folder(tmp_path):
     (tmp_path / "sweep.h5").write_bytes(b"sweep")
-    return Folder(tmp_path / "sweep.h5")
+    return tmp_path
 
 
 def test_a_name_must_be_new_and_in_the_folder(folder, tmp_path):
     os.symlink(tmp_path.parent / "elsewhere.csv", tmp_path / "link.csv")
     for wrong in ("", "../a.csv", "/x/a.csv", ".hidden", "a\0.csv", "sweep.h5", "link.csv"):
         with pytest.raises(InvalidInputError):
-            folder.save(wrong, lambda path: path.write_text("new"))
+            save_new(folder, wrong, lambda path: path.write_text("new"))
     assert (tmp_path / "sweep.h5").read_bytes() == b"sweep"
     assert not (tmp_path.parent / "elsewhere.csv").exists()
 
 
 def test_a_file_appears_whole_or_not_at_all(folder, tmp_path):
-    assert folder.save("points.csv", lambda path: path.write_text("1,2")).read_text() == "1,2"
+    assert save_new(folder, "points.csv", lambda path: path.write_text("1,2")).read_text() == "1,2"
 
     def breaks(path):
         path.write_text("1,")
         raise FileError("no")
 
     with pytest.raises(FileError):
-        folder.save("more.csv", breaks)
+        save_new(folder, "more.csv", breaks)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["points.csv", "sweep.h5"]

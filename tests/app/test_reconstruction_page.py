@@ -10,7 +10,6 @@ import pytest
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d import cli
-from speckle3d.app.folder import Folder
 from speckle3d.app.reconstruction.page import ReconstructionPage, _Viewer
 from speckle3d.core.grid import ImageGrid
 from speckle3d.core.reconstruction import Provenance, Reconstruction, Trust
@@ -45,7 +44,7 @@ def page(tmp_path_factory):
     write_reconstruction(
         folder / "r.h5", Reconstruction(sweep.frame_time_s, GRID, poses, origin, trust=trust)
     )
-    return ReconstructionPage(read_reconstruction(folder / "r.h5"), sweep, Folder(folder / "r.h5"))
+    return ReconstructionPage(read_reconstruction(folder / "r.h5"), sweep, folder / "r.h5")
 
 
 @pytest.fixture
@@ -58,7 +57,7 @@ def viewer(page):
 def run_command(page, command):
     """What a command prints that is run where the reconstruction is."""
     output = io.StringIO()
-    with pytest.MonkeyPatch.context() as patch, redirect_stdout(output), chdir(page.folder.path):
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(output), chdir(page.folder):
         patch.setattr(sys, "argv", shlex.split(command))
         with suppress(SystemExit):
             cli.main()
@@ -76,7 +75,7 @@ def test_a_cut_is_what_its_command_makes(viewer, page, cut, mode):
     viewer.param.update(frame=7, lateral_mm=9.0, depth_mm=11.0)
     command = commands(viewer._commands)[["along", "frame", "depth"].index(cut)]
     run_command(page, command.replace(f"{cut}.png", f"{cut}-{mode}.nrrd"))
-    levels = read_volume(page.folder.path / f"{cut}-{mode}.nrrd").voxels[..., 0].T.astype(float)
+    levels = read_volume(page.folder / f"{cut}-{mode}.nrrd").voxels[..., 0].T.astype(float)
     (pixels,) = viewer._plots[cut].source.data["image"]
     grey = (pixels & 0xFF).astype(float)
     assert levels.shape == grey.shape

@@ -20,7 +20,6 @@ from panel.viewable import Viewable
 
 from calibration.detection.lines import LineFinder
 from calibration.points import Recording
-from speckle3d.app.folder import Folder
 from speckle3d.app.phantom.plots import ORANGE, SKY_BLUE
 from speckle3d.app.phantom.viewer import PhantomViewer
 from speckle3d.calibrating.settings import OrientationSettings, PlaneSettings, ScanSettings
@@ -36,8 +35,8 @@ class LinesViewer(PhantomViewer):
 
     detection = ("columns", "smoothing_mm", "threshold", "tolerance_mm", "consensus", "place")
 
-    def __init__(self, recording: Recording, images: Path, folder: Folder, settings: ScanSettings) -> None:
-        super().__init__(recording, images, folder, settings)
+    def __init__(self, recording: Recording, images: Path, settings: ScanSettings) -> None:
+        super().__init__(recording, images, settings)
         self._finder: tuple[object, LineFinder] | None = None
         self._line = ColumnDataSource({"column": [], "row": []}, name="line")
         self._inliers = ColumnDataSource({"column": [], "row": []})

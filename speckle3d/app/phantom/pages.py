@@ -6,7 +6,6 @@ from pathlib import Path
 
 from panel.viewable import Viewable
 
-from speckle3d.app.folder import Folder
 from speckle3d.app.phantom.lines import LinesViewer
 from speckle3d.app.phantom.points import PointsViewer
 from speckle3d.calibrating.phantoms import opened, require_frames
@@ -35,7 +34,7 @@ class PhantomPage:
         if not recording.images.shape[0]:
             raise InvalidInputError(f"{images}: expected frames to look at, got none")
         require_frames(settings.frames_left_out, recording.images.shape[0])
-        self._inputs = recording, images, Folder(images), settings
+        self._inputs = recording, images, settings
         self._viewer = PointsViewer if isinstance(settings, WireSettings) else LinesViewer
         self.title = "Points" if isinstance(settings, WireSettings) else "Lines"
         self._viewer(*self._inputs)  # which refuses what cannot be shown

@@ -15,7 +15,7 @@ from panel.viewable import Viewable
 
 from calibration.points import Recording, Seen
 from calibration.recording import choose_crossings
-from speckle3d.app.folder import Folder
+from speckle3d.app.folder import save_new
 from speckle3d.app.look import batch_changes
 from speckle3d.app.phantom.plots import BLUE, ORANGE, SKY_BLUE
 from speckle3d.app.phantom.run import run_in_thread, sentence
@@ -82,9 +82,9 @@ class PointsViewer(PhantomViewer):
         If the phantom or the points cannot be read, or do not fit the recording.
     """
 
-    def __init__(self, recording: Recording, images: Path, folder: Folder, settings: ScanSettings) -> None:
+    def __init__(self, recording: Recording, images: Path, settings: ScanSettings) -> None:
         assert isinstance(settings, WireSettings)
-        super().__init__(recording, images, folder, settings)
+        super().__init__(recording, images, settings)
         self._phantom, self._drawing = Wired.of(settings.phantom), False
         self.picks = Picks(self._phantom.names)
         if settings.points is not None:
@@ -206,4 +206,4 @@ class PointsViewer(PhantomViewer):
         if not len(points):
             raise InvalidInputError("expected points to save, got none")
         name = name if name.endswith(".csv") else f"{name}.csv"
-        return self.folder.save(name, lambda path: write_points(path, points, self._phantom.names))
+        return save_new(self.folder, name, lambda path: write_points(path, points, self._phantom.names))

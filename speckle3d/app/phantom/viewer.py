@@ -15,7 +15,7 @@ from panel.viewable import Viewable
 from calibration.points import Recording, Seen
 from calibration.recording import Outcome
 from calibration.report import text_report
-from speckle3d.app.folder import Folder
+from speckle3d.app.folder import new_path
 from speckle3d.app.look import batch_changes
 from speckle3d.app.phantom.plots import BLUE, ORANGE, FramePlot, FrameStrip
 from speckle3d.app.phantom.run import run_in_thread, sentence
@@ -50,8 +50,6 @@ class PhantomViewer:
     recording : Recording
     images : Path
         Its file, as the command is given it.
-    folder : Folder
-        Where results are saved.
     settings : ScanSettings
         To begin with.
     """
@@ -59,8 +57,9 @@ class PhantomViewer:
     detection: tuple[str, ...] = ()
     """Settings of what is found, which change what is seen at once."""
 
-    def __init__(self, recording: Recording, images: Path, folder: Folder, settings: ScanSettings) -> None:
-        self.recording, self.images, self.folder, self._start = recording, images, folder, settings
+    def __init__(self, recording: Recording, images: Path, settings: ScanSettings) -> None:
+        self.recording, self.images, self._start = recording, images, settings
+        self.folder = images.resolve().parent
         count = recording.images.shape[0]
         self._details = _DETAILS[type(settings)]
         names = (*self.detection, "region", "leave_out", *self._details)
@@ -225,13 +224,13 @@ class PhantomViewer:
             return
         (settings, outcome), name = self._result, self._name.value or ""
         try:
-            out = self.folder.place(name if name.endswith(".h5") else f"{name}.h5")
+            out = new_path(self.folder, name if name.endswith(".h5") else f"{name}.h5")
             for suffix in BESIDE:
-                self.folder.place(out.with_suffix(suffix).name)
+                new_path(self.folder, out.with_suffix(suffix).name)
             settings = self.before_saving(settings, out)
             files = write_outcome(outcome, settings, self.images, out, remarks(outcome)).files
         except Speckle3DError as error:
             self._note.object = sentence(str(error), ORANGE)
             return
         names = ", ".join(path.name for path in files)
-        self._note.object = sentence(f"Saved {names} in {self.folder.path}", BLUE)
+        self._note.object = sentence(f"Saved {names} in {self.folder}", BLUE)

@@ -12,7 +12,6 @@ import panel as pn
 import param
 from panel.viewable import Viewable
 
-from speckle3d.app.folder import Folder
 from speckle3d.app.look import batch_changes
 from speckle3d.app.reconstruction.commands import code, measure_command, reslice_command
 from speckle3d.app.reconstruction.cut_plot import CutPlot
@@ -57,8 +56,8 @@ class ReconstructionPage:
         Its pairs are not needed.
     sweep : Sweep
         Of the frames that were reconstructed; see `speckle3d.study.images.open_reconstruction`.
-    folder : Folder
-        Of the reconstruction's file.
+    file : Path
+        Of the reconstruction.
     sweep_file : path, optional
         The sweep, if it is not where the reconstruction says: commands that are shown then name it.
     mode : str
@@ -71,14 +70,14 @@ class ReconstructionPage:
         self,
         reconstruction: Reconstruction,
         sweep: Sweep,
-        folder: Folder,
+        file: Path,
         sweep_file: Path | None = None,
         mode: str = "image",
     ) -> None:
-        self.reconstruction, self.mode, self.folder = reconstruction, mode, folder
-        self.source = Path(folder.file.name)
+        self.reconstruction, self.mode, self.folder = reconstruction, mode, file.resolve().parent
+        self.source = Path(file.resolve().name)
         recording = Path(reconstruction.provenance.input_path)
-        is_there = sweep_file is None and (folder.path / recording).exists()
+        is_there = sweep_file is None and (self.folder / recording).exists()
         self.sweep_file = None if is_there else (sweep_file or recording).resolve()
         poses = reconstruction.poses[mode]
         self._sweep = PosedSweep(sweep, np.arange(len(sweep)), poses, mode, reconstruction)
