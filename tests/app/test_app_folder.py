@@ -5,7 +5,7 @@ import os
 import pytest
 
 from speckle3d.app.folder import save_new
-from speckle3d.core.errors import FileError, InvalidInputError
+from speckle3d.core.errors import InvalidInputError
 
 
 @pytest.fixture
@@ -21,15 +21,3 @@ def test_a_name_must_be_new_and_in_the_folder(folder, tmp_path):
             save_new(folder, wrong, lambda path: path.write_text("new"))
     assert (tmp_path / "sweep.h5").read_bytes() == b"sweep"
     assert not (tmp_path.parent / "elsewhere.csv").exists()
-
-
-def test_a_file_appears_whole_or_not_at_all(folder, tmp_path):
-    assert save_new(folder, "points.csv", lambda path: path.write_text("1,2")).read_text() == "1,2"
-
-    def breaks(path):
-        path.write_text("1,")
-        raise FileError("no")
-
-    with pytest.raises(FileError):
-        save_new(folder, "more.csv", breaks)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["points.csv", "sweep.h5"]
