@@ -13,12 +13,13 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
+from speckle3d.core.arrays import AnyArray
 from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.files import PathLike
 from speckle3d.core.geometry import require_finite
 from speckle3d.io.hdf5 import open_hdf5, reading, require_dataset
 
-ReadFrame: TypeAlias = Callable[[int], npt.NDArray[Any]]
+ReadFrame: TypeAlias = Callable[[int], AnyArray]
 """Reads frame i of an open file, shape (vector, sample)."""
 
 
@@ -60,7 +61,7 @@ class FileFrames:
     def __len__(self) -> int:
         return self.shape[0]
 
-    def __getitem__(self, index: int) -> npt.NDArray[Any]:
+    def __getitem__(self, index: int) -> AnyArray:
         i = self.numbers[operator.index(index)]
         where = f"{self.path}: frame {i}"
         with self._lock, reading(where), naming(where):
@@ -75,7 +76,7 @@ class FileFrames:
             require_finite(frame, where)
         return frame
 
-    def take(self, rows: npt.NDArray[Any], axis: int = 0) -> FileFrames:
+    def take(self, rows: AnyArray, axis: int = 0) -> FileFrames:
         """Some of the frames, as `numpy.take` along the axis of frames."""
         return FileFrames(self.path, *self._arguments, [self.numbers[i] for i in rows.tolist()])
 
@@ -105,7 +106,7 @@ class HDF5Slices:
 
     path: Path
     names: tuple[str, ...]
-    turn: Callable[..., npt.NDArray[Any]]
+    turn: Callable[..., AnyArray]
     axis: int | None = 0
 
     def __call__(self) -> ReadFrame:
@@ -129,7 +130,7 @@ def _slice_reader(data: h5py.Dataset, axis: int | None) -> ReadFrame:
     return lambda i: np.asarray(data[(*(slice(None),) * axis, i)])
 
 
-def _plain_chunk(data: h5py.Dataset, i: int) -> npt.NDArray[Any]:
+def _plain_chunk(data: h5py.Dataset, i: int) -> AnyArray:
     values = np.empty(data.shape[1:], data.dtype)
     data.id.read_direct_chunk((i, *(0,) * values.ndim), out=values.reshape(-1).view(np.uint8))
     return values

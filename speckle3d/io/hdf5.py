@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform
 
-from speckle3d.core.arrays import FloatArray
+from speckle3d.core.arrays import AnyArray, FloatArray
 from speckle3d.core.errors import FileError, InvalidInputError, Speckle3DError, naming
 from speckle3d.core.files import PathLike as PathLike
 from speckle3d.core.files import open_regular
@@ -247,7 +247,7 @@ def _require_kind(group: h5py.Group, name: str, kind: type[Node]) -> Any:
 
 def read_array(
     group: h5py.Group, name: str, shape: tuple[int | str, ...] | None, dtype: npt.DTypeLike = np.float64
-) -> npt.NDArray[Any]:
+) -> AnyArray:
     """Read a data set whose shape and kind are known.
 
     Parameters

@@ -16,9 +16,8 @@ from typing import Any
 
 import nrrd
 import numpy as np
-import numpy.typing as npt
 
-from speckle3d.core.arrays import FloatArray
+from speckle3d.core.arrays import AnyArray, FloatArray
 from speckle3d.core.errors import FileError, InvalidInputError, naming
 from speckle3d.core.files import PathLike, open_regular
 from speckle3d.io.hdf5 import reading
@@ -147,7 +146,7 @@ class SequenceHeader:
         elif size > _BYTES_OF_ONE[self.encoding] * length:
             raise FileError(f"{self.path}: ends early: {size} bytes of pixels are not in {length} bytes")
 
-    def images(self) -> npt.NDArray[Any]:
+    def images(self) -> AnyArray:
         """Map or unpack all images, shape (frame, y, x).
 
         Raises
@@ -160,7 +159,7 @@ class SequenceHeader:
             values = np.moveaxis(values, len(self.file_size) - 1 - self.frame_axis, 0)
         return values.reshape(self.frame_count, self.size[1], self.size[0])
 
-    def numbers(self) -> npt.NDArray[Any]:
+    def numbers(self) -> AnyArray:
         """Map or unpack the numbers, in one row; raw ones of the machine's byte order stay on the disk.
 
         Raises

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from speckle3d.core.arrays import AnyArray
 from speckle3d.io.header_fields import NUMBER_TYPES
 from speckle3d.io.headers import DEFLATE, GZIP, ZLIB
 
@@ -59,7 +59,7 @@ def _field_lines(fields: Mapping[str, object], sign: str) -> str:
 def write_image(
     path: Path,
     header: Callable[[int | None], str],
-    planes: Iterable[npt.NDArray[Any]],
+    planes: Iterable[AnyArray],
     is_packed: bool,
     is_nrrd: bool,
 ) -> None:

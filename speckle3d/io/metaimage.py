@@ -69,7 +69,7 @@ def read_poses(path: PathLike, settings: ImportSettings | None = None) -> Tracke
     fields, frames = len(sequence.header.frames), sequence.header.frame_count
     if 0 < MOST_FRAMES_A_FIELD * fields < frames:
         raise InvalidInputError(f"{path}: expected fields of most frames, got those of {fields} of {frames}")
-    readings, notes = sequence.timed(sequence.poses)
+    readings, notes = sequence.readings
     if readings is None:
         raise InvalidInputError(
             f"{path}: expected tracked poses (fields like ProbeToTrackerTransform), got {lacking_poses(path)}"
@@ -176,33 +176,30 @@ class _Sequence:
 
     def recording(self) -> Recording:
         """Images with all that is said of them."""
-        header, settings, layout, own = self.header, self.settings, self.layout, self.own_values
-        values, remarks = self._values()
-        frames, frame_remarks = self._frames(values)
-        tracker, tracker_remarks = self._tracker()
-        poses, names = self.poses, self.device.names
-        chain = [] if poses is None else [*poses.chain]
-        if self.image_to_probe is not None and poses is not None and poses.pixels is None:
-            chain.insert(0, f"{names.image}To{poses.tool}")
+        header, settings, own = self.header, self.settings, self.own_values
         return Recording(
             Path(header.path),
             settings,
-            frames,
-            values,
+            _file_frames(header, self.frame_layout),
+            self.values,
             time_s=self._times(header.frame_count),
             faults=self._image_faults(),
-            tracker=tracker,
+            tracker=self._tracker(),
             orientation=self._orientation(),
-            chain=" * ".join(chain),
+            chain=self._chain(),
             probe=settings.probe or own.get("probe") or self.device.text("TransducerName"),
             full_scale=own.get("full_scale", 255.0),
-            assumptions=("parallel lines",) if layout.is_rf and not own else (),
-            remarks=(*remarks, *frame_remarks, *tracker_remarks, *self._remarks()),
+            assumptions=("parallel lines",) if self.layout.is_rf and not own else (),
+            remarks=tuple(self._remarks()),
         )
 
-    def timed(self, poses: Poses | None, rate_hz: float | None = None) -> tuple[TimedPoses | None, list[str]]:
-        """Poses that have a time, and a line of those left out."""
-        times = None if poses is None else self._times(len(poses.faults), rate_hz)
+    @cached_property
+    def readings(self) -> tuple[TimedPoses | None, list[str]]:
+        """The tool's poses that have a time, and a line of those left out."""
+        return self._timed_poses(self.poses)
+
+    def _timed_poses(self, poses: Poses | None) -> tuple[TimedPoses | None, list[str]]:
+        times = None if poses is None else self._times(len(poses.faults), self.settings.frame_rate_hz)
         if poses is None or times is None:
             return None, []
         return timed_poses(times, poses.matrices, poses.faults)
@@ -229,13 +226,32 @@ class _Sequence:
         faults = ["" if status <= {None, "OK"} else "not valid by their status" for status in statuses]
         return faults + [""] * (count - len(faults))
 
-    def _values(self) -> tuple[dict[str, Value], list[str]]:
-        """What a sweep of this kind needs, where file or device set have it, and what contradicts."""
+    @cached_property
+    def spacing_mm(self) -> tuple[float, ...] | None:
+        """Distances of columns and rows by the header."""
+        spacing = self.header.spacing_mm
+        return spacing[::-1] if spacing and self.layout.has_lines_in_rows else spacing
+
+    @cached_property
+    def calibration(self) -> Value:
+        """Distances of columns and rows on the tracked tool."""
+        if (transform := self.image_to_probe) is None:
+            return Value()
+        return replace(
+            transform, value=pixel_axes(transform.value, f"{self.header.path}: {transform.source}")
+        )
+
+    @cached_property
+    def values(self) -> dict[str, Value]:
+        """What a sweep of this kind needs, and where file or device set have it."""
         header, device, layout = self.header, self.device, self.layout
-        pixel, remarks = self._pixel()
-        values = dict[str, Value]()
+        # The sampling rate of RF is known better than by a calibration.
+        sizes = [Value(self.spacing_mm, "ElementSpacing" if self.spacing_mm else "")]
+        if not layout.is_rf:
+            sizes = [self.calibration, *sizes, Value(device.pixel_mm(header.size), "device set", _DEVICE)]
+        pixel = next((size for size in sizes if size.value is not None), Value())
         across, down = (replace(pixel, value=size) for size in pixel.value or (None, None))
-        vectors, samples = layout.shape(header.size)
+        values, (vectors, samples) = dict[str, Value](), layout.shape(header.size)
 
         def scan(numbers: float | tuple[float, ...] | None) -> Value:
             return Value(numbers, "ScanConversion of the device set", _DEVICE)
@@ -252,65 +268,46 @@ class _Sequence:
         elif width_mm is not None:
             values["vector_pitch_mm"] = scan(width_mm[0] / vectors)
         own = {name: number for name, number in self.own_values.items() if "_" in name}
-        return values | {
-            name: Value(number, "as this package wrote it") for name, number in own.items()
-        }, remarks
+        return values | {name: Value(number, "as this package wrote it") for name, number in own.items()}
 
-    def _pixel(self) -> tuple[Value, list[str]]:
-        """Distances of columns and rows, and what contradicts them."""
-        header, transform = self.header, self.image_to_probe
-        spacing, calibration, remarks = header.spacing_mm, Value(), list[str]()
-        if spacing is not None and self.layout.has_lines_in_rows:
-            spacing = spacing[::-1]
-        if transform is not None:
-            where = f"{header.path}: {transform.source}"
-            calibration = replace(transform, value=pixel_axes(transform.value, where))
-            if spacing and not self.own_values and differs(calibration.value, spacing):
-                text = f"{_length_text(calibration.value)} mm, {calibration.source}"
-                remarks = [f"pixels of {text}: the file says {_length_text(spacing)}"]
-        # The sampling rate of RF is known better than by a calibration.
-        sizes = [Value(spacing, "ElementSpacing" if spacing else "")]
-        if not self.layout.is_rf:
-            device_mm = self.device.pixel_mm(header.size)
-            sizes = [calibration, *sizes, Value(device_mm, "device set", _DEVICE)]
-        return next((size for size in sizes if size.value is not None), Value()), remarks
-
-    def _frames(self, values: dict[str, Value]) -> tuple[FileFrames, list[str]]:
-        """Frames, whose Q is turned where its phase runs backwards, which is told."""
-        frames, settings = _file_frames(self.header, self.layout), self.settings
-        if not self.layout.is_complex:
-            return frames, []
+    @cached_property
+    def frame_layout(self) -> Layout:
+        """Layout by which frames are turned: with the other sign of Q where their phase runs backwards."""
         demodulation, centre, rate = (
-            getattr(settings, name) or values.get(name, Value()).value for name in _FREQUENCIES
+            getattr(self.settings, name) or self.values.get(name, Value()).value for name in _FREQUENCIES
         )
+        if not self.layout.is_complex or demodulation or not (centre and rate):
+            return self.layout
         # Depth runs backwards in lines that are stored from the far end on, and so does their phase.
-        share = None if demodulation or not (centre and rate) else carrier_share(frames, centre, rate)
-        if share is None or share > -CARRIER[0]:
-            return frames, []
-        conjugate = replace(self.layout, conjugate=True)
-        return _file_frames(self.header, conjugate), [
-            "Q has the other sign in the file, as its phase tells: turned"
-        ]
+        share = carrier_share(_file_frames(self.header, self.layout), centre, rate)
+        return replace(self.layout, conjugate=share is not None and share <= -CARRIER[0])
 
-    def _tracker(self) -> tuple[Tracker | None, list[str]]:
-        """The tracker, with the image's place on it, and a line of poses left out."""
-        readings, remarks = self.timed(self.poses, self.settings.frame_rate_hz)
+    def _chain(self) -> str:
+        """Transforms that lead from the image, or the tool, to the world."""
+        if (poses := self.poses) is None:
+            return ""
+        has_mounting = self.image_to_probe is not None and poses.pixels is None
+        mounting = [f"{self.device.names.image}To{poses.tool}"] if has_mounting else []
+        return " * ".join([*mounting, *poses.chain])
+
+    def _tracker(self) -> Tracker | None:
+        """The tracker, with the image's place on it."""
+        readings, _ = self.readings
         if readings is None or (transform := self.image_to_probe) is None:
-            return None if readings is None else Tracker(readings), remarks
+            return None if readings is None else Tracker(readings)
         first_mm = self.settings.first_sample_depth_mm
         if first_mm is None:
             first_mm = self.own_values.get("first_sample_depth_mm", 0.0)
         where = f"{self.header.path}: {transform.source}"
         mounting, skew_rad = sensor_from_image(transform.value, first_mm, where)
-        return Tracker(readings, mounting, image_skew_rad=skew_rad), remarks
+        return Tracker(readings, mounting, image_skew_rad=skew_rad)
 
     def _orientation(self) -> OrientationSensor | None:
         """The orientation sensor, as this package writes it."""
         header, name = self.header, f"{ORIENTATION}ToWorld"
         if name not in names_of(header):
             return None
-        poses = tracked_poses(header, name, "none", Names())
-        readings, _ = self.timed(poses, self.settings.frame_rate_hz)
+        readings, _ = self._timed_poses(tracked_poses(header, name, "none", Names()))
         if readings is None:
             return None
         matrix = fixed_transform(header, f"{IMAGE}To{ORIENTATION}")
@@ -320,7 +317,14 @@ class _Sequence:
 
     def _remarks(self) -> Iterator[str]:
         """Tell what contradicts, and which poses were not used."""
-        header, device, layout = self.header, self.device, self.layout
+        header, device, layout, spacing = self.header, self.device, self.layout, self.spacing_mm
+        size = self.calibration
+        if size.value and spacing and not self.own_values and differs(size.value, spacing):
+            text = f"{_length_text(size.value)} mm, {size.source}"
+            yield f"pixels of {text}: the file says {_length_text(spacing)}"
+        if self.frame_layout.conjugate:
+            yield "Q has the other sign in the file, as its phase tells: turned"
+        yield from self.readings[1]
         if self.poses is None and names_of(header) and self.settings.tracker_transform is None:
             yield f"no tracker: the header's transforms are {lacking_poses(header.path)}"
         if len(header.frames) not in (0, header.frame_count):

@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform
 
-from speckle3d.core.arrays import FloatArray
+from speckle3d.core.arrays import AnyArray, FloatArray
 from speckle3d.core.errors import FileError, InvalidInputError, Speckle3DError, naming
 from speckle3d.core.geometry import require_finite, rotations_from_quaternions, transforms_from_matrices
 from speckle3d.core.grid import ImageGrid
@@ -87,7 +87,7 @@ def _create_frames(
     return node
 
 
-def _append_frame(node: h5py.Dataset, frame: npt.NDArray[Any]) -> None:
+def _append_frame(node: h5py.Dataset, frame: AnyArray) -> None:
     """Write the next frame, shape (vector, sample), and hand it to the operating system.
 
     Raises
@@ -328,7 +328,7 @@ class GrowingSweep:
         """Frames in the file."""
         return len(self._frames)
 
-    def append(self, frame: npt.NDArray[Any], time_s: float) -> None:
+    def append(self, frame: AnyArray, time_s: float) -> None:
         """Write the next frame, shape (vector, sample), taken at image time `time_s`.
 
         Raises

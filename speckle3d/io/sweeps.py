@@ -12,7 +12,7 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
-from speckle3d.core.arrays import FloatArray
+from speckle3d.core.arrays import AnyArray, FloatArray
 from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.geometry import (
     require_finite,
@@ -128,7 +128,7 @@ class _Clock:
         """Shape of a data set with a row of a shape for each time."""
         return ("row" if self.is_growing else self.time_s.size, *row)
 
-    def rows(self, name: str, *row: int, dtype: npt.DTypeLike = np.float64) -> npt.NDArray[Any]:
+    def rows(self, name: str, *row: int, dtype: npt.DTypeLike = np.float64) -> AnyArray:
         """Read the rows that have a time of a data set."""
         return read_array(self.group, name, self.shape(*row), dtype)[: self.time_s.size]
 

@@ -101,14 +101,13 @@ class Files:
         InvalidInputError
             Naming the files that are lacking.
         """
-        kinds = self.yml.keys() - {"imu"} if not self.raw else self.raw.keys() - self.yml.keys()
-        if not self.raw or kinds:
-            start = f"{self.name}_" if self.name else ""
-            lacks = " or ".join(f"{start}{kind}.{'yml' if self.raw else 'raw'}" for kind in sorted(kinds))
+        kinds = self.raw.keys() - self.yml.keys() if self.raw else self.yml.keys() - {"imu"}
+        if kinds or not self.raw:
+            start, suffix = f"{self.name}_" if self.name else "", "yml" if self.raw else "raw"
+            lacks = " or ".join(f"{start}{kind}.{suffix}" for kind in sorted(kinds)) or "samples (.raw)"
             names = [Path(member.name).name for member in (*self.raw.values(), *self.yml.values())]
             raise InvalidInputError(
-                f"{self.path}: expected {lacks or 'samples (.raw) and their description (.yml)'} beside "
-                f"{', '.join(names) or 'its gain (.tgc)'}, got none"
+                f"{self.path}: expected {lacks} beside {', '.join(names) or 'their gain (.tgc)'}, got none"
             )
 
 

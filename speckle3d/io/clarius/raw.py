@@ -18,9 +18,8 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from speckle3d.core.arrays import ComplexArray
+from speckle3d.core.arrays import AnyArray, ComplexArray
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.extras import extra_module
 from speckle3d.io.clarius.package import Member
@@ -34,7 +33,7 @@ SAMPLES = {"RF": ("<i2", 1, np.int16), "IQ": ("<i2", 2, np.complex64), "envelope
 """By kind: type of the numbers in the file, how many make a sample, and type of the samples."""
 
 
-def open_raw(member: Member, yml: Description) -> npt.NDArray[Any]:
+def open_raw(member: Member, yml: Description) -> AnyArray:
     """Frames as they lie in a raw file: ``time`` in ns and ``samples``, shape (line, sample, part).
 
     Raises

@@ -9,16 +9,15 @@ from typing import Any, TypeAlias
 
 import h5py
 import numpy as np
-import numpy.typing as npt
 
-from speckle3d.core.arrays import FloatArray
+from speckle3d.core.arrays import AnyArray, FloatArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.printable import printable
 from speckle3d.io.frames import FileFrames, HDF5Slices
 from speckle3d.io.hdf5 import has_member, locate, read_array
 from speckle3d.io.recordings import Value, step_of
 
-Turn: TypeAlias = Callable[..., npt.NDArray[Any]]
+Turn: TypeAlias = Callable[..., AnyArray]
 """Makes a frame (vector, sample) of slices of data sets."""
 
 ENVELOPE_RANGE_DB = 80.0
@@ -102,9 +101,7 @@ def text_of(value: Any) -> str:
     return printable(first.decode("utf-8", "replace") if isinstance(first, bytes) else str(first)).strip("\0")
 
 
-def frame_of(
-    *parts: npt.NDArray[Any], shape: tuple[int, ...], across: bool = False, pairs: bool = False
-) -> npt.NDArray[Any]:
+def frame_of(*parts: AnyArray, shape: tuple[int, ...], across: bool = False, pairs: bool = False) -> AnyArray:
     """Turn numbers of a frame, in one array or in real and imaginary parts, into (vector, sample).
 
     Parameters
@@ -125,8 +122,8 @@ def frame_of(
 
 
 def grey_levels(
-    *parts: npt.NDArray[Any], turn: Turn, decibels: bool, top: float, dynamic_range_db: float
-) -> npt.NDArray[Any]:
+    *parts: AnyArray, turn: Turn, decibels: bool, top: float, dynamic_range_db: float
+) -> AnyArray:
     """Turn decibels, or an echo's amplitude, into grey levels, 255 at `top`, 0 that range below."""
     values = turn(*parts).astype(np.float64)
     with np.errstate(divide="ignore", invalid="ignore"):

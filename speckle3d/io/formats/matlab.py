@@ -27,9 +27,8 @@ from typing import Any
 
 import h5py
 import numpy as np
-import numpy.typing as npt
 
-from speckle3d.core.arrays import FloatArray
+from speckle3d.core.arrays import AnyArray, FloatArray
 from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.geometry import require_finite
 from speckle3d.core.printable import printable
@@ -185,7 +184,7 @@ def _class(node: h5py.Dataset) -> str:
     return text_of(node.attrs.get("MATLAB_class"))
 
 
-def _greys(*parts: npt.NDArray[Any], turn: Turn) -> npt.NDArray[Any]:
+def _greys(*parts: AnyArray, turn: Turn) -> AnyArray:
     """Turn numbers into grey levels, refused where they are none."""
     frame = turn(*parts)
     if not np.isin(frame, np.arange(256)).all():

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from speckle3d.core.arrays import AnyArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.extras import extra_module
 from speckle3d.core.images import ImageFrames
@@ -41,7 +41,7 @@ class PictureFolder:
         first = self[0]
         self.shape, self.dtype = (len(self._paths), *first.shape), first.dtype
 
-    def __getitem__(self, index: int) -> npt.NDArray[Any]:
+    def __getitem__(self, index: int) -> AnyArray:
         from PIL import Image
 
         with reading(self._paths[index], Exception), Image.open(self._paths[index]) as picture:
@@ -68,7 +68,7 @@ class Video:
         first = self[0]
         self.shape, self.dtype = (count, *first.shape), first.dtype
 
-    def __getitem__(self, index: int) -> npt.NDArray[Any]:
+    def __getitem__(self, index: int) -> AnyArray:
         with reading(f"{self._path}: frame {index}", Exception):
             return np.asarray(self._file.read(index=index))
 

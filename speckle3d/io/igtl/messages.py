@@ -24,7 +24,7 @@ from fastcrc.crc64 import ecma_182
 from pyigtl import ImageMessage, StringMessage, TransformMessage
 from pyigtl.messages import MessageBase
 
-from speckle3d.core.arrays import FloatArray
+from speckle3d.core.arrays import AnyArray, FloatArray
 from speckle3d.core.errors import InvalidInputError
 
 HEADER = struct.Struct("> H 12s 20s II Q Q")
@@ -63,7 +63,7 @@ class ImageReceived:
 
     device: str
     time_s: float
-    pixels: npt.NDArray[Any]
+    pixels: AnyArray
     image_to_world: FloatArray
     components: int = 1
 
@@ -139,7 +139,7 @@ def decode(start: bytes, body: bytes) -> Received:
 
 
 def packed_image(
-    device: str, time_s: float, pixels: npt.NDArray[Any], image_to_world: FloatArray, components: int = 1
+    device: str, time_s: float, pixels: AnyArray, image_to_world: FloatArray, components: int = 1
 ) -> bytes:
     """Pack an IMAGE in RAS, the world of Slicer and of TRANSFORMs.
 
@@ -202,7 +202,7 @@ def _image(message: Any) -> ImageReceived:
     matrix = _finite(message.ijk_to_world_matrix)
     if message.world_coordinate_system == "lps":
         matrix = _RAS_FROM_LPS @ matrix
-    by_slice: npt.NDArray[Any] = message.image
+    by_slice: AnyArray = message.image
     if not by_slice.size:
         raise ValueError(f"expected pixels, got none: shape {by_slice.shape}")
     pixels = by_slice.transpose(2, 1, 0, *range(3, by_slice.ndim))

@@ -8,13 +8,12 @@ from __future__ import annotations
 import heapq
 import math
 from collections.abc import Iterator
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from speckle3d.core.arrays import FloatArray
+from speckle3d.core.arrays import AnyArray, FloatArray
 from speckle3d.core.grid import ImageGrid
 from speckle3d.core.sweep import Frames, OrientationSensor, Sweep, Tracker
 from speckle3d.io.igtl.messages import packed_image, packed_transform
@@ -94,7 +93,7 @@ def _readings(
         yield at_s, packed_transform(name, time_s + later_s, matrix), False
 
 
-def _pixels(frames: Frames, i: int, upright: bool) -> tuple[npt.NDArray[Any], int]:
+def _pixels(frames: Frames, i: int, upright: bool) -> tuple[AnyArray, int]:
     """Pixels (column, row) of a frame, (column, row, 2) of I and Q, and the number of components."""
     frame = frames[i]
     if frame.dtype.kind == "c":

@@ -11,11 +11,10 @@ References
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from speckle3d.core.arrays import AnyArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.io.headers import SequenceHeader
 
@@ -95,7 +94,7 @@ class Layout:
         if self.is_complex and self._lines(size)[self._pair_axis] % 2:
             raise InvalidInputError(f"{path}: expected I and Q in pairs, got images of size {size}")
 
-    def frame(self, pixels: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    def frame(self, pixels: AnyArray) -> AnyArray:
         """Turn pixels, shape (y, x), into samples, shape (vector, sample): marked and far sides last."""
         lines = pixels if self.has_lines_in_rows else pixels.T
         if self.is_complex:

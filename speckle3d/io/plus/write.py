@@ -13,10 +13,9 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from speckle3d.core.arrays import BoolArray, FloatArray
+from speckle3d.core.arrays import AnyArray, BoolArray, FloatArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.files import PathLike
 from speckle3d.core.progress import Progress
@@ -111,7 +110,7 @@ def write_sequence(
         dtype = np.dtype(np.int16 if stored_dtype(sweep.frames) == np.int16 else np.float32)
     shape = (*_pixels(sweep.frames[0]).shape[::-1], len(sweep))
 
-    def planes() -> Iterator[npt.NDArray[Any]]:
+    def planes() -> Iterator[AnyArray]:
         for i in range(len(sweep)):
             yield _pixels(sweep.frames[i]).astype(dtype, copy=False)
             if progress is not None:
@@ -128,7 +127,7 @@ def write_sequence(
     return omissions
 
 
-def _pixels(frame: npt.NDArray[Any]) -> npt.NDArray[Any]:
+def _pixels(frame: AnyArray) -> AnyArray:
     """Pixels (y, x) of a frame (vector, sample): lines of echoes in rows, I and Q in turn; images upright."""
     if frame.dtype.kind == "c":
         return np.stack([frame.real, frame.imag], axis=2).reshape(len(frame), -1)

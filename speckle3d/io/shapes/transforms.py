@@ -11,14 +11,11 @@ References
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.files import PathLike
-from speckle3d.io.fileset import FileSet
 from speckle3d.io.hdf5 import atomic_path, require_suffix
 from speckle3d.io.text import number_text
 
@@ -68,29 +65,3 @@ def write_transform(path: PathLike, world_from_image: RigidTransform) -> None:
     )
     with atomic_path(path) as part:
         part.write_text("\n".join(lines) + "\n", encoding="ascii")
-
-
-def write_transforms(path: PathLike, world_from_image: RigidTransform) -> None:
-    """Write a row of poses, each into a file of its own: all of them appear, or none.
-
-    Parameters
-    ----------
-    path : path
-        As of `write_transform`; names are as in `transform_paths`.
-    world_from_image : RigidTransform, length n
-
-    Raises
-    ------
-    InvalidInputError, FileError
-        As `write_transform` does.
-    """
-    first, *rest = (file.name for file in transform_paths(path, len(world_from_image)))
-    with FileSet(first, tuple(rest)).replaced(Path(path).parent) as part:
-        for name, pose in zip((first, *rest), world_from_image, strict=True):
-            write_transform(part / name, pose)
-
-
-def transform_paths(path: PathLike, count: int) -> list[Path]:
-    """Files of a row of poses: the path with the frame's number behind its stem, as poses-0000.tfm."""
-    pattern = Path(path)
-    return [pattern.with_name(f"{pattern.stem}-{i:04d}{pattern.suffix}") for i in range(count)]

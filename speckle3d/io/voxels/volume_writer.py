@@ -20,6 +20,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform
 
+from speckle3d.core.arrays import AnyArray
 from speckle3d.core.errors import InvalidInputError, MismatchError
 from speckle3d.core.files import PathLike
 from speckle3d.core.labels import LabelMap, Segment
@@ -158,7 +159,7 @@ class VolumeWriter:
                 )
             write_volume(self._path, self._volume, self._compress)
 
-    def append(self, planes: npt.NDArray[Any]) -> None:
+    def append(self, planes: AnyArray) -> None:
         """Take the next planes along k, shape (k, j, i), of the volume's type.
 
         Raises

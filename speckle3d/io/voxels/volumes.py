@@ -9,10 +9,9 @@ from typing import Any
 
 import nibabel
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform
 
-from speckle3d.core.arrays import ByteArray, FloatArray
+from speckle3d.core.arrays import AnyArray, ByteArray, FloatArray
 from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.files import PathLike
 from speckle3d.core.geometry import transforms_from_matrices
@@ -151,8 +150,8 @@ def read_states(path: PathLike, volume: Volume) -> ByteArray:
 
 
 def _right_handed(
-    voxels: npt.NDArray[Any], world_from_index: FloatArray
-) -> tuple[npt.NDArray[Any], tuple[float, float, float], RigidTransform]:
+    voxels: AnyArray, world_from_index: FloatArray
+) -> tuple[AnyArray, tuple[float, float, float], RigidTransform]:
     """Voxels of a right-handed grid, its spacing and its pose."""
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # what is not finite is refused
         matrix = np.array(world_from_index, dtype=float)
@@ -166,7 +165,7 @@ def _right_handed(
     return voxels, tuple(spacing.tolist()), pose
 
 
-def _labels(voxels: npt.NDArray[Any]) -> npt.NDArray[Any]:
+def _labels(voxels: AnyArray) -> AnyArray:
     """Labels as whole numbers of two bytes at most."""
     if voxels.dtype.name in LABEL_TYPES:
         return voxels
@@ -182,7 +181,7 @@ def _is_nifti(path: Path, start: bytes) -> bool:
     return start[:4] in _SIZES or (start.startswith(b"\x1f\x8b") and path.name.lower().endswith(".nii.gz"))
 
 
-def _read_nifti(path: Path) -> tuple[npt.NDArray[Any], FloatArray, dict[str, str], bool]:
+def _read_nifti(path: Path) -> tuple[AnyArray, FloatArray, dict[str, str], bool]:
     """Read an image of NIfTI-1 or NIfTI-2, of one file or two.
 
     Returns
