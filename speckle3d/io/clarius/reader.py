@@ -110,21 +110,14 @@ def open_package(path: Path, settings: ImportSettings) -> Facts:
         **({} if yml.speed_m_s is None else {"speed_of_sound_m_s": Value(yml.speed_m_s, "", _YML)}),
         **spreading,
     }
-    shift_hz = settings.demodulation_frequency_hz if yml.kind == "IQ" else None
+    shift_hz, start_mm = settings.demodulation_frequency_hz, first_mm or settings.first_sample_depth_mm or 0.0
     if yml.kind == "IQ" and yml.receive is not None:
         shallow_hz, deep_hz, filter_mm = yml.receive
-        start_mm = first_mm or settings.first_sample_depth_mm or 0.0
-        depths_mm = start_mm + spacing_mm * np.arange(yml.size.samples)
-        oscillator_hz = np.interp(depths_mm, [0.0, filter_mm], [shallow_hz, deep_hz])
-        middle_hz = float(np.interp(depths_mm[[0, -1]].mean(), depths_mm, oscillator_hz))
+        depths_mm: FloatArray = start_mm + spacing_mm * np.arange(yml.size.samples)
+        middle_hz, slide = _oscillator(yml.receive, depths_mm, rate_hz)
         values["demodulation_frequency_hz"] = Value(middle_hz, "of the lines' middle", _YML)
         if shift_hz is None and shallow_hz != deep_hz:
-            # The frequency falls along a straight line with depth, as from 11 to 8 MHz; a sweep has one.
-            # Samples are turned as if the oscillator had stayed at that of the line's middle, which takes
-            # its phase to be the integral of its frequency: so it is where a frequency is swept, but it
-            # is not documented. Left as they are, simulated I/Q shifted down by 9 to 6 MHz gave lengths
-            # 10 % off, and turned back 0.001 % from those of RF.
-            turns = np.exp(2j * np.pi * cumulative_trapezoid(oscillator_hz - middle_hz, initial=0) / rate_hz)
+            turns = np.exp(2j * np.pi * slide)
             remarks.append(
                 f"demodulation frequency from its yml: {shallow_hz / 1e6:g} to {deep_hz / 1e6:g} MHz "
                 f"over {filter_mm:g} mm, turned to that of the line's middle"
@@ -134,6 +127,7 @@ def open_package(path: Path, settings: ImportSettings) -> Facts:
     source, shape = partial(open_frames, member, yml, turns), records["samples"].shape[:3]
     frames = FileFrames(member.path, source, shape, SAMPLES[yml.kind][2], narrow)
     centre_hz, band = settings.centre_frequency_hz or yml.transmit_hz, None
+    shift_hz = None if yml.kind == "RF" else shift_hz
     has_spectrum = yml.kind == "RF" or (yml.kind == "IQ" and shift_hz is not None)
     if settings.bandwidth_hz is None and centre_hz and has_spectrum:
         band = band_hz(frames, rate_hz, centre_hz, shift_hz)
@@ -178,6 +172,23 @@ def package_files(path: Path) -> Sequence[Path]:
     """Other files on disk that the sweep's content depends on."""
     files = find_files(path)
     return sorted({member.path for member in (*files.raw.values(), *files.yml.values())} - {path})
+
+
+def _oscillator(
+    receive: tuple[float, float, float], depths_mm: FloatArray, rate_hz: float
+) -> tuple[float, FloatArray]:
+    """Demodulation frequency at the lines' middle, and turns of each sample that lead to it.
+
+    The frequency falls along a straight line with depth, as from 11 to 8 MHz; a sweep has one. Samples are
+    turned as if the oscillator had stayed at that of the line's middle, which takes its phase to be the
+    integral of its frequency: so it is where a frequency is swept, but it is not documented. Left as they
+    are, simulated I/Q shifted down by 9 to 6 MHz gave lengths 10 % off, and turned back 0.001 % from those
+    of RF.
+    """
+    shallow_hz, deep_hz, filter_mm = receive
+    oscillator_hz = np.interp(depths_mm, [0.0, filter_mm], [shallow_hz, deep_hz])
+    middle_hz = float(np.interp(depths_mm[[0, -1]].mean(), depths_mm, oscillator_hz))
+    return middle_hz, cumulative_trapezoid(oscillator_hz - middle_hz, initial=0) / rate_hz
 
 
 def _elements(yml: Description) -> FloatArray:
