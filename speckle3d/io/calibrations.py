@@ -104,18 +104,18 @@ def read_calibration(path: Source) -> Calibration:
     [0.0, 0.0, 0.1]
     """
     with open_family(path, FORMAT) as file:
-        pose, quaternion = None, None
+        translation = None
         if has_member(file, "sensor_from_image"):
             pose = read_transforms(file, "sensor_from_image")
+            rotation, translation = pose.rotation, np.asarray(pose.translation)
         else:
-            where = locate(file, "sensor_from_image_wxyz")
-            wxyz = read_array(file, "sensor_from_image_wxyz", (4,))
-            quaternion = rotations_from_quaternions(wxyz[None], where)[0]
+            name = "sensor_from_image_wxyz"
+            rotation = rotations_from_quaternions(read_array(file, name, (4,))[None], locate(file, name))[0]
         calibration = read_record(
             file,
             Calibration,
-            rotation=quaternion if pose is None else pose.rotation,
-            translation_mm=None if pose is None else np.asarray(pose.translation),
+            rotation=rotation,
+            translation_mm=translation,
             pixel_mm=read_array(file, "pixel_mm", (2,)) if has_member(file, "pixel_mm") else None,
             parameters=_read_parameters(require_group(file, "parameters")),
             frames=_read_frames(require_group(file, "frames")),

@@ -138,13 +138,14 @@ class SequenceHeader:
         ------
         FileError
         """
-        size = self.number_count * self.dtype.itemsize
         with open_regular(self.data) as stream:
-            length = stream.seek(0, 2)
-        if self.encoding == "raw":
-            self.numbers()
-        elif size > _BYTES_OF_ONE[self.encoding] * length:
-            raise FileError(f"{self.path}: ends early: {size} bytes of pixels are not in {length} bytes")
+            length = stream.seek(0, 2) - max(self.start, 0)
+        self._require_numbers(_BYTES_OF_ONE[self.encoding] * length // self.dtype.itemsize)
+
+    def _require_numbers(self, count: int) -> None:
+        if count < self.number_count:
+            whole = max(count, 0) * self.frame_count // self.number_count
+            raise FileError(f"{self.path}: ends early: {whole} of {self.frame_count} frames")
 
     def images(self) -> AnyArray:
         """Map or unpack all images, shape (frame, y, x).
@@ -183,9 +184,7 @@ class SequenceHeader:
             else:
                 content = _unpack(stream.read(), self.encoding)
                 values = np.frombuffer(content, self.dtype, len(content) // item_bytes)
-        if values.size < count:
-            whole = values.size * self.frame_count // count
-            raise FileError(f"{self.path}: ends early: {whole} of {self.frame_count} frames")
+        self._require_numbers(values.size)
         return values[:count].astype(self.dtype.newbyteorder("="), copy=False)
 
 

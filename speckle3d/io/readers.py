@@ -66,6 +66,12 @@ class Reader:
     takes_settings: bool = True
     claims_hdf5: Callable[[h5py.File], bool] | None = None
 
+    def is_of(self, path: Path, start: bytes, file: h5py.File | None) -> bool:
+        """Whether a recording is of this format."""
+        if self.claims_hdf5 is not None:
+            return file is not None and self.claims_hdf5(file)
+        return self.claims is not None and self.claims(path, start)
+
 
 @contextmanager
 def claim(path: PathLike) -> Iterator[tuple[Reader | None, Path | h5py.File]]:
@@ -79,13 +85,7 @@ def claim(path: PathLike) -> Iterator[tuple[Reader | None, Path | h5py.File]]:
     place, start = Path(path), first_bytes(path)
     with open_hdf5(path) if start.startswith(SIGNATURE) else nullcontext() as file:
         with reading(path):
-            claims = (
-                reader
-                for reader in readers()
-                if (reader.claims is not None and reader.claims(place, start))
-                or (reader.claims_hdf5 is not None and file is not None and reader.claims_hdf5(file))
-            )
-            reader = next(claims, None)
+            reader = next((reader for reader in readers() if reader.is_of(place, start, file)), None)
         is_hdf5 = file is not None and (reader is None or reader.claims_hdf5 is not None)
         yield reader, file if is_hdf5 else place
 

@@ -113,7 +113,7 @@ def open_package(path: Path, settings: ImportSettings) -> Facts:
     shift_hz, start_mm = settings.demodulation_frequency_hz, first_mm or settings.first_sample_depth_mm or 0.0
     if yml.kind == "IQ" and yml.receive is not None:
         shallow_hz, deep_hz, filter_mm = yml.receive
-        depths_mm: FloatArray = start_mm + spacing_mm * np.arange(yml.size.samples)
+        depths_mm = start_mm + spacing_mm * np.arange(yml.size.samples, dtype=np.float64)
         middle_hz, slide = _oscillator(yml.receive, depths_mm, rate_hz)
         values["demodulation_frequency_hz"] = Value(middle_hz, "of the lines' middle", _YML)
         if shift_hz is None and shallow_hz != deep_hz:
