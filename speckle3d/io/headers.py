@@ -233,8 +233,8 @@ def _header(path: Path, words: dict[str, Any], is_nrrd: bool, start: int) -> Seq
         sides = [i for i in sides if i != thin]
     if len(sides) != 2 or min(sizes) < 0:
         raise InvalidInputError(
-            f"sizes: expected images on two axes and at most one of frames, got lengths "
-            f"{' '.join(map(str, sizes))} of kinds {' '.join(kinds)}"
+            "sizes: expected images on two axes and at most one of frames, not volumes in a row or segments "
+            f"in layers, got lengths {' '.join(map(str, sizes))} of kinds {' '.join(kinds)}"
         )
     size = tuple(sizes[i] for i in (*sides, frame_axis) if i is not None)
     axes, origin = _placement(words, len(sizes))
@@ -250,7 +250,7 @@ def _header(path: Path, words: dict[str, Any], is_nrrd: bool, start: int) -> Seq
         raise InvalidInputError(f"encoding: expected raw, gzip, bzip2 or text, got {words['encoding']!r}")
     file, byte_skip = words.get("data file", ""), words.get("byte skip", 0)
     data, start = (_data_file(path, file), 0) if file else (path, start)
-    index, step = (None, None) if frame_axis is None else _axis_clock(words, frame_axis, size[2])
+    index, step = (None, None) if frame_axis is None else _axis_clock(words, frame_axis)
     return SequenceHeader(
         str(path), "NrrdImage" if is_nrrd else "MetaImage", fields, frames, size, spacing, sizes, frame_axis,
         is_spatial and len(frames) < size[2],
@@ -281,11 +281,11 @@ def _placement(words: Mapping[str, Any], count: int) -> tuple[FloatArray | None,
     return axes, origin
 
 
-def _axis_clock(words: Mapping[str, Any], axis: int, count: int) -> tuple[FloatArray | None, float | None]:
+def _axis_clock(words: Mapping[str, Any], axis: int) -> tuple[FloatArray | None, float | None]:
     """Times of frames by their axis's index, as 3D Slicer writes it, or the step between them."""
     unit_s = s_per("".join(words.get("units", ())[axis : axis + 1]))
     index, steps = words.get(f"axis {axis} index values", "").split(), words.get("spacings")
-    if words.get(f"axis {axis} index type", "numeric") == "numeric" and len(index) == count:
+    if words.get(f"axis {axis} index type", "numeric") == "numeric" and index:
         return np.array(index, dtype=float) * (unit_s or 1.0), None
     return None, float(steps[axis]) * unit_s if unit_s and steps is not None and steps[axis] > 0 else None
 

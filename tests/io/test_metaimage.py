@@ -202,6 +202,16 @@ def test_axes_and_units_of_nrrd_are_those_it_says(tmp_path, form, arrange):
     np.testing.assert_allclose(sweep.frame_time_s, [0, 0.05, 0.1])
 
 
+def test_frames_beyond_the_index_of_their_axis_have_no_time(tmp_path):
+    axes = "dimension: 3\nsizes: 5 4 5\nspacings: 0.1 0.2 nan\nkinds: domain domain list\n"
+    index = "axis 2 index type:=numeric\naxis 2 index values:=1 1.1 1.2\n\n"
+    path = tmp_path / "a.nrrd"
+    path.write_bytes(f"NRRD0004\ntype: uint8\nencoding: raw\n{axes}{index}".encode() + grey(5).tobytes())
+    recording = open_recording(path, LEVELS)
+    np.testing.assert_allclose(recording.sweep.frame_time_s, [1.0, 1.1, 1.2])
+    assert any("2 of 5 left out" in note for note in recording.notes)
+
+
 @pytest.mark.realdata
 def test_recordings_of_others(realdata):
     liver = ImportSettings(centre_frequency_hz=12e6, bandwidth_hz=(8e6, 16e6), frame_rate_hz=30.0)

@@ -140,8 +140,8 @@ def _children(node: Any) -> Iterator[tuple[str, Any]]:
     """What is inside a node, and what MATLAB adds to its name; nothing for an only struct."""
     if isinstance(node, dict):
         yield from node.items()
-    elif isinstance(node, partial):
-        yield from node()
+    elif isinstance(node, Iterator):
+        yield from node
     elif isinstance(node, np.void):
         yield from ((f".{name}", node[name]) for name in node.dtype.names or ())
     elif isinstance(node, np.ndarray) and (node.dtype.names or node.dtype == object):
@@ -157,11 +157,7 @@ def _children(node: Any) -> Iterator[tuple[str, Any]]:
         if not lists:
             yield from fields.items()
         for k in range(lists[0].size if lists else 0):
-            yield f"({k + 1})", partial(_struct, fields, k)
-
-
-def _struct(fields: Mapping[str, Any], k: int) -> Iterator[tuple[str, Any]]:
-    return ((name, _element(field, k)) for name, field in fields.items())
+            yield f"({k + 1})", ((name, _element(field, k)) for name, field in fields.items())
 
 
 def _element(node: h5py.Dataset, k: int) -> Any:
