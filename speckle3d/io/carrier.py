@@ -1,4 +1,4 @@
-"""What frequency complex samples carry, told by how their phase turns along depth."""
+"""Carrier frequency of complex samples, estimated from the phase between neighbouring samples."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def demodulation_of(frames: Frames, frequency_hz: float, sampling_rate_hz: float
 
 
 def carrier_share(frames: Frames, frequency_hz: float, sampling_rate_hz: float) -> float | None:
-    """Mean turn of the phase from sample to sample, over that of a carrier of `frequency_hz`.
+    """Mean phase step between samples, divided by that of a carrier of `frequency_hz`.
 
     The phase between neighbouring samples is the mean turn of what they carry, the first moment of the
     spectrum [1]_: nothing, or 2 pi f / fs. The first, the middle and the last frame are looked at.

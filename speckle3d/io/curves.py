@@ -18,7 +18,7 @@ FORMAT = "speckle3d.curves"
 
 
 def curves_beside(sweep_file: Path) -> Path:
-    """Where the curves of a sweep's probe lie that nobody names: curves.h5 in its folder.
+    """Path of the default curves of a sweep: curves.h5 in its folder.
 
     Raises
     ------
@@ -35,7 +35,7 @@ def curves_beside(sweep_file: Path) -> Path:
 
 
 def trust_words(path: Path, curves: DecorrelationCurves, same_probe: bool) -> str:
-    """Say which curves were taken that nobody named, and how far to trust them."""
+    """Message that names the default curves and how far to trust them."""
     percent = 196.0 * curves.mismatch(same_probe)
     return f"curves: {path}, by {curves.origin}; lengths by them are right to {percent:.0f} % (95 %)"
 

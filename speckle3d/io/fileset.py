@@ -40,7 +40,7 @@ class FileSet:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """All that is written."""
+        """Names of all files of the set."""
         return (*self.others, self.primary)
 
     @contextmanager
@@ -93,7 +93,7 @@ class FileSet:
 
 @contextmanager
 def _lock(folder: Path) -> Iterator[None]:
-    """Make an empty folder of this process, where there are locks; they end however the process does.
+    """Make an empty folder and lock it; the lock ends with the process, however that ends.
 
     Raises
     ------

@@ -80,7 +80,7 @@ def atomic_path(path: PathLike) -> Iterator[Path]:
 
 
 def require_target(path: PathLike) -> Path:
-    """Path of a file that may be written, resolved; to be asked before long work, too.
+    """Resolve a path and require that a file may be written there; call it before long work, too.
 
     Raises
     ------
@@ -284,7 +284,7 @@ def require_shape(node: h5py.Dataset, shape: tuple[int | str, ...], where: str) 
 
 
 def read_transforms(group: h5py.Group, name: str, count: int | None = None) -> RigidTransform:
-    """Read a data set of so many rigid 4x4 matrices, or of a single one."""
+    """Read a data set of `count` rigid 4x4 matrices, or of a single one."""
     shape = (4, 4) if count is None else (count, 4, 4)
     matrices = read_array(group, name, shape).reshape(-1, 4, 4)
     poses = transforms_from_matrices(matrices, locate(group, name))

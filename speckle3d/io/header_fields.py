@@ -1,4 +1,4 @@
-"""Fields of MetaImage and NRRD headers, both told in NRRD's words, and what their words mean.
+"""Fields of MetaImage and NRRD headers, both by NRRD's names, and the units and types they name.
 
 pynrrd parses NRRD's headers; a MetaImage's fields are put into NRRD's words.
 
@@ -75,7 +75,7 @@ def nrrd_fields(stream: BinaryIO) -> dict[str, Any]:
 
 
 def meta_fields(stream: BinaryIO) -> dict[str, Any]:
-    """Fields of a MetaImage, and what they say in NRRD's words; the stream is left behind them."""
+    """Fields of a MetaImage by its own and by NRRD's names; the stream is left behind them."""
     fields: dict[str, Any] = {}
     for line in _lines(stream):
         name, _, value = line.partition("=")

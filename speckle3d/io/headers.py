@@ -119,11 +119,11 @@ class SequenceHeader:
 
     @property
     def number_count(self) -> int:
-        """Numbers of all pixels."""
+        """How many numbers all pixels have."""
         return math.prod(self.size) * self.channels
 
     def axis_times_s(self, count: int) -> FloatArray | None:
-        """Times of so many frames by their axis, NaN where it has none; None where it is no axis of time."""
+        """Times of `count` frames by their axis, NaN beyond its index; None if it is not an axis of time."""
         if self.axis_step_s is not None:
             return self.axis_step_s * np.arange(count, dtype=np.float64)
         if self.axis_index_s is None:
@@ -132,7 +132,7 @@ class SequenceHeader:
         return times
 
     def require_bytes(self) -> None:
-        """Refuse a file too short for its images, before anything is made in their number.
+        """Raise if the file is too short for its images, before anything of their number is allocated.
 
         Raises
         ------
@@ -189,7 +189,7 @@ class SequenceHeader:
 
 
 def _unpack(content: bytes, encoding: str) -> bytes:
-    """Unpack all; members of gzip that follow one another are one stream."""
+    """Decompress the content; several gzip members are one stream."""
     plain = bytearray()
     while content:
         stream = bz2.BZ2Decompressor() if encoding == "bzip2" else DEFLATE.decompressobj(_EITHER)
@@ -218,7 +218,7 @@ def read_header(path: PathLike) -> SequenceHeader:
 
 
 def _header(path: Path, words: dict[str, Any], is_nrrd: bool, start: int) -> SequenceHeader:
-    """Tell axes of the image, of frames and of colours by their kinds; without, as PLUS orders them."""
+    """Assign axes to image, frames and colours by their kinds; without kinds, as PLUS orders them."""
     sizes = tuple(map(int, words["sizes"]))
     kinds = [kind.lower() for kind in words.get("kinds", ())]
     is_spatial = len(kinds) == 3 == len(sizes) and {*kinds} <= {"domain", "space"}
@@ -282,7 +282,7 @@ def _placement(words: Mapping[str, Any], count: int) -> tuple[FloatArray | None,
 
 
 def _axis_clock(words: Mapping[str, Any], axis: int) -> tuple[FloatArray | None, float | None]:
-    """Times of frames by their axis's index, as 3D Slicer writes it, or the step between them."""
+    """Times of frames by the index of their axis, as 3D Slicer writes it, or the step between them."""
     unit_s = s_per("".join(words.get("units", ())[axis : axis + 1]))
     index, steps = words.get(f"axis {axis} index values", "").split(), words.get("spacings")
     if words.get(f"axis {axis} index type", "numeric") == "numeric" and index:

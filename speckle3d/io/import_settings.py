@@ -1,4 +1,4 @@
-"""What a recording's own files do not say, and is given instead: by options, or by a TOML file beside them.
+"""Settings for what a recording's own files do not say: from options, or a TOML file beside them.
 
 The numbers for ``scan.mha`` are looked for in ``scan.mha.toml`` and else in ``import.toml``, which serves
 every recording of its folder; those for a folder ``scan`` in ``scan.toml``, ``scan/import.toml``, or

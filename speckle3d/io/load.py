@@ -1,4 +1,4 @@
-"""One door to every recording that holds a sweep: the reader is chosen by what it holds, not by its name."""
+"""Open any recording that holds a sweep; the reader is chosen by content, not by name."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def recording_of(reader: Reader, source: Any, settings: ImportSettings, path: Pa
 
 
 def _read(reader: Reader, source: Any, settings: ImportSettings, path: Path) -> Sweep | Recording:
-    """What a reader makes; where it cannot, the facts that it told before, and why."""
+    """Run a reader; if it fails, keep the facts it told before, and the error."""
     facts = reader.read(source, settings)
     if not isinstance(facts, Generator):
         return facts

@@ -128,12 +128,12 @@ class _Sequence:
 
     @cached_property
     def layout(self) -> Layout:
-        """Of the images."""
+        """Layout of the images."""
         return Layout.of(self.header, self.device.text("PortUsImageOrientation") or None)
 
     @cached_property
     def poses(self) -> Poses | None:
-        """Of the tracked tool."""
+        """Poses of the tracked tool."""
         settings = self.settings
         names = settings.tracker_transform, settings.reference_transform, self.device.names
         return tracked_poses(self.header, *names)
@@ -160,7 +160,7 @@ class _Sequence:
         return None if transform is None else Value(transform, f"{names.image}To{tool}", _DEVICE)
 
     def require_images(self) -> None:
-        """Refuse what are no images of echoes, or a file too short for them."""
+        """Raise unless these are ultrasound images and the file is long enough for them."""
         header, path = self.header, self.header.path
         if 0 in header.size or max(header.size[:2]) == 1:
             use = ": the recording of a tracker, for --poses" if names_of(header) else ""
@@ -175,7 +175,7 @@ class _Sequence:
         header.require_bytes()
 
     def recording(self) -> Recording:
-        """Images with all that is said of them."""
+        """The recording, with all that header, settings and device set say."""
         header, settings, own = self.header, self.settings, self.own_values
         return Recording(
             Path(header.path),
@@ -243,7 +243,7 @@ class _Sequence:
 
     @cached_property
     def values(self) -> dict[str, Value]:
-        """What a sweep of this kind needs, and where file or device set have it."""
+        """Numbers that a sweep of this kind needs, with their sources."""
         header, device, layout = self.header, self.device, self.layout
         # The sampling rate of RF is known better than by a calibration.
         sizes = [Value(self.spacing_mm, "ElementSpacing" if self.spacing_mm else "")]

@@ -74,7 +74,7 @@ class Value:
 
     @property
     def is_assumption(self) -> bool:
-        """Whether nobody says it."""
+        """Whether the number is assumed."""
         return self.source.startswith(_ASSUMPTION)
 
 
@@ -318,7 +318,7 @@ Facts: TypeAlias = Generator[Row, None, Recording]
 
 
 def rate_by_spacing(spacing: Value, settings: ImportSettings, values: Mapping[str, Value]) -> Value:
-    """Sampling rate of samples so far apart, at the speed of sound that is given, said or assumed."""
+    """Sampling rate by the spacing of samples and the speed of sound that is given, said or assumed."""
     file_speed = values.get("speed_of_sound_m_s", Value()).value
     speed = float(settings.speed_of_sound_m_s or file_speed or SPEED_OF_SOUND_M_S)
     words = f"of samples {spacing.value:.6g} mm apart, {spacing.source}, at {speed:g} m/s"
@@ -326,7 +326,7 @@ def rate_by_spacing(spacing: Value, settings: ImportSettings, values: Mapping[st
 
 
 def grid_values(x_mm: FloatArray, z_mm: FloatArray, where: str, source: str) -> dict[str, Value]:
-    """What lateral positions and depths of samples say.
+    """Pitch, spacing and first depth by positions of lines and depths of samples.
 
     Raises
     ------
@@ -346,7 +346,7 @@ def differs(a: Any, b: Any) -> bool:
 
 
 def rate_of(time_s: FloatArray) -> float | None:
-    """Mean frame rate of times, Hz; None of fewer than two, or where they do not rise."""
+    """Mean frame rate of times, Hz; None for fewer than two, or if they do not rise."""
     span = float(time_s[-1] - time_s[0]) if time_s.size > 1 else 0.0
     return (time_s.size - 1) / span if span > 0 else None
 

@@ -51,7 +51,7 @@ def reserve(file: h5py.h5f.FileID, more_bytes: int = 0) -> None:
 
 
 def trim(path: Path) -> None:
-    """Give back what a closed file did not need: HDF5 cuts off what lies behind its end."""
+    """Free reserved disk space of a closed file: HDF5 cuts off what lies behind its end."""
     with h5py.File(path, "r+", locking=False):  # somebody may be reading it
         pass
 
@@ -111,7 +111,7 @@ def put(group: h5py.Group, name: str, value: Any) -> None:
 
 
 def _unicode(text: str) -> str:
-    """A text without the halves of letters by which Python writes paths that are no Unicode."""
+    """Escape lone surrogates, which Python writes into paths that are not Unicode."""
     return text.encode("utf-8", "backslashreplace").decode()
 
 

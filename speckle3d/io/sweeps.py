@@ -129,7 +129,7 @@ class _Clock:
         return ("row" if self.is_growing else self.time_s.size, *row)
 
     def rows(self, name: str, *row: int, dtype: npt.DTypeLike = np.float64) -> AnyArray:
-        """Read the rows that have a time of a data set."""
+        """Read the rows of a data set that have a time."""
         return read_array(self.group, name, self.shape(*row), dtype)[: self.time_s.size]
 
 

@@ -46,7 +46,7 @@ def numbers(text: str, count: int | None, where: str) -> tuple[float, ...]:
 
 
 def number_text(values: npt.ArrayLike, between: str = " ") -> str:
-    """Numbers written so that reading gives them back exactly; none is a negative zero."""
+    """Numbers as text that is read back exactly, without negative zeros."""
     plain = (np.ravel(values).astype(float) + 0.0).tolist()
     return between.join(repr(value).removesuffix(".0") for value in plain)
 

@@ -92,14 +92,14 @@ def read_tum(path: PathLike, length_unit: LengthUnit | None = None) -> TimedPose
 
 
 def is_tum(path: PathLike) -> bool:
-    """Whether a file's first line that is no comment is eight numbers."""
+    """Whether the first line that is not a comment holds eight numbers."""
     with suppress(FileError, InvalidInputError, StopIteration):
         return all(np.isfinite(next(_eight(text) for _, text in text_lines(path) if text[0] != "#")))
     return False
 
 
 def _eight(text: str) -> list[float]:
-    """Numbers of a line; NaN where they are no eight."""
+    """Numbers of a line; NaN unless there are eight."""
     try:
         values = [float(word) for word in text.split()]
     except ValueError:

@@ -71,7 +71,7 @@ class Member:
             return stream.read(self.size if limit is None else min(self.size, limit))
 
     def text(self) -> str:
-        """All of it as text in UTF-8."""
+        """Content as text in UTF-8."""
         with reading(self.where):
             return self.read().decode("utf-8-sig")
 

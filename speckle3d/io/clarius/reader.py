@@ -204,7 +204,7 @@ def _elements(yml: Description) -> FloatArray:
 
 
 def _pitch(yml: Description, per_line: float, settings: ImportSettings) -> Value:
-    """Distance between lines at the array, mm: of the elements' as given, by the yml, or a table's."""
+    """Distance between lines at the array, mm, by the element pitch: the option's, the yml's, the table's."""
     model = _model(settings.probe or yml.probe.model)
     pitches = {
         "as given": settings.element_pitch_mm,
@@ -221,7 +221,7 @@ def _pitch(yml: Description, per_line: float, settings: ImportSettings) -> Value
 def _spreading(
     yml: Description, ends: FloatArray, per_line: float, pitch: Value, probe: str
 ) -> dict[str, Value]:
-    """Where the lines of a curved array lie; of a curved model without its radius, that it is lacking."""
+    """Radius and line angles of a curved array, without values where the radius is not known."""
     radius_mm, elements = yml.probe.radius, yml.probe.elements
     if not radius_mm and not _model(probe).startswith(CONVEX):
         return {}

@@ -52,7 +52,7 @@ def yml_fields(text: str, where: str) -> dict[str, Any]:
 
 
 def _quantity(text: object) -> float | None:
-    """Number in Hz, mm, m/s or degrees of text as ``60 MHz``; None of no text."""
+    """Parse text as ``60 MHz`` into Hz, mm, m/s or degrees; None if it is empty."""
     if text in (None, "", "~"):
         return None
     parts = _NUMBER.fullmatch(str(text))

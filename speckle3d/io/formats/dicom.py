@@ -218,7 +218,7 @@ def _clock(header: Any, count: int) -> tuple[FloatArray | None, Value, tuple[str
 
 
 def _numbers(item: Any, *names: str) -> list[float]:
-    """Finite numbers of elements, or of the one element named, as many as it has."""
+    """Read the finite numbers of one or several elements."""
     numbers = list[float]()
     for name in names:
         try:

@@ -52,7 +52,7 @@ def single(group: h5py.Group, name: str) -> float | None:
 
 
 def values_of(group: h5py.Group, places: Mapping[str, str]) -> dict[str, Value]:
-    """Numbers of a file by the names of their settings, of those that are there and not 0."""
+    """Read the numbers of a file that are there and not 0, by the names of their settings."""
     numbers = {name: single(group, place) for name, place in places.items()}
     return {
         name: Value(number, f"in {group.name.strip('/')}/{places[name]}".replace("in /", "in "))
@@ -96,7 +96,7 @@ def fan_values(
 
 
 def text_of(value: Any) -> str:
-    """Text of what HDF5 holds, of the first if there are several; empty of None."""
+    """Convert a value of HDF5, or the first of several, to text; empty for None."""
     first = next(iter(np.ravel("" if value is None else value)), "")
     return printable(first.decode("utf-8", "replace") if isinstance(first, bytes) else str(first)).strip("\0")
 

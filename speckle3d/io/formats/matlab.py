@@ -105,7 +105,7 @@ def _variables(path: Path) -> dict[str, Any]:
 
 
 def _array(variables: Any, name: str) -> Any:
-    """The array of a name as MATLAB's; the only struct may be counted or not.
+    """Find the array of a MATLAB name; the index of a single struct may be left out.
 
     Raises
     ------
@@ -121,7 +121,7 @@ def _array(variables: Any, name: str) -> Any:
 
 
 def _arrays(node: Any, target: str = "", name: str = "") -> Iterator[tuple[str, Any]]:
-    """Names and arrays of numbers, of the first elements of lists; or those along the way to a name.
+    """Yield numeric arrays with their names: those on the way to `target`, else the first of each list.
 
     All have their axes in reverse.
     """
@@ -137,7 +137,7 @@ def _arrays(node: Any, target: str = "", name: str = "") -> Iterator[tuple[str, 
 
 
 def _children(node: Any) -> Iterator[tuple[str, Any]]:
-    """What is inside a node, and what MATLAB adds to its name; nothing for an only struct."""
+    """Yield the children of a node with what MATLAB adds to its name, nothing for a single struct."""
     if isinstance(node, dict):
         yield from node.items()
     elif isinstance(node, Iterator):

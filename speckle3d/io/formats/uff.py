@@ -108,7 +108,7 @@ def open_uff(file: h5py.File, settings: ImportSettings) -> Facts:
 
 
 def _kind_of(frames: FileFrames) -> str:
-    """What real numbers are, by their signs: echoes swing to both sides, amplitudes and decibels do not."""
+    """Classify real samples by sign: echoes have both, amplitudes and decibels one."""
     frame = frames[len(frames) // 2]
     if frame.min() < 0 < frame.max():
         return "RF"

@@ -72,7 +72,7 @@ def is_zea(file: h5py.File) -> bool:
 
 
 def _homes(file: h5py.File) -> list[str]:
-    """What stands before ``data``: nothing at the root, or tracks with a slash at the end."""
+    """Prefixes of the ``data`` groups: empty at the root, ``tracks/NAME/`` of tracks."""
     tracks = find_member(file, "tracks")
     names = sorted(map(str, tracks)) if isinstance(tracks, h5py.Group) else []
     homes = [""] if has_member(file, "data") else [f"tracks/{name}/" for name in names]
@@ -80,7 +80,7 @@ def _homes(file: h5py.File) -> list[str]:
 
 
 def _arrays(file: h5py.File, kinds: Sequence[str]) -> list[tuple[str, str, str]]:
-    """Names of arrays of some kinds, their kinds, and what stands before their ``data``."""
+    """Names of arrays of some kinds, their kinds, and the prefixes of their ``data`` groups."""
     names = ((f"{home}data/{kind}", kind, home) for kind in kinds for home in _homes(file))
     return [row for row in names if has_member(file, row[0])]
 

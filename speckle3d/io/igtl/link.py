@@ -33,7 +33,7 @@ _PIECE_BYTES = 2**20
 
 @dataclass
 class LinkState:
-    """What has happened on the connections of an end so far.
+    """Counts and last failure of the connections of an end.
 
     Attributes
     ----------
@@ -63,7 +63,7 @@ class LinkState:
 
 
 class End:
-    """An end of connections: messages received and not yet taken, and counts of what has come.
+    """One end of connections: a queue of received messages, and counts.
 
     A message whose body makes no sense is refused alone. Where there is no header of a message, or the peer
     stalls within one, the connection is given up.
@@ -91,7 +91,7 @@ class End:
             self._thread.join()
 
     def wait_connected(self, timeout_s: float) -> bool:
-        """Wait for a peer; whether there is one."""
+        """Wait for a peer; False if none came in time."""
         return _until(lambda: self.state.peers > 0, timeout_s)
 
     def receive(self, timeout_s: float) -> list[Received]:
@@ -172,7 +172,7 @@ class End:
 
 
 def _until(is_so: Callable[[], bool], timeout_s: float) -> bool:
-    """Wait for what another thread does; whether it was in time."""
+    """Wait until a condition holds; False if it did not in time."""
     end_s = time.monotonic() + timeout_s
     while not is_so():
         if time.monotonic() > end_s:
@@ -247,7 +247,7 @@ class Server(End):
         self._socket.close()
 
     def drain(self, timeout_s: float) -> bool:
-        """Wait until all clients were sent everything; whether they were in time."""
+        """Wait until everything is sent to all clients; False if it was not in time."""
 
         async def drained() -> None:
             await asyncio.gather(*(writer.drain() for writer in self._writers))

@@ -85,7 +85,7 @@ class TransformReceived:
 
 @dataclass(frozen=True)
 class Other:
-    """A message that nothing here has a use for."""
+    """A message of a type that is not used here."""
 
     device: str
     time_s: float
@@ -112,7 +112,7 @@ def body_bytes(start: bytes) -> int:
 
 
 def decode(start: bytes, body: bytes) -> Received:
-    """Make a message of its first 58 bytes and its body; a check sum of 0 is one that was not made.
+    """Decode a message from its first 58 bytes and its body; a check sum of 0 is not checked.
 
     Raises
     ------

@@ -74,7 +74,7 @@ def played(
 
 
 def clock_shift_s(sweep: Sweep) -> float:
-    """Whole seconds by which a sweep's times are to be put later: messages hold none below zero."""
+    """Whole seconds to add to a sweep's times: messages hold no negative times."""
     sensors = (sweep.tracker, sweep.orientation)
     clocks = sweep.frame_time_s, *(sensor.readings.time_s for sensor in sensors if sensor is not None)
     earliest_s = min(float(times[0]) for times in clocks)

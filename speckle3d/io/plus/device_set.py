@@ -152,7 +152,7 @@ class DeviceSet:
 
     @cached_property
     def names(self) -> Names:
-        """Of the coordinate frames."""
+        """Names of the coordinate frames."""
         usual = Names()
         return Names(
             self.text("ImageCoordinateFrame", usual.image),
@@ -174,7 +174,7 @@ class DeviceSet:
 
     @property
     def geometry(self) -> str:
-        """Of the transducer, as LINEAR; empty where the set does not say."""
+        """Geometry of the transducer, as LINEAR; empty where the set does not say."""
         return self.text("TransducerGeometry").upper()
 
     @property
@@ -247,7 +247,7 @@ def read_device_set(path: PathLike) -> DeviceSet:
 
 
 def _open(path: Path, _: ImportSettings) -> Facts:
-    """Tell what a document is; there is no sweep in it."""
+    """Describe a document; it holds no sweep."""
     device = DeviceSet(str(path), read_xml(path))
     root = device.root
     if root.tag not in _DOCUMENTS:

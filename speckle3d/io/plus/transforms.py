@@ -225,7 +225,7 @@ def _back(name: str) -> str:
 
 
 def _usual_pose(transforms: Sequence[str], names: Names) -> str | None:
-    """The pose of the probe, of what the image is on, or of the image, in the tracker or the only world."""
+    """Choose the pose of the probe, of what the image is on, or of the image, in the tracker or only world."""
 
     def partners(tool: str) -> set[str]:
         frames = {b if a == tool else a for a, b in map(ends, transforms) if tool in (a, b)}
@@ -242,7 +242,7 @@ def _usual_pose(transforms: Sequence[str], names: Names) -> str | None:
 
 
 def _column(header: SequenceHeader, name: str) -> tuple[FloatArray, list[str]]:
-    """One transform by frame, or the inverse of what is held; the identity where not valid, and why."""
+    """Read one transform of every frame, either way round; the identity where it is not valid, and why."""
     frames = header.frames
     is_back = not any(f"{name}Transform" in frame for frame in frames)
     key = f"{_back(name) if is_back else name}Transform"
@@ -262,7 +262,7 @@ def _column(header: SequenceHeader, name: str) -> tuple[FloatArray, list[str]]:
 def _image_poses(
     matrices: FloatArray, faults: Sequence[str], where: str
 ) -> tuple[FloatArray, FloatArray | None]:
-    """Split transforms of pixels to mm into the image's poses and its pixels, those of the middle size.
+    """Split transforms of pixels to mm into poses of the image and one matrix of pixels, of median size.
 
     Where a frame's pixels are others, its pose is not rigid.
     """

@@ -20,7 +20,7 @@ _UNNAMED_COLOUR = "0.5 0.5 0.5"
 
 
 def segment_fields(segments: Iterable[Segment], shape: Sequence[int]) -> dict[str, str]:
-    """Tell of a label map and its segments, all in one layer of the whole grid."""
+    """Header fields of a label map and its segments, all in one layer of the whole grid."""
     extent = " ".join(f"0 {length - 1}" for length in shape)
     fields = {
         "Segmentation_ContainedRepresentationNames": f"{_REPRESENTATION}|",

@@ -176,7 +176,7 @@ class VolumeWriter:
 
 
 def _write_nifti(path: Path, volume: Volume, fields: Mapping[str, str], is_labels: bool) -> None:
-    """Write an image of NIfTI-1, or of NIfTI-2 where it is longer than that counts."""
+    """Write NIfTI-1, or NIfTI-2 where an axis is too long for NIfTI-1."""
     kind: Any = nibabel.Nifti2Image if max(volume.shape) >= _LONGEST else nibabel.Nifti1Image
     image = kind(volume.voxels, RAS_FROM_LPS @ volume.world_from_index)
     image.set_qform(image.affine, 1)
