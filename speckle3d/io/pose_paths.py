@@ -89,7 +89,7 @@ def usable(noun: str, time_s: FloatArray, faults: Sequence[str] | None = None) -
 def timed_poses(
     time_s: FloatArray, matrices: FloatArray, faults: Sequence[str] | None = None
 ) -> tuple[TimedPoses | None, list[str]]:
-    """Usable poses among matrices, shape (n, 4, 4), in mm, None if there are none, and a line of the others."""
+    """Usable poses among matrices, shape (n, 4, 4), in mm, or None, and a line of the others."""
     exact, deviations = rigid(matrices)
     reasons = [fault or deviation for fault, deviation in zip(faults or deviations, deviations, strict=True)]
     rows, notes = usable("poses", time_s, reasons)

@@ -225,7 +225,7 @@ def _back(name: str) -> str:
 
 
 def _usual_pose(transforms: Sequence[str], names: Names) -> str | None:
-    """Choose the pose of the probe, of what the image is on, or of the image, in the tracker or only world."""
+    """Choose the pose of the probe, of what the image is on, or of the image, in the usual or only world."""
 
     def partners(tool: str) -> set[str]:
         frames = {b if a == tool else a for a, b in map(ends, transforms) if tool in (a, b)}
