@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.geometry import transforms_from_matrices
+from speckle3d.io.hdf5 import make_folder
 from speckle3d.io.igtl.messages import TransformReceived
 from speckle3d.io.sweep_writer import GrowingSweep
 from speckle3d.live.frames import ImageLayout
@@ -42,7 +43,7 @@ class Recording:
         self._progress, self._first_s, self._last_s = progress, first_s, float("-inf")
         self._began_s = self._came_s = time.monotonic()
         self._timeless = False
-        path.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(path.parent)
         self._sweep = GrowingSweep(
             path, example.grid, example.signal, example.frames.dtype, probe=example.probe
         )

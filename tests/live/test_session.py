@@ -149,3 +149,10 @@ def test_images_that_say_too_little_leave_no_folder(example, tmp_path):
     with pytest.raises(MissingSettingsError, match="--sampling-rate-hz"):
         run([[image(frames[0], 0.0)]], lambda _: False, curves, tmp_path, importing=ImportSettings())
     assert not (tmp_path / "out").exists()
+
+
+def test_a_file_in_the_folders_place_is_an_error_of_files(example, tmp_path):
+    frames, curves = example
+    (tmp_path / "out").write_text("")
+    with pytest.raises(s3.Speckle3DError):
+        run([[image(frames[0], 0.0)]], lambda _: False, curves, tmp_path)
