@@ -11,6 +11,7 @@ import numpy as np
 import panel as pn
 import param
 from panel.viewable import Viewable
+from scipy.spatial.transform import RigidTransform
 
 from speckle3d.app.look import batch_changes
 from speckle3d.app.reconstruction.commands import code, measure_command, reslice_command
@@ -119,13 +120,12 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
         self._page = page
         grid = self._grid = page.reconstruction.grid
         modes = {label_of(mode): mode for mode in page.modes}
-        self.param.mode.objects, self.param.overlay.objects = modes, {"(nothing)": "", **modes}
+        self.param.mode.objects, self.param.overlay.objects = modes, {"(nothing)": None, **modes}
         self.param.frame.bounds = (0, len(page.reconstruction.frame_time_s) - 1)
         middle_mm = grid.extent_mm.mean(axis=0).round(2).tolist()
         self.param.lateral_mm.bounds, self.param.depth_mm.bounds = map(tuple, grid.extent_mm.T.tolist())
         super().__init__(
             mode=page.mode,
-            overlay="",
             frame=self.param.frame.bounds[1] // 2,
             lateral_mm=middle_mm[0],
             depth_mm=middle_mm[1],
@@ -193,13 +193,10 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
         )
         self._space.object.add_scatter3d(mode="lines", line={"color": "#ff4fc3", "width": 6}, name="cuts")
         trust = page.reconstruction.trust
-        curves = sweep_curves(
-            page.reconstruction.poses,
-            self._grid.centre_mm,
-            page.reference,
-            None if trust is None else trust.covariance,
+        covariance = None if trust is None else trust.covariance
+        drift = plot_curves(
+            sweep_curves(page.reconstruction.poses, self._grid.centre_mm, page.reference, covariance)
         )
-        drift = plot_curves(curves)
         drift.update_layout(
             height=None, font_size=9, showlegend=False, updatemenus=[], margin={"t": 10, "r": 10}
         )
@@ -213,26 +210,28 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
 
     def _draw_planes(self) -> None:
         """Draw where the cuts are in space."""
-        first = self._page.posed(*self._pair).poses[self.mode][0].inv()
-        hulls = [first.apply(plot.plane.hull_mm) for plot in self._plots.values() if plot.plane is not None]
+        hulls = [plot.plane.hull_mm for plot in self._plots.values() if plot.plane is not None]
         # Of the first pixels of all columns and the last ones, the first and the last column's.
         corners = [
             np.vstack([hull[[0, len(hull) // 2 - 1, -1, len(hull) // 2, 0]], np.full(3, np.nan)])
             for hull in hulls
         ]
-        y, z, x = np.concatenate(corners).T
+        y, z, x = self._poses[0].inv().apply(np.concatenate(corners)).T
         self._space.object.data[-1].update(x=x, y=y, z=z)
         self._space.param.trigger("object")
 
     @property
     def _cross_mm(self) -> FloatArray:
         """Where the cross hair is in the world of the mode, shape (3,)."""
-        pose = self._page.posed(*self._pair).poses[self.mode][self.frame]
-        return np.asarray(pose.apply([self.lateral_mm, self.depth_mm, 0.0]))
+        return np.asarray(self._poses[self.frame].apply([self.lateral_mm, self.depth_mm, 0.0]))
 
     @property
     def _pair(self) -> tuple[str, str | None]:
-        return self.mode, self.overlay if self.overlay not in ("", self.mode) else None
+        return self.mode, None if self.overlay == self.mode else self.overlay
+
+    @property
+    def _poses(self) -> RigidTransform:
+        return self._page.posed(*self._pair).poses[self.mode]
 
     def _slider(self, name: str) -> dict[str, Any]:
         """Name and value of the slider that moves a cut."""
@@ -260,7 +259,7 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
 
     def _go(self, point_mm: FloatArray) -> None:
         """Put the cross hair where the nearest frame has a point; beside the images, leave it."""
-        inside = self._page.posed(*self._pair).poses[self.mode].inv().apply(point_mm)
+        inside = self._poses.inv().apply(point_mm)
         away = np.abs(inside[:, 2])
         away[self.frame] -= 1e-6  # of frames that lie as near, the one that is shown
         frame = int(np.argmin(away))
