@@ -120,12 +120,13 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
         self._page = page
         grid = self._grid = page.reconstruction.grid
         modes = {label_of(mode): mode for mode in page.modes}
-        self.param.mode.objects, self.param.overlay.objects = modes, {"(nothing)": None, **modes}
+        self.param.mode.objects, self.param.overlay.objects = modes, {"(nothing)": "", **modes}
         self.param.frame.bounds = (0, len(page.reconstruction.frame_time_s) - 1)
         middle_mm = grid.extent_mm.mean(axis=0).round(2).tolist()
         self.param.lateral_mm.bounds, self.param.depth_mm.bounds = map(tuple, grid.extent_mm.T.tolist())
         super().__init__(
             mode=page.mode,
+            overlay="",
             frame=self.param.frame.bounds[1] // 2,
             lateral_mm=middle_mm[0],
             depth_mm=middle_mm[1],
@@ -227,7 +228,7 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
 
     @property
     def _pair(self) -> tuple[str, str | None]:
-        return self.mode, None if self.overlay == self.mode else self.overlay
+        return self.mode, self.overlay if self.overlay not in ("", self.mode) else None
 
     @property
     def _poses(self) -> RigidTransform:
