@@ -11,7 +11,7 @@ WIDTH_PX = 285
 _SLIDERS: dict[str, tuple[str, float, float, float]] = {
     "columns": ("n, columns", 5, 240, 1),
     "smoothing_mm": ("σ, smoothing / mm", 0.05, 3.05, 0.05),
-    "threshold": ("T / levels per mm, 0: automatic", 0.0, 300.0, 1.0),
+    "threshold": ("T / levels per mm, 0: auto", 0.0, 300.0, 1.0),
     "tolerance_mm": ("d, tolerance / mm", 0.05, 3.05, 0.05),
     "consensus": ("p, share that agrees", 0.05, 1.0, 0.01),
 }
