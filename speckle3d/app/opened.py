@@ -93,7 +93,8 @@ def open_pages(path: Path, record: Path | None = None, **of_file: Any) -> Iterat
         from speckle3d.app.sensor.page import SensorPage
         from speckle3d.app.sensor.watch import SensorWatch
 
-        with SensorWatch(str(path), record) as watch:
+        watch = SensorWatch(str(path), record)
+        with watch.recording():
             yield [SensorPage(watch)]
         return
     if record is not None:

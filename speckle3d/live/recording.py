@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import time
-from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import numpy.typing as npt
 
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.geometry import transforms_from_matrices
-from speckle3d.io.hdf5 import make_folder
 from speckle3d.io.igtl.messages import TransformReceived
 from speckle3d.io.sweep_writer import GrowingSweep
-from speckle3d.live.frames import ImageLayout
 from speckle3d.live.progress import Progress
 
 RESTARTED_S = 1.0
@@ -22,40 +18,25 @@ RESTARTED_S = 1.0
 
 
 class Recording:
-    """A sweep file that grows with every image and transform received.
+    """Images and transforms written into a growing sweep file as they are received.
 
     Times are the sender's, counted from the first frame's. If its clock begins anew, they go on by what has
     passed here; so they do if messages have no time, which OpenIGTLink writes as zero.
 
     Parameters
     ----------
-    path : path
-        A new file; its folder is made.
-    layout : ImageLayout
+    sweep : GrowingSweep
     first_s : float
         The first frame's time on the sender's clock.
     progress : Progress
         Told how many frames are written, what is refused, and how often the sender's clock begins anew.
     """
 
-    def __init__(self, path: Path, layout: ImageLayout, first_s: float, progress: Progress) -> None:
-        example = layout.example
-        self._progress, self._first_s, self._last_s = progress, first_s, float("-inf")
+    def __init__(self, sweep: GrowingSweep, first_s: float, progress: Progress) -> None:
+        self._sweep, self._progress = sweep, progress
+        self._first_s, self._last_s = first_s, float("-inf")
         self._began_s = self._came_s = time.monotonic()
         self._timeless = False
-        make_folder(path.parent)
-        self._sweep = GrowingSweep(
-            path, example.grid, example.signal, example.frames.dtype, probe=example.probe
-        )
-
-    def __enter__(self) -> Self:
-        self._sweep.__enter__()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._sweep.__exit__(kind, error, trace)
 
     def keep_frame(self, frame: npt.NDArray[Any], sent_s: float) -> float | None:
         """Write a frame; its time in the sweep, or None if it is not later than the last frame's."""

@@ -11,7 +11,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -28,8 +28,10 @@ from speckle3d.core.errors import InvalidInputError, Speckle3DError
 from speckle3d.core.grid import ImageGrid
 from speckle3d.core.threads import on_one_thread
 from speckle3d.imaging.voxels.volume import CompoundedVolume
+from speckle3d.io.hdf5 import make_folder
 from speckle3d.io.igtl.messages import ImageReceived, Received, TransformReceived
 from speckle3d.io.import_settings import ImportSettings
+from speckle3d.io.sweep_writer import GrowingSweep
 from speckle3d.live.checks import GOOD, NO_OVERLAP, TOO_FAST, Words, words_for
 from speckle3d.live.crossing import CrossingCheck
 from speckle3d.live.frames import ImageLayout
@@ -61,7 +63,7 @@ class SessionSettings:
     Attributes
     ----------
     recording : path
-        New sweep file for everything that is received.
+        New sweep file for everything that is received; its folder is made with the first image.
     image, transform, orientation : str or None
         Devices whose messages count: by default the first image's; no sensor's.
     importing : ImportSettings
@@ -181,16 +183,19 @@ class Session:
             self._report(show)
         if layout is None or first is None:
             return
-        with (
-            self._tracking(layout),
-            Recording(self._settings.recording, layout, first.time_s, self.progress) as recording,
-        ):
-            self._take_all(waiting, recording, layout)
-            while not self._is_over(until_s):
-                self._take_all(self._source.receive(_LOOK_S), recording, layout)
-                self._report(show)
-            # What has come and waits for the disk is part of the sweep, too.
-            self._take_all(self._source.receive(0.0), recording, layout)
+        path, example = self._settings.recording, layout.example
+        with self._tracking(layout):
+            make_folder(path.parent)
+            with GrowingSweep(
+                path, example.grid, example.signal, example.frames.dtype, probe=example.probe
+            ) as sweep:
+                recording = Recording(sweep, first.time_s, self.progress)
+                self._take_all(waiting, recording, layout)
+                while not self._is_over(until_s):
+                    self._take_all(self._source.receive(_LOOK_S), recording, layout)
+                    self._report(show)
+                # What has come and waits for the disk is part of the sweep, too.
+                self._take_all(self._source.receive(0.0), recording, layout)
 
     def _is_over(self, until_s: float | None) -> bool:
         late = until_s is not None and time.monotonic() >= until_s
@@ -240,7 +245,7 @@ class Session:
     def _tracking(self, layout: ImageLayout) -> Iterator[None]:
         """Match frames and make volumes in threads that end with the block."""
         self._centre_mm = layout.example.grid.centre_mm
-        with LiveTracker(layout.example, self._curves, self._settings.config) as tracker:
+        with closing(LiveTracker(layout.example, self._curves, self._settings.config)) as tracker:
             volume = GrowingVolume(tracker.image_grid)
             self.tracker, self._volume, tracker.images = tracker, volume, volume.keep
             work = {"placing": partial(self._match, tracker, layout.image_from_pixel)}

@@ -13,8 +13,7 @@ from __future__ import annotations
 
 import threading
 from dataclasses import dataclass, replace
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -140,14 +139,6 @@ class LiveTracker:
         if background:
             self._thread = threading.Thread(target=self._keep_revising, name="revising", daemon=True)
             self._thread.start()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def __len__(self) -> int:
         return len(self._tables)

@@ -38,10 +38,10 @@ def row(sweep, curves, step):
         return s3.track(sweep.part(0, frames), curves).image
 
     whole, apart = poses_of(len(sweep)), []
-    with LiveTracker(sweep, curves, background=False) as live:
-        first = [live.append(sweep.frames[k], float(k)).world_from_image for k in range(len(sweep))]
-        live.revise()
-        last = live.poses
+    live = LiveTracker(sweep, curves, background=False)
+    first = [live.append(sweep.frames[k], float(k)).world_from_image for k in range(len(sweep))]
+    live.revise()
+    last = live.poses
     for k in [*range(2, len(sweep), step), len(sweep) - 1]:
         part, later = poses_of(k + 1)[-1:], whole[k : k + 1]
         live_pose = RigidTransform.concatenate([first[k]])

@@ -8,9 +8,8 @@ from sweep_examples import RF
 
 import speckle3d as s3
 from speckle3d.core.grid import ImageGrid
-from speckle3d.core.sweep import Sweep
+from speckle3d.io.sweep_writer import GrowingSweep
 from speckle3d.live import recording
-from speckle3d.live.frames import ImageLayout
 from speckle3d.live.progress import Progress
 from speckle3d.live.recording import Recording
 
@@ -21,12 +20,11 @@ def record(tmp_path, monkeypatch):
 
     def times_of(here_s, sent_s):
         frame = np.ones((4, 8), dtype=np.int16)
-        grid = ImageGrid(4, 8, 0.3, RF.sample_spacing_mm)
-        example = Sweep(frame[None], grid, RF, np.zeros(1))
-        layout, progress = ImageLayout("Image", example, True), Progress()
+        grid, progress = ImageGrid(4, 8, 0.3, RF.sample_spacing_mm), Progress()
         clock = iter([here_s[0], *here_s])
         monkeypatch.setattr(recording, "time", SimpleNamespace(monotonic=lambda: next(clock)))
-        with Recording(tmp_path / "sweep.h5", layout, sent_s[0], progress) as growing:
+        with GrowingSweep(tmp_path / "sweep.h5", grid, RF, frame.dtype) as sweep:
+            growing = Recording(sweep, sent_s[0], progress)
             for time_s in sent_s:
                 growing.keep_frame(frame, time_s)
         return s3.load_sweep(tmp_path / "sweep.h5").frame_time_s, progress

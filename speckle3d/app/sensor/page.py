@@ -31,12 +31,7 @@ _PARTS = {
 }
 """Colour and corners of the handle, the head, the image and its first vector, in the image's axes."""
 _AXES = {"north": (1.6, 0.0, 0.0), "west": (0.0, 1.6, 0.0), "up": (0.0, 0.0, 1.6)}
-_COLOURS = {
-    Trust.YES: ("#2e7d32", "#edf6ee"),
-    Trust.CARE: ("#c77700", "#fdf5e6"),
-    Trust.NO: ("#b3261e", "#fcebea"),
-    Trust.UNKNOWN: ("#6b7780", "#f1f3f4"),
-}
+_COLOURS = {Trust.YES: "#2e7d32", Trust.CARE: "#c77700", Trust.NO: "#b3261e", Trust.UNKNOWN: "#6b7780"}
 _LINES = {"x": "#b3261e", "y": "#2e7d32", "z": "#20507a"}
 _PLOTS = {
     "rate, °/s": ("x", "y", "z"),
@@ -176,8 +171,8 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
 
 def banner(trust: Trust, sentence: str) -> str:
     """HTML of the sentence on the magnetometer, coloured by what it says."""
-    line, ground = _COLOURS[trust]
-    style = f"border-left:5px solid {line};background:{ground};padding:7px 12px;font-size:14px"
+    colour = _COLOURS[trust]
+    style = f"border-left:5px solid {colour};background:{colour}18;padding:7px 12px;font-size:14px"
     return f'<div class="magnetometer" style="{style}">{escape(sentence)}</div>'
 
 

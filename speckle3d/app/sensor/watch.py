@@ -5,11 +5,10 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from types import TracebackType
-from typing import Self
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -17,7 +16,6 @@ from scipy.spatial.transform import Rotation
 from speckle3d.app.sensor.source import COLUMNS, NORMAL_95, Columns, angles, heading_rad
 from speckle3d.core.errors import Speckle3DError
 from xsens.fusion.field import Trust, field_now
-from xsens.live.device import DeviceSettings
 from xsens.live.monitor import LiveState
 from xsens.live.recording import Recorder
 
@@ -28,46 +26,44 @@ SHOWN_S = 60.0
 
 
 class SensorWatch:
-    """Record a sensor on a serial port and keep its last minute of states, within a block.
+    """Record a sensor on a serial port and keep its last minute of states.
 
     Parameters
     ----------
     port : str
     record : path, optional
         New file for the sensor's bytes; without it they go to a scratch file, which is removed.
-    settings : DeviceSettings, optional
-
-    Raises
-    ------
-    FileError
-        If no sensor answers on the port, or the file cannot be written.
     """
 
     is_live = True
 
-    def __init__(self, port: str, record: Path | None = None, settings: DeviceSettings | None = None) -> None:
-        self._port, self._record, self._settings = port, record, settings
+    def __init__(self, port: str, record: Path | None = None) -> None:
+        self._port, self._record = port, record
         self.states: deque[LiveState] = deque(maxlen=round(SHOWN_S / INTERVAL_S))
         self._end = threading.Event()
         self._failure = ""
 
-    def __enter__(self) -> Self:
+    @contextmanager
+    def recording(self) -> Iterator[None]:
+        """Record the sensor during a block.
+
+        Raises
+        ------
+        FileError
+            If no sensor answers on the port, or the file cannot be written.
+        """
         with ExitStack() as stack:
             path = self._record
             if path is None:
                 path = Path(stack.enter_context(TemporaryDirectory(prefix="speckle3d-"))) / "sensor.mtb"
-            self._recorder = stack.enter_context(Recorder(self._port, path, self._settings))
+            self._recorder = stack.enter_context(Recorder(self._port, path))
             thread = threading.Thread(target=self._ask, daemon=True)
             thread.start()
-            stack.callback(thread.join)
-            stack.callback(self._end.set)
-            self._stack = stack.pop_all()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._stack.__exit__(kind, error, trace)
+            try:
+                yield
+            finally:
+                self._end.set()
+                thread.join()
 
     def _ask(self) -> None:
         next_s = time.monotonic()
