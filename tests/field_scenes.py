@@ -6,6 +6,7 @@ The motion is a simulated hand's; the magnetometer is computed from the true ori
 from typing import NamedTuple
 
 import numpy as np
+from scipy.ndimage import uniform_filter1d
 from scipy.spatial.transform import Rotation
 
 from xsens.logs.samples import VECTORS, ImuLog
@@ -127,10 +128,18 @@ def drift(motion, amount, rng):
     return seen_by(motion, turns.apply(room_ut(motion, rng)))
 
 
+def wander(motion, amount, rng):
+    """A field that goes astray as a random walk, by so many uT at most."""
+    steps = np.cumsum(rng.standard_normal((len(motion.log), 3)), axis=0)
+    astray = uniform_filter1d(steps, 400, axis=0, mode="nearest")
+    return seen_by(motion, room_ut(motion, rng) + amount * astray / np.abs(astray).max())
+
+
 FIELDS = {
     "attached": iron_on_sensor,
     "start": start,
     "drift": drift,
+    "wander": wander,
 }
 
 

@@ -13,8 +13,8 @@ from speckle3d.core.sweep import OrientationSensor
 
 TURN_S = 0.3
 """A hand's wobble turns round within this time; over longer ones a gyroscope's bias counts."""
-LEAST_TURN_DEG, SCALE_ERROR = 0.1, 0.05
-"""Noise of a turn over `TURN_S`, and the share of it by which gyroscopes and readings honestly differ."""
+WALK_DEG, SCALE_ERROR = 0.03, 0.05
+"""Random walk of a gyroscope over `TURN_S`, and the share of a turn by which readings honestly differ."""
 LEAST_GAIN = 4.0
 """Logarithm of the likelihood by which a convention must explain the gyroscope better: good simulated sensors
 gain up to 0.1, faulty ones from 5."""
@@ -40,8 +40,11 @@ def _spread(values: FloatArray) -> FloatArray:
     return np.asarray(1.4826 * np.median(np.abs(values - np.median(values, axis=0)), axis=0))
 
 
-def doubts_of_gyroscope(sensor: OrientationSensor) -> Iterator[Doubt]:
-    """At most one: the convention in which readings turn as the gyroscope, or that they do not."""
+def doubts_of_gyroscope(sensor: OrientationSensor, jitter_rad: float) -> Iterator[Doubt]:
+    """At most one: the convention in which readings turn as the gyroscope, or that they do not.
+
+    A turn has the jitter of two readings.
+    """
     rate, time_s, readings = sensor.gyroscope_rad_s, sensor.readings.time_s, sensor.readings.world_from_sensor
     if rate is None or len(time_s) < 2:
         return
@@ -52,7 +55,7 @@ def doubts_of_gyroscope(sensor: OrientationSensor) -> Iterator[Doubt]:
     angle = np.cumsum((rate[1:] + rate[:-1]) / 2 * pause[:, None], axis=0)
     angle = np.concatenate([np.zeros((1, 3)), angle])
     turns = np.rad2deg(angle[lag:] - angle[:-lag])
-    noise = LEAST_TURN_DEG + SCALE_ERROR * float(_spread(turns).max())
+    noise = WALK_DEG + np.sqrt(2.0) * np.rad2deg(jitter_rad) + SCALE_ERROR * float(_spread(turns).max())
 
     def difference(turned: Rotation, sign: float = 1.0) -> FloatArray:
         """Turns by the gyroscope, or the opposite ones, less those by readings, degrees."""

@@ -78,7 +78,8 @@ def examine_sensors(sweep: Sweep, image: RigidTransform, examine: bool = True) -
         if sensor is not None:
             odd = (*_doubt_still(sensor, sweep, image), *_doubt_jitter(sensor))
             if not odd and isinstance(sensor, OrientationSensor):
-                odd = (*doubts_of_gyroscope(sensor), *doubts_of_gravity(sensor))
+                _, turn_jitter = jitter(rigid(sensor.readings.world_from_sensor), np.zeros(3))
+                odd = (*doubts_of_gyroscope(sensor, turn_jitter), *doubts_of_gravity(sensor))
             doubts += odd
     credible = credible_sensors(left, doubts)
     sensor, suspects = credible.orientation, {doubt.about for doubt in doubts}

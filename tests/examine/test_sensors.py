@@ -10,7 +10,7 @@ from speckle3d.core.errors import MismatchError
 from speckle3d.corrections import correct
 from speckle3d.examine.conventions import doubts_of_gyroscope
 from speckle3d.examine.disagreements import differing_lengths, disagreements
-from speckle3d.examine.sensors import examine_sensors, repair_readings
+from speckle3d.examine.sensors import examine_sensors, jitter, repair_readings, rigid
 from speckle3d.motion.direction import settle_direction
 
 AGAINST_THEMSELVES = {
@@ -139,15 +139,17 @@ def test_a_gyroscope_on_other_axes_does_not_refute_the_readings(sweep, tracking)
     assert [(doubt.refuted, "gyroscope" in doubt.suspect) for doubt in examination.doubts] == [(False, True)]
 
 
-def test_readings_that_jitter_about_the_gyroscopes_turns_are_not_doubted(sweep):
+@pytest.mark.parametrize("jitter_deg", [0.15, 0.6])
+def test_readings_that_jitter_about_the_gyroscopes_turns_are_not_doubted(sweep, jitter_deg):
     sensor = sweep.orientation
     time_s = sensor.readings.time_s
     rotvec = np.deg2rad(2.0) * np.sin(np.pi * time_s[:, None] + np.arange(3))
-    jitter = np.random.default_rng(0).normal(0.0, np.deg2rad(0.15), rotvec.shape)
-    readings = replace(sensor.readings, world_from_sensor=Rotation.from_rotvec(rotvec + jitter))
+    noise = np.random.default_rng(0).normal(0.0, np.deg2rad(jitter_deg), rotvec.shape)
+    readings = replace(sensor.readings, world_from_sensor=Rotation.from_rotvec(rotvec + noise))
     rate = np.gradient(rotvec, time_s, axis=0)
     slow = replace(sensor, readings=readings, gyroscope_rad_s=rate, accelerometer_m_s2=None)
-    assert list(doubts_of_gyroscope(slow)) == []
+    _, jitter_rad = jitter(rigid(readings.world_from_sensor), np.zeros(3))
+    assert list(doubts_of_gyroscope(slow, jitter_rad)) == []
 
 
 def test_modes_by_the_images_alone_do_not_contradict_each_other():

@@ -74,6 +74,9 @@ _STEADY_S = 60.0
 
 _STEADY = round(_STEADY_S / BIN_S)
 
+_FIRST_BINS = round(1.0 / BIN_S)
+"""Readings whose mean is north where the sensor was at first."""
+
 
 def steps_per_bin(settings: FusionSettings) -> int:
     """Steps of the filter in a bin."""
@@ -163,7 +166,7 @@ class HeadingFilter:
         self._filters["begun"] = False
         self._rows = np.zeros(0, STEP)  # steps of a bin that is not whole
         self._north = np.zeros((0, len(UNKNOWN)))  # at the end of the last bin
-        self._lately = np.zeros((0, _FILTERS + 1))  # angles of the filters, and slip
+        self._lately = np.zeros((0, 2 * _FILTERS + 1))  # angles of the filters, variances, and slip
 
     def follow(self, rows: Any, to_end: bool = False) -> FloatArray:
         """`NORTH` after each step by the last whole bin, or else the first; what is left is one `to_end`."""
@@ -178,7 +181,7 @@ class HeadingFilter:
             estimates = self._run(bins)
             weights, best = self._weights(estimates)
             more = self._unsteady(estimates, best, bins)
-            north = np.concatenate([north, _combined(estimates, weights, best, bins, more)])
+            north = np.concatenate([north, _combine(estimates, weights, best, bins, more)])
         self._north = north[-1:]
         north = north if len(north) else np.array([UNKNOWN])
         return np.asarray(north[np.clip(done, 0, len(north) - 1)])
@@ -189,16 +192,22 @@ class HeadingFilter:
         rows, moving = self._run(bins), ~bins["resting"]
         best = self._weights(rows)[1][-1]
         self._begin(max(float(np.median(rows["stray"][moving, best])) if moving.any() else 0.0, _STRAY))
-        filtered = _shaped(_FILTERS, len(bins))
-        rows = self._run(bins, filtered)
+        arrays = _empty_arrays(_FILTERS, len(bins))
+        rows = self._run(bins, arrays)
         weights, best = (values[-1] for values in self._weights(rows))
-        many = np.full(len(bins), best)
-        later = self._unsteady(rows, many, bins)[_STEADY:]  # what passes, as iron at the start, is smoothed
-        more = np.median(later) if later.size > _STEADY // 4 else 0.0
+        best_filters = np.full(len(bins), best)
+        later = self._unsteady(rows, best_filters, bins)[
+            _STEADY:
+        ]  # what passes, as iron at the start, is smoothed
+        unsteady = np.median(later) if later.size > _STEADY // 4 else 0.0
         weights[weights < _NEGLIGIBLE] = 0.0
         for j in np.union1d(np.flatnonzero(weights), best):
-            rows["turn_rad"][:, j], rows["variance"][:, j] = _backward(*(each[j] for each in filtered))
-        return _combined(rows, np.tile(weights, (len(bins), 1)), many, bins, more)
+            states, rows["turn_rad"][:, j], rows["variance"][:, j] = _smooth_backward(
+                *(part[j] for part in arrays)
+            )
+            if j == best != _BESIDE:
+                unsteady += _first_misfit(bins, states, self._filters["norm"][j])
+        return _combine(rows, np.tile(weights, (len(bins), 1)), best_filters, bins, unsteady)
 
     def _weights(self, rows: Any) -> tuple[FloatArray, IntArray]:
         """Weights of the filters after each bin, shape (n, filters), and the one whose heading is taken.
@@ -219,23 +228,26 @@ class HeadingFilter:
         return likely / likely.sum(axis=1, keepdims=True), best
 
     def _unsteady(self, rows: Any, best: IntArray, bins: Any) -> FloatArray:
-        """Square of what the best filter's north has moved against the gyroscope, beyond its error.
+        """Square of what the best filter's north has moved against the gyroscope in a minute, beyond its error.
 
-        Zero in the first minute, in which filters find what the field is.
+        That of a filter whose first place was beside iron moves when it leaves it.
         """
-        lately = np.vstack([self._lately, np.column_stack([rows["turn_rad"], bins["slip_rad2"]])])
+        columns = (rows["turn_rad"], rows["variance"], bins["slip_rad2"])
+        lately = np.vstack([self._lately, np.column_stack(columns)])
         last = len(self._lately) + np.arange(len(bins))
         first = np.maximum(last - _STEADY, 0)
-        slip = np.cumsum(lately[:, _FILTERS])
-        gyroscope = slip[last] - slip[first] + bins["bias_variance"] * _STEADY_S**2
+        slip = np.cumsum(lately[:, -1])
+        span_s = BIN_S * (last - first)
+        error = slip[last] - slip[first] + bins["bias_variance"] * span_s**2
+        error += np.where(last < _STEADY, lately[first, _FILTERS + best] + lately[last, _FILTERS + best], 0.0)
         self._lately = lately[-_STEADY:]
-        moved = _angle(lately[last, best] - lately[first, best])
-        return np.where(last < _STEADY, 0.0, np.maximum(moved**2 - gyroscope, 0.0))
+        move = _angle(lately[last, best] - lately[first, best])
+        return np.where(best == _BESIDE, 0.0, np.maximum(move**2 - error, 0.0))
 
-    def _run(self, bins: Any, filtered: list[FloatArray] | None = None) -> Any:
+    def _run(self, bins: Any, arrays: list[FloatArray] | None = None) -> Any:
         """What each filter finds in each bin, shape (n, filters)."""
         rows = np.zeros((len(bins), _FILTERS), kernel.HEADING)
-        kernel.find_headings(bins, self._models, self._filters, rows, *(filtered or _shaped(0, 0)))
+        kernel.find_headings(bins, self._models, self._filters, rows, *(arrays or _empty_arrays(0, 0)))
         return rows
 
 
@@ -243,13 +255,13 @@ def _angle(difference: FloatArray) -> FloatArray:
     return np.asarray(np.angle(np.exp(1j * difference)))
 
 
-def _shaped(*shape: int) -> list[FloatArray]:
+def _empty_arrays(*shape: int) -> list[FloatArray]:
     """Arrays for states, covariances, transitions and noises."""
     size = kernel.SIZE
     return [np.zeros((*shape, *each)) for each in ((size,), *3 * [(size, size)])]
 
 
-def _combined(rows: Any, weights: FloatArray, best: IntArray, bins: Any, more_rad2: Any) -> FloatArray:
+def _combine(rows: Any, weights: FloatArray, best: IntArray, bins: Any, more_rad2: Any) -> FloatArray:
     """`NORTH` of each bin: the best filter's angle, and deviation of all from it by their weights."""
     turn = np.take_along_axis(rows["turn_rad"], best[:, None], axis=1)
     off = _angle(rows["turn_rad"] - turn)
@@ -259,16 +271,25 @@ def _combined(rows: Any, weights: FloatArray, best: IntArray, bins: Any, more_ra
     return np.column_stack([turn, np.sqrt(variance), disturbed, stray, weights[:, _IRON]])
 
 
-def _backward(
+def _smooth_backward(
     states: FloatArray, covariances: FloatArray, transitions: FloatArray, noises: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Angle and variance of one filter, smoothed; before the first reading as there."""
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """States, angle and variance of one filter, smoothed; before the first reading as there."""
     from filterpy.kalman import KalmanFilter
 
     first = int(np.argmax(covariances[:, 0, 0] > 0.0))
     smoother = KalmanFilter(dim_x=kernel.SIZE, dim_z=3)
-    filtered = (states, covariances, transitions, noises + _ROUNDING * np.eye(kernel.SIZE))
-    means, spread, _, _ = smoother.rts_smoother(*(each[first:] for each in filtered))
+    arrays = (states, covariances, transitions, noises + _ROUNDING * np.eye(kernel.SIZE))
+    means, spread, _, _ = smoother.rts_smoother(*(part[first:] for part in arrays))
     turns = np.array([kernel.turn_to_north(x, p) for x, p in zip(means, spread, strict=True)])
     turn, variance = np.pad(turns, ((first, 0), (0, 0)), mode="edge").T
-    return np.unwrap(turn), variance
+    return np.pad(means, ((first, 0), (0, 0)), mode="edge"), np.unwrap(turn), variance
+
+
+def _first_misfit(bins: Any, states: FloatArray, norm: float) -> float:
+    """Square of the angle from the smoothed north to that of the first readings, which ought to be it."""
+    first = np.flatnonzero(bins["seen"])[:_FIRST_BINS]
+    iron = np.einsum("nij,nj->ni", bins["level"][first], states[first, kernel.IRON : kernel.IRON + 3])
+    fields = bins["field"][first] / norm - iron, states[first]
+    angles = [np.arctan2(field[:, 1], field[:, 0]) for field in fields]
+    return float(_angle(angles[0] - angles[1]).mean() ** 2)

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
 from xsens.logs.clocks import COUNTS, TICK_S, TICKS, Stamps, unwrapped
-from xsens.logs.faults import saturated
+from xsens.logs.faults import at_ends
 from xsens.logs.parts import Parts
 from xsens.logs.samples import VECTORS
 from xsens.logs.worlds import Claim, quaternions_of
@@ -77,7 +77,7 @@ def legacy_samples(frames: Frames, which: IntArray) -> Parts:
         notes.append(NOT_COMPENSATED)
         for sensor, name in enumerate(VECTORS):
             counts = layout.decode(data, _RAW_VECTORS[sensor])
-            ends = saturated(counts)  # which the units' mixture of axes would hide
+            ends = at_ends(counts)  # which the units' mixture of axes would hide
             values[name] = calibration.to_units(sensor, as_floats(counts))
             if ends.any():
                 values[name][ends] = np.nan

@@ -7,6 +7,7 @@ become NaN, as if they had not come, so that whatever uses the log grows less ce
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,12 +25,12 @@ class _Limits(NamedTuple):
     spike: float
 
 
-_OWN = "own orientation"
+_ORIENTATION = "own orientation"
 LIMITS = {
     VECTORS[0]: _Limits(2000.0, 0.3, 100.0),
     VECTORS[1]: _Limits(60.0, 0.03, 10.0),
     VECTORS[2]: _Limits(100.0, 0.03, 1.0),
-    _OWN: _Limits(np.inf, 0.05, np.inf),
+    _ORIENTATION: _Limits(np.inf, 0.05, np.inf),
 }
 """Accelerometers end at 200 g, gyroscopes at 35 rad/s; a hand's knock lasts longer than a sample. A resting
 sensor's readings change by less than the second, its orientation by less than two degrees. The field's limits
@@ -53,8 +54,14 @@ _TURNING_RAD_S = 0.2
 _FEW = 0.05
 """Share of readings that may be errors; more are in another unit."""
 
-_OTHER = 5.0
+_TURNS_APART = 5.0
 """Of rows in turn of several sensors, how much farther neighbours are apart than rows of one sensor."""
+
+_NOISY = 10.0
+"""Last digits by which readings change that never repeat by chance."""
+
+_WRAPS = 1.5
+"""Change between two readings, in largest ones, that is an overflow: twice as much, less what it turned."""
 
 _ENOUGH = 50
 _MOST_SENSORS = 8
@@ -70,30 +77,30 @@ def measured(log: ImuLog) -> ImuLog:
     InvalidInputError
         If its rows are of several sensors in turn.
     """
-    kept = dict.fromkeys(VECTORS, np.ones(len(log), dtype=bool)) | {_OWN: log.oriented}
-    readings = {name: getattr(log, name) for name in VECTORS} | {_OWN: log.own_direction}
+    oriented = slice(None) if log.oriented.all() else log.oriented
+    readings = {name: getattr(log, name) for name in VECTORS} | {_ORIENTATION: log.own_direction}
     readings = {name: rows for name, rows in readings.items() if rows is not None}
     _require_one_sensor(readings)
-    changed: dict[str, Any] = {}
+    changes: dict[str, Any] = {}
     notes: list[str] = []
     dead, force, rate = np.zeros(len(log), dtype=bool), readings.get(VECTORS[0]), readings.get(VECTORS[1])
     for name, rows in readings.items():
-        some = slice(None) if kept[name].all() else kept[name]
-        others = (None if others is None else others[some] for others in (force, rate))
-        bad = _bad(name, rows[some], dead[some], *others)
+        part: Any = oriented if name == _ORIENTATION else slice(None)
+        inertial = (None if vectors is None else vectors[part] for vectors in (force, rate))
+        bad = _bad(name, rows[part], dead[part], *inertial)
         if name == VECTORS[0]:
             dead = bad["readings of zero"] | ~finite_rows(rows)
         counts = ", ".join(f"{int(mask.sum())} {why}" for why, mask in bad.items() if mask.any())
         wrong = np.zeros(len(log), dtype=bool)
-        wrong[some] = np.logical_or.reduce(list(bad.values()))
+        wrong[part] = np.logical_or.reduce(list(bad.values()))
         if counts:
             notes.append(f"{name.split('_')[0]}: {counts}: taken as missing")
-        if name == _OWN:
-            changed["oriented"] = log.oriented & ~wrong
+        if name == _ORIENTATION:
+            changes["oriented"] = log.oriented & ~wrong
         elif counts or not finite_rows(rows).any():
             rows = np.where(wrong[:, None], np.nan, rows)
-            changed[name] = rows if finite_rows(rows).any() else None
-    return replace(log, **changed, notes=(*log.notes, *notes))
+            changes[name] = rows if finite_rows(rows).any() else None
+    return replace(log, **changes, notes=(*log.notes, *notes))
 
 
 def _norm(rows: FloatArray) -> FloatArray:
@@ -127,20 +134,21 @@ def _bad(
         beyond = size >= _ABSURD
     if beyond.any() or not finite.all():
         rows = np.where((finite & ~beyond)[:, None], rows, np.nan)
-    ends, spikes = saturated(rows), _spikes(rows, limits.spike * unit)
+    ends, spikes, overflows = at_ends(rows), _spikes(rows, limits.spike * unit), _overflows(rows)
     if name == VECTORS[1]:  # at rest zero is a reading
         zero &= dead
-    repeated = _repeated(name, rows, limits.change * unit, size, force, rate) & finite & ~zero
+    repeats = _repeats(name, rows, limits.change * unit, size, force, rate) & finite & ~zero
     return {
         "readings of zero": zero,
         "out of range": beyond,
-        "repeated": repeated,
-        "at the end of the range": ends & ~repeated & ~zero,
-        "single spikes": spikes & ~zero,
+        "repeated": repeats,
+        "at the end of the range": ends & ~repeats & ~zero,
+        "beyond the range, wrapped round": overflows & ~ends & ~repeats & ~zero,
+        "single spikes": spikes & ~overflows & ~zero,
     }
 
 
-def _repeated(
+def _repeats(
     name: str,
     rows: FloatArray,
     change: float,
@@ -148,7 +156,10 @@ def _repeated(
     force: FloatArray | None,
     rate: FloatArray | None,
 ) -> BoolArray:
-    """Rows that repeat the one before for longer than two samples of the sensor's rate, and then change."""
+    """Rows that repeat the one before for longer than two samples of the sensor's rate, and then change.
+
+    Where readings before and after change by many of their last digits, no sensor at rest repeats one.
+    """
     changes = np.logical_or.reduce([axis[1:] != axis[:-1] for axis in rows.T])
     start = np.flatnonzero(np.append(True, changes))
     length = np.diff(np.append(start, len(rows)))
@@ -158,13 +169,18 @@ def _repeated(
         return np.zeros(len(rows), dtype=bool)
     step = np.pad(_change(rows, 1), 1, constant_values=np.nan)
     before, after = step[start], step[start + length]
-    moves = (after > change) | (np.isnan(after) & (start > 0))
+    noisy = np.ones(len(start), dtype=bool)
+    for axis in rows.T:
+        steps = np.abs(np.diff(axis, prepend=np.nan, append=np.nan))
+        digit = np.min(steps, where=steps > 0.0, initial=np.inf)
+        noisy &= np.minimum(steps[start], steps[start + length]) > _NOISY * digit
+    moves = noisy | (after > change) | (np.isnan(after) & (start > 0))
     if name == VECTORS[1]:  # a resting one may read its bias, or zero
         still = np.ones(len(start), dtype=bool)
         for axis in () if force is None else force.T:
             still &= ~(np.fmax.reduceat(axis, start) - np.fmin.reduceat(axis, start) > _STEADY_M_S2)
-        begun = np.isnan(before) | np.isnan(after) | (before > _DROP_RAD_S)
-        moves = (moves & ~(still & begun & (size[start] < _SLOW_RAD_S))) | (np.isnan(after) & ~still)
+        drops = np.isnan(before) | np.isnan(after) | (before > _DROP_RAD_S)
+        moves = (moves & ~(still & drops & (size[start] < _SLOW_RAD_S))) | (np.isnan(after) & ~still)
     else:  # what is repeated to the log's end was left while the sensor turned
         turn = 0.0 if rate is None else np.add.reduceat(np.nan_to_num(_norm(rate)), start)
         moves &= ~np.isnan(after) | (turn > _TURNING_RAD_S * length)
@@ -172,7 +188,7 @@ def _repeated(
     return np.asarray(np.repeat(long & moves, length) & (place >= usual))
 
 
-def saturated(rows: FloatArray) -> BoolArray:
+def at_ends(rows: FloatArray) -> BoolArray:
     """Rows in which an axis stays at its highest or lowest value, from one steep slope to another."""
     bad = np.zeros(len(rows), dtype=bool)
     for column in rows.T:
@@ -189,6 +205,26 @@ def saturated(rows: FloatArray) -> BoolArray:
             for i, k in zip(first[steep], last[steep], strict=True):
                 others_go_on = (rows[i + 1 : k + 1] != rows[i:k]).any(axis=1).sum() > 1
                 bad[i : k + 1] |= others_go_on
+    return bad
+
+
+def _overflows(rows: FloatArray) -> BoolArray:
+    """Rows in which an axis is beyond its range: it has gone on from its one end at the other."""
+    bad = np.zeros(len(rows), dtype=bool)
+    for axis in rows.T:
+        steps = np.diff(axis)
+        jumps = (np.flatnonzero(np.abs(steps) > _WRAPS * np.fmax.reduce(np.abs(axis))) + 1).tolist()
+        spans, ends = list[tuple[int, int]](), set[int]()
+        # The log may begin or end beyond the range, which shows if a jump has no other.
+        for i, k in (*pairwise(jumps), (0, *jumps[:1]), (*jumps[-1:], len(axis))) if jumps else ():
+            opposite = i == 0 or k == len(axis) or steps[i - 1] * steps[k - 1] < 0.0
+            if opposite and not ends & {i, k} and (axis[i:k] * axis[i] > 0.0).all():
+                spans.append((i, k))
+                ends |= {i, k}
+        lengths = [k - i for i, k in spans]
+        if 2 * sum(length for length in lengths if length > 2) > sum(lengths):  # no vibration to and fro
+            for i, k in spans:
+                bad[i:k] = True
     return bad
 
 
@@ -213,7 +249,7 @@ def _require_one_sensor(readings: dict[str, FloatArray]) -> None:
         rows = np.where((rows != 0.0).any(axis=1)[:, None], rows, np.nan)
         apart = [_median_norm(rows[lag:] - rows[:-lag]) for lag in range(1, _MOST_SENSORS + 1)]
         for sensors in range(2, _MOST_SENSORS + 1):
-            if np.min(apart[: sensors - 1]) > _OTHER * apart[sensors - 1] + 0.02 * _median_norm(rows):
+            if np.min(apart[: sensors - 1]) > _TURNS_APART * apart[sensors - 1] + 0.02 * _median_norm(rows):
                 raise InvalidInputError(
                     f"expected the rows of one sensor, got those of {sensors} in turn: neighbouring readings "
                     f"differ, and every {sensors}. is alike: split the table"

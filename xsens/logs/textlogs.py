@@ -48,6 +48,15 @@ _TICKS = {"MT Manager": TICK_S, "DOT": 1e-6}
 _SLOWEST_HZ = 5.0
 """By times that come more slowly no hand's movement can be followed: they are in another unit."""
 
+_EPOCH_S = (1e9, 4e9)
+"""Seconds since 1970 of the years 2001 to 2096."""
+
+_HALF_TURN = 3.2
+"""Angles that are none of them larger may be in radians."""
+
+_GRAVITY_M_S2 = 4.0
+"""Median length of accelerations from which they hold gravity: a hand's own are less."""
+
 _VECTORS = [[f"{quantity}_{axis}" for axis in "xyz"] for quantity in ("acc", "gyr", "mag")]
 _EULER = ["euler_roll", "euler_pitch", "euler_yaw"]
 _MATRIX = [f"mat_{row}_{column}" for row in "123" for column in "123"]
@@ -96,25 +105,30 @@ def _mt9_export(table: TextTable) -> TextTable:
 def _samples(table: TextTable) -> Parts:
     """Samples of a table whose columns are known."""
     columns, notes = dict(table.columns), list[str]()
-    timed = np.ones(len(next(iter(columns.values()), ())), dtype=bool)
-    stamps = columns.keys() & set(STAMPS)
-    if "time" in stamps and table.names and "time" not in table.stated:
-        unit, scale = _unit_of(columns["time"], TIMES)
-        columns["time"] = columns["time"] * scale
-        if unit != "s":
-            notes.append(f"times without a unit: taken as in {unit}, by their steps")
-    for key in stamps:
-        timed &= np.abs(columns[key]) < (np.inf if key == "time" else 2.0**53)
-    if not timed.any():
+    if "time" in columns and table.names and "time" not in table.stated:
+        unit = _unit_of(columns["time"], TIMES)
+        if unit is None:  # steps of one: milliseconds, or the samples' numbers
+            columns.setdefault("counter", columns.pop("time"))
+            notes.append("times without a unit in steps of 1: taken for the samples' numbers")
+        else:
+            columns["time"] = columns["time"] * TIMES[unit]
+            if unit != "s":
+                notes.append(f"times without a unit: taken as in {unit}, by their steps")
+    if not columns.keys() & {"time", "ticks"} and (utc_s := _utc_s(columns)) is not None:
+        columns["time"] = utc_s
+    stamped = np.ones(len(next(iter(columns.values()), ())), dtype=bool)
+    for key in columns.keys() & set(STAMPS):
+        stamped &= np.abs(columns[key]) < (np.inf if key == "time" else 2.0**53)
+    if not stamped.any():
         raise InvalidInputError("expected lines with a time, got none")
-    if not timed.all():
-        notes.append(f"{(~timed).sum()} lines without a time were left out")
-        columns = {key: column[timed] for key, column in columns.items()}
+    if not stamped.all():
+        notes.append(f"{(~stamped).sum()} lines without a time were left out")
+        columns = {key: column[stamped] for key, column in columns.items()}
     counter, ticks, time_s = (columns.get(key) for key in ("counter", "ticks", "time"))
     dot = any("devicetag" in line.lower() for line in table.header)
     if ticks is not None and time_s is None:
         ticks = unwrapped(ticks.astype(np.int64), TICKS)
-        if not dot and _unit_of(ticks, _TICKS, "MT Manager")[0] == "DOT":
+        if not dot and _unit_of(ticks, _TICKS) == "DOT":
             dot = True
             notes.append("taken for a DOT's export by its clock: ticks of 1 us, gyroscope in deg/s")
         time_s = ticks * _TICKS["DOT" if dot else "MT Manager"]
@@ -123,21 +137,33 @@ def _samples(table: TextTable) -> Parts:
     force, rate, field = (_side_by_side(columns, keys) for keys in _VECTORS)
     if rate is not None and dot and "gyr_x" not in table.stated:
         rate = np.deg2rad(rate)
-    odd = _not_understood(table, "time" in stamps)
+    if force is None and any(key.startswith("free_") for key in columns):
+        force = _side_by_side(columns, [f"free_{axis}" for axis in "xyz"])
+        if force is None or np.nanmedian(np.linalg.norm(force, axis=1)) < _GRAVITY_M_S2:
+            force = None
+            notes.append("acceleration without gravity is no accelerometer's reading and was left out")
+    plain = "time" in table.columns
+    odd = _not_understood(table, plain)
     claim = None
     if (own := _side_by_side(columns, _OPTICAL)) is not None:
         notes.append("orientation: by cameras, in a world of their own: x and z need not be north and up")
     else:
-        claim = _claim(table, "time" in stamps, dot)
+        claim = _claim(table, plain, dot)
         notations = (_side_by_side(columns, keys) for keys in (_QUATERNION, _MATRIX, _EULER))
         own = next((rows for rows in notations if rows is not None), None)
+        if (
+            plain
+            and own is not None
+            and own.shape[1] == 3
+            and table.names
+            and "euler_roll" not in table.stated
+        ):
+            own = own * _degrees(own, force)
     if all(part is None for part in (force, rate, field, own)):
-        got = "; ".join(odd) or "got none"
+        got = "; ".join(odd) or not_understood(table.names)
         raise InvalidInputError(
             f"expected columns of acceleration, rate of turn, field or orientation, {got}"
         )
-    if force is None and "freeacc_x" in table.names:
-        notes.append("acceleration without gravity is no accelerometer's reading and was left out")
     stated = _RATE.search("\n".join(table.header))
     rate_hz = number(stated[1]) if stated else float("nan")
     period_s = 1.0 / rate_hz if rate_hz > 0.0 else float("nan")
@@ -145,18 +171,53 @@ def _samples(table: TextTable) -> Parts:
     return Parts(sent, (force, rate, field), own, claim, (*odd, *notes))
 
 
-def _unit_of(times: FloatArray, units: dict[str, float], otherwise: str = "") -> tuple[str, float]:
-    """The unit of times that makes their steps a sensor's, and its length in s."""
+def _unit_of(times: FloatArray, units: dict[str, float]) -> str | None:
+    """The unit of times that makes their steps a sensor's, or steps of one those of an epoch."""
     steps = np.diff(times)
-    usual = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else float("nan")
+    if times.size > 1 and not (steps > 0.0).any():
+        raise InvalidInputError(f"expected times that rise, got {times[0]:g} in every line")
+    usual = float(np.median(steps[steps > 0.0])) if steps.size else 0.01
     for unit, scale in units.items():
-        if SHORTEST_S <= usual * scale <= 1.0 / _SLOWEST_HZ:
-            return unit, scale
-    if not otherwise:
+        if usual != 1.0 and SHORTEST_S <= usual * scale <= 1.0 / _SLOWEST_HZ:
+            return unit
+        if usual == 1.0 and _EPOCH_S[0] < times[0] * scale < _EPOCH_S[1]:
+            return unit
+    if usual != 1.0 and units is TIMES:
         raise InvalidInputError(
             f"expected a time with its unit, as time_s or time_ms, got steps of {usual:g}"
         )
-    return otherwise, units[otherwise]
+    return None
+
+
+def _degrees(angles: FloatArray, force: FloatArray | None) -> float:
+    """Degrees in the unit of angles that names none; gravity tells small degrees from radians."""
+    if np.nanmax(np.abs(angles), initial=0.0) > _HALF_TURN:
+        return 1.0
+    if force is None:
+        raise InvalidInputError(
+            "expected angles with their unit, as roll_deg, got none beyond half a turn in rad"
+        )
+    up = force / np.linalg.norm(force, axis=1)[:, None]
+    off = {}
+    for scale in (1.0, 180.0 / np.pi):
+        roll, pitch, _ = np.deg2rad(scale * angles).T
+        gravity = [-np.sin(pitch), np.sin(roll) * np.cos(pitch), np.cos(roll) * np.cos(pitch)]
+        off[float(np.nanmedian(1.0 - np.abs(np.einsum("nj,jn->n", up, gravity))))] = scale
+    return off[min(off)]
+
+
+def _utc_s(columns: dict[str, FloatArray]) -> FloatArray | None:
+    """Seconds since 1970, or since midnight, of columns of UTC; None if they are missing or stand still."""
+    if "utc_s" not in columns:
+        return None
+    day, month, year, hour, minute, seconds, nano = (
+        columns.get(f"utc_{part}", np.zeros(1))
+        for part in ("day", "month", "year", "hour", "minute", "s", "nano")
+    )
+    months = np.nan_to_num(12.0 * (year - 1970.0) + month - 1.0).astype("M8[M]")
+    days = months.astype("M8[D]").astype(float) + day
+    utc_s = 86400.0 * days + 3600.0 * hour + 60.0 * minute + seconds + 1e-9 * nano
+    return utc_s if np.ptp(utc_s) > 0.0 else None
 
 
 def _side_by_side(columns: dict[str, FloatArray], keys: list[str]) -> FloatArray | None:

@@ -32,6 +32,9 @@ _LONGEST_HEADER = 64
 """Lines, not counting comments, among which the names of the columns or the first numbers must be."""
 
 _COMMENT = "#"
+_DATE_DIGIT, _MILLISECONDS = re.compile(r"\b(\d)\b"), re.compile(r":(\d{3})$")
+"""In dates and times: a number without its leading zero, and thousandths after a colon."""
+
 _DIGIT = re.compile("[0-9]")
 # -- names of columns
 
@@ -39,16 +42,23 @@ _DEG = 0.017453292519943295
 _FIELD_UNITS = ("au", "a_u", "ut", "µt", "nt", "mt", "t", "gauss", "g", "mgauss", "local_flux")
 TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}
 _COLUMNS = (
-    ("acc", "(?:linear_)?acc(?:el(?:eration|erometer)?)?|a", "[xyz]"),
-    ("gyr", "gyro?(?:scope)?|angular_(?:velocity|rate)|[gw]", "[xyz]"),
-    ("mag", "mag(?:n|neto|netometer|netic)?(?:_field)?|m", "[xyz]"),
-    ("quat", "quat(?:ernion)?(?:_?q)?|q|orientation", "[wxyz0-3]"),
+    ("acc", "acc(?:el(?:eration|erometers?)?)?|a", "[xyz]"),
+    ("free", "(?:free|lin(?:ear)?|user)_?(?:acc(?:el(?:eration)?)?)?", "[xyzenu]"),
+    ("gyr", "gyro?(?:scopes?)?|angular_(?:velocity|rate)|as|[gw]", "[xyz]"),
+    ("mag", "mag(?:n|neto|netometers?|netic)?(?:_field)?|[mh]", "[xyz]"),
+    ("quat", "quat(?:ernion)?(?:_?q)?|q|orientation", "[wxyz0-3]|scalar"),
     ("euler", "(?:euler)?", "roll|pitch|yaw|(?<=euler_)[xyz]"),
+    ("euler", "angle", "[xyz]"),
     ("mat", "mat", "[1-3]_[1-3]"),
     ("optical", "vicon_orientation", "[wxyz]"),
-    ("time", "time(?:_?stamp)?|ts?|epoch|elapsed", ""),
-    ("counter", "(?:packet)?counter|frame_?number", ""),
+    (
+        "time",
+        "(?:(?:sample|system|sensor|elapsed|date|local|chip)_?)?time(?:_?stamp)?|ts?|epoch|(?:s_)?elapsed",
+        "",
+    ),
+    ("counter", "(?:packet|sample)?_?(?:counter|number|index)|(?:frame|sample)_?(?:number|no)?|seq", ""),
     ("ticks", "sampletimefine", ""),
+    ("utc", "utc", "year|month|day|hour|minute|s|nano"),
 )
 """Quantity, its names with other characters than letters and digits as underscores, and those of its axes."""
 
@@ -56,30 +66,38 @@ _PATTERNS = [
     (
         quantity,
         re.compile(
-            rf"(?:(?:imu|field|sensor|shimmer)_)*(?:{names})(?:_rs_s|_ln|_wr|_unix)?_?({axes})(?:_cal)?(?:_(.+))?$"
+            rf"(?:(?:imu|field|sensor|shimmer(?:_[0-9a-f]{{4}})?)_)*(?:{names})(?:_rs_s|_ln|_wr|_unix|_startup)?_?({axes})(?:_cal)?(?:_(.+))?$"
         ),
     )
     for quantity, names, axes in _COLUMNS
 ]
+_FORCE_UNITS = {"m_s2": 1.0, "m_s_2": 1.0, "m_s_s": 1.0, "g": g, "mg": 1e-3 * g}
+_RATE_UNITS = (
+    {"rad_s": 1.0, "mrad_s": 1e-3} | dict.fromkeys(("deg_s", "dps", "°_s"), _DEG) | {"mdps": 1e-3 * _DEG}
+)
 _UNITS = {
-    "acc": {"m_s2": 1.0, "m_s_2": 1.0, "m_s_s": 1.0, "g": g, "mg": 1e-3 * g},
-    "gyr": {
-        "rad_s": 1.0,
-        "rad_s_1": 1.0,
-        "deg_s": _DEG,
-        "dps": _DEG,
-        "°_s": _DEG,
-        "mdps": 1e-3 * _DEG,
-        "mrad_s": 1e-3,
-    },
+    "acc": _FORCE_UNITS,
+    "free": _FORCE_UNITS,
+    "gyr": {f"{unit}{power}": scale for unit, scale in _RATE_UNITS.items() for power in ("", "_1")},
     "mag": dict.fromkeys(_FIELD_UNITS, 1.0),
-    "euler": {"deg": 1.0, "degrees": 1.0, "°": 1.0, "rad": 1.0 / _DEG},
+    "euler": {"deg": 1.0, "°": 1.0, "rad": 1.0 / _DEG},
     "time": TIMES,
 }
 """Units by quantity; the field stays in the unit it is in, and angles are in degrees."""
 
-_SAME = {
-    "quat": {"0": "w", "1": "x", "2": "y", "3": "z"},
+_SPELLINGS = {
+    "s": "(?:per_)?sec(?:ond)?s?",
+    "ms": "m(?:illi)?sec(?:ond)?s?|millis",
+    "us": "(?:u|micro)sec(?:ond)?s?|micros",
+    "ns": "n(?:ano)?sec(?:ond)?s?|nanos",
+    "deg": "degrees?",
+    "rad": "radians?",
+}
+_WORDS = {short: re.compile(rf"(?<![^_])(?:{spelling})(?![^_])") for short, spelling in _SPELLINGS.items()}
+"""Units as they may be spelt out."""
+
+_AXES = {
+    "quat": {"0": "w", "1": "x", "2": "y", "3": "z", "scalar": "w"},
     "euler": {"x": "roll", "y": "pitch", "z": "yaw"},
 }
 """Names of one axis."""
@@ -102,13 +120,17 @@ def column_of(name: str) -> tuple[str, float | None] | None:
     With it comes what turns its numbers to SI units, None if the name states no unit.
     """
     words = re.sub(r"[^a-z0-9°µ]+", "_", name.replace("²", "2")).strip("_")
+    for short, spelling in _WORDS.items():
+        words = spelling.sub(short, words)
+    if words in TIMES:  # as millis
+        return "time", TIMES[words]
     for quantity, pattern in _PATTERNS:
         if match := pattern.match(words):
             axis, unit = match.groups()
             scale = _UNITS.get(quantity, {}).get(unit)
             if unit and scale is None:
                 return None
-            axis = _SAME.get(quantity, {}).get(axis, axis)
+            axis = _AXES.get(quantity, {}).get(axis, axis)
             return (f"{quantity}_{axis}" if axis else quantity), scale
     return None
 
@@ -179,6 +201,7 @@ def number(cell: str) -> float:
     cell = cell.strip().strip('"')
     with suppress(ValueError):
         return float(cell.replace(",", "."))
+    cell = _MILLISECONDS.sub(r".\1", _DATE_DIGIT.sub(r"0\1", cell.replace("/", "-")))
     for text in (cell, f"1970-01-01T{cell}"):
         with suppress(ValueError):
             moment = datetime.fromisoformat(text)

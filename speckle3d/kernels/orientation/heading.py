@@ -60,7 +60,7 @@ FILTER = np.dtype(
         ("ran", "?"),  # ever
         ("rested", "?"),  # in the last bin
         ("beside", "?"),  # iron, since the start
-        ("holding_s", "f8"),  # how long iron is still being put on
+        ("changing_s", "f8"),  # how long iron is still being put on, or left
     ],
     align=True,
 )
@@ -87,8 +87,8 @@ _FREEDOM = 3.0
 _OUTLIER = 25.0
 """Squared misfit that shows iron put on or off, or left: one in 10^5 with normal errors."""
 
-_PUT_ON_S = 3.0
-"""How long putting iron on the sensor takes."""
+_CHANGE_S = 3.0
+"""How long putting iron on the sensor takes, or leaving iron beside it."""
 
 _DOUBT_S, _BESIDE_S = 1.0, 3.0
 """Times of movement after which odds are less by e: of a field that is disbelieved to be the room's after
@@ -167,7 +167,7 @@ def _begin(s: Any, b: Any, m: Any) -> None:
     _forget(s, STRAY, 3, m.first_stray * s.stray)
     s.x[ROOM : ROOM + 3] = b.field / s.norm - b.level @ s.x[IRON : IRON + 3]
     s.bias[:] = b.bias
-    s.holding_s, s.beside = 0.0, m.beside_iron and not s.ran
+    s.changing_s, s.beside = 0.0, m.beside_iron and not s.ran
     s.begun, s.ran, s.rested = True, True, b.resting
 
 
@@ -185,6 +185,9 @@ def _predict(s: Any, b: Any, m: Any, f: FloatArray, q: FloatArray) -> None:
     span, across, along = b.span_s, s.x[ROOM], s.x[ROOM + 1]
     moving, moves_on = 0.0 if b.resting else 1.0, b.resting != s.rested
     keep_bias, keep_stray = math.exp(-span / _BIAS_S), math.exp(-moving * span / _STRAY_S)
+    leaves = m.beside_iron and s.changing_s > 0.0  # iron, and at last for a place as any other
+    place = m.first_place if leaves and s.changing_s > span else m.place
+    new_place = moves_on or leaves
     s.rested = b.resting
     s.x[BIAS : BIAS + 3] -= b.bias - s.bias
     s.bias[:] = b.bias
@@ -193,16 +196,16 @@ def _predict(s: Any, b: Any, m: Any, f: FloatArray, q: FloatArray) -> None:
         turn = moving * span * keep_bias * b.level[2, i]
         f[ROOM, BIAS + i], f[ROOM + 1, BIAS + i] = -turn * along, turn * across
         f[BIAS + i, BIAS + i], f[STRAY + i, STRAY + i] = keep_bias, keep_stray
-        f[PLACE + i, PLACE + i] = 1.0 if s.beside or not moves_on else 0.0
+        f[PLACE + i, PLACE + i] = 1.0 if s.beside or not new_place else 0.0
         q[ROOM + i, ROOM + i] = _WALK_SQRT_S**2 * span
         q[BIAS + i, BIAS + i] = (1.0 - keep_bias**2) * b.bias_variance
-        q[IRON + i, IRON + i] = m.iron_put_on**2 if s.holding_s > 0.0 else 0.0
-        q[PLACE + i, PLACE + i] = m.place**2 if moves_on else 0.0
+        q[IRON + i, IRON + i] = m.iron_put_on**2 if s.changing_s > 0.0 else 0.0
+        q[PLACE + i, PLACE + i] = place**2 if new_place else 0.0
         q[STRAY + i, STRAY + i] = (1.0 - keep_stray**2) * s.stray**2
     q[ROOM, ROOM] += b.slip_rad2 * along * along
     q[ROOM + 1, ROOM + 1] += b.slip_rad2 * across * across
     q[ROOM, ROOM + 1] = q[ROOM + 1, ROOM] = -b.slip_rad2 * across * along
-    s.holding_s = max(s.holding_s - span, 0.0)
+    s.changing_s = max(s.changing_s - span, 0.0)
     s.x[:] = f @ s.x
     s.p[:] = f @ s.p @ f.T + q
 
@@ -248,8 +251,8 @@ def _correct(s: Any, b: Any, m: Any, rows: FloatArray, f: FloatArray, q: FloatAr
 @compiled
 def _changed(s: Any, m: Any, f: FloatArray, q: FloatArray, off: FloatArray, total: FloatArray) -> bool:
     """Whether an outlier is iron put on the sensor, or iron beside it left behind; if so, foresee it."""
-    if m.iron_put_on > 0.0 and s.holding_s <= 0.0:
-        s.holding_s = _PUT_ON_S
+    if m.iron_put_on > 0.0 and s.changing_s <= 0.0:
+        s.changing_s = _CHANGE_S
         for i in range(IRON, IRON + 3):
             s.p[i, i] += m.iron_put_on**2
             q[i, i] += m.iron_put_on**2
@@ -257,11 +260,11 @@ def _changed(s: Any, m: Any, f: FloatArray, q: FloatArray, off: FloatArray, tota
     wide, _ = inverse(total + m.place**2 * np.eye(3))
     if not s.beside or off @ (wide @ off) <= _OUTLIER:
         return False
-    s.beside = False
-    _forget(s, PLACE, 3, m.place)
+    s.beside, s.changing_s = False, _CHANGE_S
+    _forget(s, PLACE, 3, m.first_place)
     f[PLACE : PLACE + 3], q[PLACE : PLACE + 3] = 0.0, 0.0
     for i in range(PLACE, PLACE + 3):
-        q[i, i] = m.place**2
+        q[i, i] = m.first_place**2
     return True
 
 

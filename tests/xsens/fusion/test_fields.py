@@ -14,28 +14,33 @@ SIGMAS = 2.3
 """RMS error over RMS claimed sigma that is still honest: measured 2.0 on line, 2.3 off line."""
 
 KINDS = [
-    ("attached", 5.0),
-    ("attached", 30.0),
-    ("start", 20.0),
-    ("drift", 15.0),
-    ("truncated", 0.25),
+    ("attached", 5.0, 20),
+    ("attached", 30.0, 20),
+    ("start", 20.0, 20),
+    ("start", 30.0, 26),
+    ("drift", 15.0, 20),
+    ("wander", 20.0, 27),
+    ("truncated", 0.25, 20),
 ]
+"""Field, how much of it, and a seed: some fields are hard, others easy, and no more than `SIGMAS` is honest."""
+
+WANDERING = ("drift", "wander")
+"""No filter follows north by a field that turns: its error is claimed."""
 
 
 @cache
-def made(kind, amount):
-    rng = np.random.default_rng([20, *kind.encode()])
-    return scene(simulate_motion(rng, 120.0 if kind == "drift" else 60.0), kind, amount, rng)
+def recording(kind, amount, seed):
+    rng = np.random.default_rng([seed, *kind.encode()])
+    return scene(simulate_motion(rng, 120.0 if kind in (*WANDERING, "start") else 60.0), kind, amount, rng)
 
 
 @pytest.mark.parametrize("methods", [ONLINE, OFFLINE], ids=["on-line", "off-line"])
-@pytest.mark.parametrize(("kind", "amount"), KINDS)
-def test_no_heading_is_confident_and_wrong(kind, amount, methods):
-    one = made(kind, amount)
-    theirs, ours = (estimate(one.log, method) for method in methods)
-    peer, own = (errors_deg(each.wxyz, one.true_wxyz, one.moving)[1] for each in (theirs, ours))
-    sigma = rms_deg(ours.sigma_rad[counting(one.true_wxyz, one.moving), 2])
-    # No filter follows north by a field that turns: its error is claimed.
-    assert own <= max(SIGMAS * sigma, WORSE * peer * (kind != "drift")), (
-        f"{own:.2f}, claimed {sigma:.2f}, VQF {peer:.2f}"
+@pytest.mark.parametrize(("kind", "amount", "seed"), KINDS)
+def test_no_heading_is_confident_and_wrong(kind, amount, seed, methods):
+    log, true, moving = recording(kind, amount, seed)
+    vqf, estimated = (estimate(log, method) for method in methods)
+    vqf_error, error = (errors_deg(result.wxyz, true, moving)[1] for result in (vqf, estimated))
+    sigma = rms_deg(estimated.sigma_rad[counting(true, moving), 2])
+    assert error <= max(SIGMAS * sigma, WORSE * vqf_error * (kind not in WANDERING)), (
+        f"{error:.2f}, claimed {sigma:.2f}, VQF {vqf_error:.2f}"
     )

@@ -3,7 +3,10 @@
 import numpy as np
 import pytest
 from imu_logs import WORLDS, samples
+from scipy.spatial.transform import Rotation
 
+from speckle3d.core.errors import InvalidInputError
+from xsens.logs.parts import Hints
 from xsens.logs.textlogs import parse_text
 
 VECTORS = ("accelerometer_m_s2", "gyroscope_rad_s", "magnetometer_au")
@@ -113,6 +116,11 @@ ROS = [
     for axis in "xyz"
 ]
 SHORT = [f"{quantity}{axis}" for quantity in "agm" for axis in "xyz"]
+SPELT = [
+    f"{name} {axis} ({unit})"
+    for name, unit in (("Accelerometers", "m/s^2"), ("Gyroscopes", "degrees per second"), ("Mag", "uT"))
+    for axis in "XYZ"
+]
 UNITS = [f"{name} ({unit})" for name, unit in zip(PLAIN, 3 * ["g"] + 3 * ["deg/s"] + 3 * ["uT"], strict=True)]
 
 
@@ -122,6 +130,8 @@ UNITS = [f"{name} ({unit})" for name, unit in zip(PLAIN, 3 * ["g"] + 3 * ["deg/s
         (["time_s", *PLAIN], "|", (1.0, 1.0, 1.0)),
         (["timestamp", *ROS], ",", (1e9, 1.0, 1.0)),
         (["t", *SHORT], ";", (1e3, 1.0, 1.0)),
+        (["millis", *SHORT], ";", (1e3, 1.0, 1.0)),
+        (["Time Startup (nanoseconds)", *SPELT], ",", (1e9, 1.0, np.rad2deg(1.0))),
         (["#timestamp [us]", *UNITS], "\t", (1e6, 1 / 9.80665, np.rad2deg(1.0))),
         (
             ["time", *PLAIN, "\nms", *3 * ["m/s^2"], *3 * ["deg/s"], *3 * ["a.u."]],
@@ -145,6 +155,49 @@ def test_dates_and_short_counters_that_wrap_round(s):
     rows = [f"2024-05-01T23:59:59.{i:02d}0Z,{(230 + i) % 256},0,0,9.8" for i in range(60) if i != 30]
     log = parse_text("timestamp,counter,acc_x,acc_y,acc_z\n" + "\n".join(rows))
     assert (log.rate_hz, log.lost, log.duration_s) == pytest.approx((100.0, 1, 0.59))
+
+
+def test_steps_of_one_are_samples_unless_they_count_from_1970():
+    def table(times):
+        return "time,acc_x,acc_y,acc_z\n" + "".join(f"{t},0,{i},9.8\n" for i, t in enumerate(times))
+
+    with pytest.raises(InvalidInputError, match="--rate-hz"):
+        parse_text(table(range(50)))
+    assert parse_text(table(range(50)), Hints(rate_hz=100.0)).rate_hz == pytest.approx(100.0)
+    assert parse_text(table(1_714_600_000_000 + np.arange(50))).rate_hz == pytest.approx(1000.0)
+    # Stamps of whole seconds: the samples of each are spread over it.
+    assert parse_text(table(1_714_600_000 + np.arange(300) // 60)).rate_hz == pytest.approx(60.0)
+    assert len(parse_text(table([5]))) == 1
+    with pytest.raises(InvalidInputError, match="rise"):
+        parse_text(table([5] * 50))
+
+
+def test_columns_of_utc_are_a_clock():
+    names = "UTC_Nano UTC_Year UTC_Month UTC_Day UTC_Hour UTC_Minute UTC_Second Acc_X Acc_Y Acc_Z"
+    rows = ["990000000 2024 12 31 23 59 59 0 0 9.8", "0 2025 1 1 0 0 0 0 0 9.8"]
+    log = parse_text("\n".join([names, *rows]))
+    assert log.duration_s == pytest.approx(0.01, abs=1e-6)
+
+
+def test_acceleration_without_gravity_is_no_accelerometers_reading(s):
+    for name, gravity in (("linear_acc", 0.0), ("User Acceleration", 0.0), ("linear_acceleration.", 9.8)):
+        columns = [s["time_s"], s["gyroscope_rad_s"], np.tile([0.1, 0.2, gravity], (60, 1))]
+        names = ["time_s", *PLAIN[3:6], *(f"{name}_{axis}" for axis in "xyz")]
+        log = parse_text(",".join(names) + "\n" + lines(columns, ","))
+        assert (log.accelerometer_m_s2 is None) == (gravity == 0.0)
+        assert any("without gravity" in note for note in log.notes) == (gravity == 0.0)
+
+
+@pytest.mark.parametrize("factor", [1.0, 0.05])
+def test_angles_that_name_no_unit_are_what_gravity_shows(s, factor):
+    turns = Rotation.from_rotvec(factor * s["world_from_sensor"].as_rotvec())
+    force = turns.inv().apply([0.0, 0.0, 9.8])
+    for degrees in (False, True):
+        columns = [s["time_s"], turns.as_euler("xyz", degrees=degrees), force]
+        log = parse_text("time_s,roll,pitch,yaw,ax,ay,az\n" + lines(columns, ","))
+        assert angle_to(log, turns) < 2e-6
+    with pytest.raises(InvalidInputError, match="roll_deg"):
+        parse_text("time_s,roll,pitch,yaw\n0,0.1,0.2,1.0\n0.1,0.1,0.2,1.0\n")
 
 
 def test_of_two_times_without_units_the_first_counts():
