@@ -166,7 +166,7 @@ class HeadingFilter:
         self._filters["begun"] = False
         self._rows = np.zeros(0, STEP)  # steps of a bin that is not whole
         self._north = np.zeros((0, len(UNKNOWN)))  # at the end of the last bin
-        self._lately = np.zeros((0, 2 * _FILTERS + 1))  # angles of the filters, variances, and slip
+        self._lately = np.zeros((0, _FILTERS + 1))  # angles of the filters, and slip
 
     def follow(self, rows: Any, to_end: bool = False) -> FloatArray:
         """`NORTH` after each step by the last whole bin, or else the first; what is left is one `to_end`."""
@@ -228,21 +228,18 @@ class HeadingFilter:
         return likely / likely.sum(axis=1, keepdims=True), best
 
     def _unsteady(self, rows: Any, best: IntArray, bins: Any) -> FloatArray:
-        """Square of what the best filter's north has moved against the gyroscope in a minute, beyond its error.
+        """Square of what the best filter's north has moved against the gyroscope, beyond its error.
 
-        That of a filter whose first place was beside iron moves when it leaves it.
+        Zero in the first minute, in which filters find what the field is.
         """
-        columns = (rows["turn_rad"], rows["variance"], bins["slip_rad2"])
-        lately = np.vstack([self._lately, np.column_stack(columns)])
+        lately = np.vstack([self._lately, np.column_stack([rows["turn_rad"], bins["slip_rad2"]])])
         last = len(self._lately) + np.arange(len(bins))
         first = np.maximum(last - _STEADY, 0)
-        slip = np.cumsum(lately[:, -1])
-        span_s = BIN_S * (last - first)
-        error = slip[last] - slip[first] + bins["bias_variance"] * span_s**2
-        error += np.where(last < _STEADY, lately[first, _FILTERS + best] + lately[last, _FILTERS + best], 0.0)
+        slip = np.cumsum(lately[:, _FILTERS])
+        gyroscope = slip[last] - slip[first] + bins["bias_variance"] * _STEADY_S**2
         self._lately = lately[-_STEADY:]
-        move = _angle(lately[last, best] - lately[first, best])
-        return np.where(best == _BESIDE, 0.0, np.maximum(move**2 - error, 0.0))
+        moved = _angle(lately[last, best] - lately[first, best])
+        return np.where(last < _STEADY, 0.0, np.maximum(moved**2 - gyroscope, 0.0))
 
     def _run(self, bins: Any, arrays: list[FloatArray] | None = None) -> Any:
         """What each filter finds in each bin, shape (n, filters)."""

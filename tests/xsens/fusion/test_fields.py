@@ -19,10 +19,10 @@ KINDS = [
     ("start", 20.0, 20),
     ("start", 30.0, 26),
     ("drift", 15.0, 20),
-    ("wander", 20.0, 27),
+    ("wander", 20.0, 28),
     ("truncated", 0.25, 20),
 ]
-"""Field, how much of it, and a seed: some fields are hard, others easy, and no more than `SIGMAS` is honest."""
+"""Field, how much of it, and a seed: that of a hard one."""
 
 WANDERING = ("drift", "wander")
 """No filter follows north by a field that turns: its error is claimed."""
