@@ -20,15 +20,15 @@ from speckle3d.io.load import load_sweep
 from speckle3d.io.readers import find_reader
 from speckle3d.io.sweep_writer import attach_orientation
 from xsens.logs.clocks import Stamps, timeline
-from xsens.logs.faults import measured
+from xsens.logs.faults import without_faults
 from xsens.logs.samples import Gap, ImuLog
 
 
 def held_log(path: Path) -> ImuLog | None:
     """Log of the sensor that a recording holds; None of what is a log itself."""
     inside = _inside_probe(path)
-    if inside is None and (held := ridden_along(path)) is not None:
-        return log_of(held, path.name)
+    if inside is None and (sensor := ridden_along(path)) is not None:
+        return log_of(sensor, path.name)
     return inside
 
 
@@ -59,7 +59,7 @@ def _inside_probe(path: Path) -> ImuLog | None:
         notes=(*clock.notes, *meaning, *samples.remarks),
         source=path.name,
     )
-    return measured(log)
+    return without_faults(log)
 
 
 def log_of(sensor: OrientationSensor, source: str) -> ImuLog:
@@ -73,15 +73,15 @@ def log_of(sensor: OrientationSensor, source: str) -> ImuLog:
         notes=clock.notes,
         source=source,
     )
-    return measured(log)
+    return without_faults(log)
 
 
 def with_orientation(log: ImuLog, rotations: TimedRotations) -> ImuLog:
     """Replace the sensor's own orientation in a log."""
-    oriented = np.isin(log.time_s, rotations.time_s)
+    rows = np.isin(log.time_s, rotations.time_s)
     quaternions = np.tile([0.0, 0.0, 0.0, 1.0], (len(log), 1))
-    quaternions[oriented] = rotations.world_from_sensor.as_quat()
-    return replace(log, world_from_sensor=Rotation.from_quat(quaternions), oriented=oriented)
+    quaternions[rows] = rotations.world_from_sensor.as_quat()
+    return replace(log, world_from_sensor=Rotation.from_quat(quaternions), oriented=rows)
 
 
 def attach_log(
@@ -104,12 +104,12 @@ def attach_log(
     InvalidInputError
         If the stream covers no frame.
     """
-    kept = np.isin(log.time_s, rotations.time_s)
+    rows = np.isin(log.time_s, rotations.time_s)
     vectors = {}
     for name in INERTIAL:
         values = getattr(log, name)
-        whole = values is not None and bool(np.isfinite(values[kept]).all())
-        vectors[name] = values[kept] if whole and kept.sum() == len(rotations) else None
+        whole = values is not None and bool(np.isfinite(values[rows]).all())
+        vectors[name] = values[rows] if whole and rows.sum() == len(rotations) else None
     sensor = OrientationSensor(rotations, mounting, time_offset_s, **vectors)
     words = ""
     with suppress(InvalidInputError) if replaces else nullcontext():

@@ -87,17 +87,17 @@ class AccuracyTable:
     def text(self) -> str:
         """Mean and standard deviation in degrees as an aligned table."""
         lines = [["degrees", *map(str.capitalize, ANGLES)]]
-        for name, found in self.statistics.items():
-            pairs = np.rad2deg([found["mean"], found["standard deviation"]]).T
+        for name, statistics in self.statistics.items():
+            pairs = np.rad2deg([statistics["mean"], statistics["standard deviation"]]).T
             lines.append([name, *(f"{mean:+.4f} ± {sd:.4f}" for mean, sd in pairs)])
         return text_table(lines).rstrip("\n")
 
     def values(self) -> tuple[tuple[str, float, str], ...]:
         """All statistics as rows of description, value, unit."""
         return tuple(
-            (f"{name}: {angle} error, {what}", float(value), "degrees")
-            for name, found in self.statistics.items()
-            for what, radians in found.items()
+            (f"{name}: {angle} error, {statistic}", float(value), "degrees")
+            for name, statistics in self.statistics.items()
+            for statistic, radians in statistics.items()
             for angle, value in zip(ANGLES, np.rad2deg(radians), strict=True)
         )
 
@@ -160,8 +160,8 @@ def pair_errors(
     turns, reference = _turns(world_from_sensor, reference_from_image)
     # (S C)^-1 (T C) = C^-1 (S^-1 T) C turns by the rotation vector of S^-1 T in the image's axes, so that
     # each pair's rotation vector is computed once for all calibrations.
-    measured = np.einsum("kji,pj->kpi", matrices, turns)
-    errors = _nearest_turn(measured, reference) - reference
+    angles = np.einsum("kji,pj->kpi", matrices, turns)
+    errors = _nearest_turn(angles, reference) - reference
     return PairErrors(len(world_from_sensor), reference[:, ::-1].copy(), errors[..., ::-1].copy())
 
 
@@ -195,15 +195,15 @@ def common_readings(
     if frames < 2:
         raise InvalidInputError(f"frames: expected at least 2, got {frames}")
     times_s = reference.time_s - sensor_offset_s
-    covered = np.flatnonzero(sensor.covers(times_s))
-    if covered.size < 2:
+    common = np.flatnonzero(sensor.covers(times_s))
+    if common.size < 2:
         raise InsufficientDataError(
-            f"expected at least 2 samples of the reference covered by the sensor's, got {covered.size}: the "
+            f"expected at least 2 samples of the reference covered by the sensor's, got {common.size}: the "
             f"reference spans {_span(reference.time_s)}, the sensor with an offset of {sensor_offset_s:g} s "
             f"{_span(sensor.time_s + sensor_offset_s)}"
         )
-    some = covered[np.unique(np.linspace(0, covered.size - 1, frames).round().astype(int))]
-    return sensor.at(times_s[some]), reference.world_from_sensor[some]
+    sample = common[np.unique(np.linspace(0, common.size - 1, frames).round().astype(int))]
+    return sensor.at(times_s[sample]), reference.world_from_sensor[sample]
 
 
 def mounting_from_motion(measured: Rotation, reference: Rotation) -> Rotation:
@@ -243,14 +243,14 @@ def mounting_from_motion(measured: Rotation, reference: Rotation) -> Rotation:
 
 def _turns(measured: Rotation, reference: Rotation) -> tuple[FloatArray, FloatArray]:
     """Rotation vectors between the frames of all pairs by each, in the axes of the body, shape (p, 3)."""
-    n, found = (0 if each.single else len(each) for each in (measured, reference))
-    if found != n:
-        raise MismatchError(f"expected one reference per reading, got {found} and {n}")
+    n, n_reference = (0 if poses.single else len(poses) for poses in (measured, reference))
+    if n_reference != n:
+        raise MismatchError(f"expected one reference per reading, got {n_reference} and {n}")
     if n < 2:
         raise InsufficientDataError(f"expected at least 2 orientations, got {n}")
     first, second = np.triu_indices(n, 1)
-    turned = [(each[first].inv() * each[second]).as_rotvec() for each in (measured, reference)]
-    return turned[0], turned[1]
+    vectors = [(poses[first].inv() * poses[second]).as_rotvec() for poses in (measured, reference)]
+    return vectors[0], vectors[1]
 
 
 def _nearest_turn(turns: FloatArray, reference: FloatArray) -> FloatArray:
@@ -260,9 +260,9 @@ def _nearest_turn(turns: FloatArray, reference: FloatArray) -> FloatArray:
     """
     angle = np.linalg.norm(turns, axis=-1, keepdims=True)
     with np.errstate(divide="ignore", invalid="ignore"):
-        other = np.where(angle > 0, turns * (1.0 - 2.0 * np.pi / angle), turns)
-    nearer = np.linalg.norm(other - reference, axis=-1) < np.linalg.norm(turns - reference, axis=-1)
-    return np.where(nearer[..., None], other, turns)
+        opposite = np.where(angle > 0, turns * (1.0 - 2.0 * np.pi / angle), turns)
+    nearer = np.linalg.norm(opposite - reference, axis=-1) < np.linalg.norm(turns - reference, axis=-1)
+    return np.where(nearer[..., None], opposite, turns)
 
 
 def _span(time_s: FloatArray) -> str:

@@ -51,9 +51,9 @@ class Turn(NamedTuple):
 
 def turns_about(angle: str, experiments: Mapping[str, PairErrors]) -> list[Turn]:
     """Turns about one axis, of at least `FEWEST_FRAMES` frames and nearly as long as the longest."""
-    found = [turn for name, errors in experiments.items() for turn in _turns(name, errors, angle)]
-    longest = max((turn.reference_rad[-1] for turn in found), default=0.0)
-    return [turn for turn in found if turn.reference_rad[-1] >= _SHORTEST * longest]
+    turns = [turn for name, errors in experiments.items() for turn in _turns(name, errors, angle)]
+    longest = max((turn.reference_rad[-1] for turn in turns), default=0.0)
+    return [turn for turn in turns if turn.reference_rad[-1] >= _SHORTEST * longest]
 
 
 def _turns(name: str, errors: PairErrors, angle: str) -> Iterator[Turn]:
@@ -66,10 +66,10 @@ def _turns(name: str, errors: PairErrors, angle: str) -> Iterator[Turn]:
     alone = (np.abs(np.delete(reference, axis, axis=2)) <= OFF_AXIS_RAD).all(axis=2)
     for start in range(n):
         angles = reference[start, :, axis]
-        kept = np.flatnonzero(alone[start] & (angles >= 0))
-        kept = kept[np.argsort(angles[kept], kind="stable")]
-        if kept.size >= FEWEST_FRAMES and angles[kept[-1]] > 0:
-            yield Turn(name, angle, angles[kept], error[:, start, kept])
+        frames = np.flatnonzero(alone[start] & (angles >= 0))
+        frames = frames[np.argsort(angles[frames], kind="stable")]
+        if frames.size >= FEWEST_FRAMES and angles[frames[-1]] > 0:
+            yield Turn(name, angle, angles[frames], error[:, start, frames])
 
 
 def figure_turns(experiments: Mapping[str, PairErrors], title: str = "") -> Figure:
@@ -95,16 +95,16 @@ def figure_turns(experiments: Mapping[str, PairErrors], title: str = "") -> Figu
     ----------
     .. [1] Housden et al., BioMedical Engineering OnLine 7:5, 2008, figure 5.
     """
-    drawn = [turns for angle in ANGLES if (turns := turns_about(angle, experiments))]
-    if not drawn:
+    panels_of_turns = [turns for angle in ANGLES if (turns := turns_about(angle, experiments))]
+    if not panels_of_turns:
         raise InsufficientDataError(
             f"expected at least {FEWEST_FRAMES} frames that differ in one angle only, to within "
             f"{np.rad2deg(OFF_AXIS_RAD):g} degrees, got none: there is no turn to draw"
         )
-    figure = Figure(figsize=(9.0, 2.8 * len(drawn)), layout="constrained")
+    figure = Figure(figsize=(9.0, 2.8 * len(panels_of_turns)), layout="constrained")
     FigureCanvasAgg(figure)
-    panels = figure.subplots(len(drawn), 2, squeeze=False)
-    for (left, right), turns in zip(panels, drawn, strict=True):
+    panels = figure.subplots(len(panels_of_turns), 2, squeeze=False)
+    for (left, right), turns in zip(panels, panels_of_turns, strict=True):
         worst = max(turns, key=lambda turn: float(turn.drift_rad.max()))
         best = min(turns, key=lambda turn: float(turn.drift_rad.min()))
         _draw(left, "worst", worst, int(worst.drift_rad.argmax()))
@@ -114,12 +114,12 @@ def figure_turns(experiments: Mapping[str, PairErrors], title: str = "") -> Figu
     return figure
 
 
-def _draw(axes: Axes, which: str, turn: Turn, calibration: int) -> None:
+def _draw(axes: Axes, rank: str, turn: Turn, calibration: int) -> None:
     reference = np.rad2deg(turn.reference_rad)
-    measured = reference + np.rad2deg(turn.error_rad[calibration])
+    sensed = reference + np.rad2deg(turn.error_rad[calibration])
     axes.plot(reference, color="black", linewidth=2.2, alpha=0.55, label="reference")
-    axes.plot(measured, "o--", color=_COLOURS[turn.angle], markersize=4, linewidth=1.3, label="sensor")
-    title = f"{which} {turn.angle}: {turn.experiment}, calibration {calibration + 1}"
+    axes.plot(sensed, "o--", color=_COLOURS[turn.angle], markersize=4, linewidth=1.3, label="sensor")
+    title = f"{rank} {turn.angle}: {turn.experiment}, calibration {calibration + 1}"
     axes.set_title(title, fontsize="medium", parse_math=False)
     axes.set_xlabel("orientation in the turn")
     axes.set_ylabel(f"{turn.angle} / degrees")

@@ -144,8 +144,8 @@ def _table(text: str, where: str) -> dict[str, FloatArray]:
     except ValueError as error:
         raise InvalidInputError(f"{where}: expected as many numbers in every line, got others") from error
     table = dict(zip(names, columns, strict=False))
-    needed = {"tilt", "yaw", "time"} if "until" in table else {"tilt", "yaw"}
-    if len(table) != len(columns) or not needed <= set(table) or not np.isfinite(columns).all():
+    required = {"tilt", "yaw", "time"} if "until" in table else {"tilt", "yaw"}
+    if len(table) != len(columns) or not required <= set(table) or not np.isfinite(columns).all():
         raise InvalidInputError(
             f"{where}: expected settings of tilt and yaw, perhaps roll, time_s and with it until_s, "
             f"got {len(lines)} of {len(columns)} columns"

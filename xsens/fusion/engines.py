@@ -13,10 +13,10 @@ from speckle3d.core.arrays import FloatArray
 from speckle3d.kernels.orientation import inclination as kernel
 from speckle3d.kernels.orientation.smoothing import orient_samples, smooth_steps
 from xsens.fusion.heading import UNKNOWN, HeadingFilter, averaged_bins, lasts_of_bins, steps_per_bin
-from xsens.fusion.readings import Estimate, Samples, turned
+from xsens.fusion.readings import Estimate, Samples, turn_about_up
 from xsens.fusion.settings import FusionSettings
 
-_CLAIMED = np.array([0.6, 0.6, 1.0])
+_CLAIMED_SHARES = np.array([0.6, 0.6, 1.0])
 """Of the filter's deviation of inclination, what is claimed. The hand's velocity, an error that persists, is
 taken for white noise as strong at low frequencies: so it is for the smoother, but the filter sees less of it.
 Measured on twelve trials of BROAD (Laidig et al. 2021)."""
@@ -87,21 +87,21 @@ class Filter:
         north = np.tile(UNKNOWN, (len(rows), 1))
         if self._settings.use_magnetometer:
             north = self._heading.follow(rows, to_end)
-        done = np.searchsorted(rows["last"], np.arange(1, len(samples) + 1), side="right")
-        done = np.maximum(done + len(self.last) - 1, 0)
-        known, north = np.concatenate([self.last, rows]), np.concatenate([self._north, north])
-        self.last, self._north = known[-1:], north[-1:]
-        if not len(known):
-            known, north = np.zeros(1, kernel.STEP), np.array([UNKNOWN])
-        sd = known["sd"][done, :3] * _CLAIMED
+        step_of_sample = np.searchsorted(rows["last"], np.arange(1, len(samples) + 1), side="right")
+        step_of_sample = np.maximum(step_of_sample + len(self.last) - 1, 0)
+        steps, north = np.concatenate([self.last, rows]), np.concatenate([self._north, north])
+        self.last, self._north = steps[-1:], north[-1:]
+        if not len(steps):
+            steps, north = np.zeros(1, kernel.STEP), np.array([UNKNOWN])
+        sd = steps["sd"][step_of_sample, :3] * _CLAIMED_SHARES
         if self._settings.use_magnetometer:
-            sd[:, 2] = north[done, 1]
-        turn, _, disturbed, stray, iron = north[done].T
-        bias, resting = known["bias"][done], known["resting"][done]
-        return Estimate(turned(turn, xyzw), sd, bias, disturbed > 0.0, resting, stray, iron)
+            sd[:, 2] = north[step_of_sample, 1]
+        turn, _, distrust, stray, iron = north[step_of_sample].T
+        bias, resting = steps["bias"][step_of_sample], steps["resting"][step_of_sample]
+        return Estimate(turn_about_up(turn, xyzw), sd, bias, distrust > 0.0, resting, stray, iron)
 
 
-def smoothed(samples: Samples, settings: FusionSettings) -> Estimate:
+def smooth(samples: Samples, settings: FusionSettings) -> Estimate:
     """Orientation of a stretch by all its samples; it must be longer than the filter's start, a second."""
     rows, _, covariance, transition = Filter(settings).steps(samples, to_end=True, covariances=True)
     n, first = len(rows), int(np.argmax(rows["started"]))
@@ -115,7 +115,7 @@ def smoothed(samples: Samples, settings: FusionSettings) -> Estimate:
         of_bins = HeadingFilter(settings, online=False).smooth(bins)
         time_s = np.append(0.0, np.cumsum(rows["duration_s"]))
         ends_s = time_s[1:][lasts_of_bins(n, settings)]
-        nodes = turned(np.interp(time_s, ends_s, np.unwrap(of_bins[:, 0])), nodes)
+        nodes = turn_about_up(np.interp(time_s, ends_s, np.unwrap(of_bins[:, 0])), nodes)
         sd[:, 2] = np.interp(time_s[1:], ends_s, of_bins[:, 1])
         north = of_bins[np.arange(n) // steps_per_bin(settings)]
     elif settings.use_magnetometer:
@@ -123,6 +123,6 @@ def smoothed(samples: Samples, settings: FusionSettings) -> Estimate:
     xyzw, rates = np.empty((len(samples), 4)), np.ascontiguousarray(samples.rate_rad_s)
     orient_samples(samples.step_s, rates, rows, nodes, biases, xyzw)
     of_step = np.repeat(np.arange(n), np.diff(rows["last"], prepend=0))
-    _, _, disturbed, stray, iron = north[of_step].T
+    _, _, distrust, stray, iron = north[of_step].T
     resting = rows["resting"][of_step]
-    return Estimate(xyzw, sd[of_step], biases[1:][of_step], disturbed > 0.0, resting, stray, iron)
+    return Estimate(xyzw, sd[of_step], biases[1:][of_step], distrust > 0.0, resting, stray, iron)

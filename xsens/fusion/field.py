@@ -24,7 +24,7 @@ beyond which a reconstruction is better off without."""
 _WORST = 95.0
 """Percentile of the heading's standard deviation that counts: the first second is the worst."""
 
-_SOME, _MOST = 0.1, 0.5
+_LEAST_SHARE, _MOST = 0.1, 0.5
 """Shares of readings that may be disbelieved: iron passed by, and a field that tells nothing."""
 
 ROUGH = 0.03
@@ -84,18 +84,18 @@ class FieldFound:
         """Whether the magnetometer can be trusted, why, and what to do if it cannot."""
         if self.trust is Trust.UNKNOWN:
             return f"The magnetometer {self.trust} here: it has told nothing of the heading yet."
-        held, drift = math.degrees(self.heading_sd_rad), math.degrees(self.drift_rad)
+        sd_deg, drift = math.degrees(self.heading_sd_rad), math.degrees(self.drift_rad)
         alone = ""
         if math.isfinite(drift):
             alone = f"; the gyroscope alone drifts by {drift:.1f}\N{DEGREE SIGN} in {self.duration_s:.0f} s"
         doubts = [words for words, so in self._doubts().items() if so]
         advice = ""
-        if drift < held:
+        if drift < sd_deg:
             advice = " Within this recording the gyroscope alone does better (--no-magnetometer)."
         elif self.trust is Trust.NO:
             advice = " Move away from iron and motors, or leave it out (--no-magnetometer)."
         return (
-            f"The magnetometer {self.trust} here: with it the heading is known to {held:.1f}\N{DEGREE SIGN}"
+            f"The magnetometer {self.trust} here: with it the heading is known to {sd_deg:.1f}\N{DEGREE SIGN}"
             f"{alone} (standard deviation). The field changes by {100.0 * self.stray:.1f} % from place to "
             f"place, and {100.0 * self.disbelieved:.1f} % of its readings are disbelieved."
             + "".join(f" {words}." for words in doubts)
@@ -106,14 +106,14 @@ class FieldFound:
         return {
             "Part of it turns with the sensor, as by iron on the probe, and is taken off": self.iron > 0.5,
             "Such a field is rough: iron or motors are near": self.stray > ROUGH,
-            "Something magnetic comes near at times": self.disbelieved > _SOME,
+            "Something magnetic comes near at times": self.disbelieved > _LEAST_SHARE,
             f"A good field holds the heading to {math.degrees(HELD_RAD):.1f}\N{DEGREE SIGN}": (
                 self.heading_sd_rad > HELD_RAD
             ),
         }
 
 
-def field_of(log: ImuLog, found: Orientation) -> FieldFound:
+def field_of(log: ImuLog, orientation: Orientation) -> FieldFound:
     """What the orientation of a log tells of the magnetic field.
 
     Parameters
@@ -127,15 +127,15 @@ def field_of(log: ImuLog, found: Orientation) -> FieldFound:
     InsufficientDataError
         As `orient` does.
     """
-    if not found.magnetic or not np.isfinite(found.field_stray).any():
+    if not orientation.magnetic or not np.isfinite(orientation.field_stray).any():
         return FieldFound(math.pi, 0.0, math.nan, math.nan, duration_s=log.duration_s)
     alone = orient(log, FusionSettings(use_magnetometer=False))
-    heading = found.standard_deviation_rad[:, 2]
+    heading = orientation.standard_deviation_rad[:, 2]
     return FieldFound(
         heading_sd_rad=float(np.percentile(heading, _WORST)),
-        disbelieved=float(found.disturbed.mean()),
-        stray=float(np.nanmedian(found.field_stray)),
-        iron=float(np.nanmedian(found.field_iron)),
+        disbelieved=float(orientation.disturbed.mean()),
+        stray=float(np.nanmedian(orientation.field_stray)),
+        iron=float(np.nanmedian(orientation.field_iron)),
         drift_rad=float(alone.standard_deviation_rad[-1, 2]),
         duration_s=log.duration_s,
     )
@@ -144,8 +144,8 @@ def field_of(log: ImuLog, found: Orientation) -> FieldFound:
 def field_now(state: OnlineState, disbelieved: float) -> FieldFound:
     """What a filter finds of the field while samples arrive, with the share it disbelieved lately."""
     sd_rad = float(state.standard_deviation_rad[2])
-    found = FieldFound(sd_rad, disbelieved, state.field_stray, state.field_iron)
-    return found if state.started else replace(found, stray=math.nan)
+    field = FieldFound(sd_rad, disbelieved, state.field_stray, state.field_iron)
+    return field if state.started else replace(field, stray=math.nan)
 
 
 def dip_rad(field_in_world: FloatArray) -> FloatArray:

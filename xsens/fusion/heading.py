@@ -57,7 +57,7 @@ _FIRST_STRAY = 0.25
 """The first reading's stray while samples arrive, as a fraction: the first readings are all there is, and a
 rough room would swing the heading about. A recording tells it in full."""
 
-_DISTRUSTED = 0.5
+_LEAST_TRUST = 0.5
 
 _ROUNDING = 1e-12
 """Variance that keeps covariances invertible: (1 microradian)^2, a millionth of the field, 1 microsecond."""
@@ -118,10 +118,10 @@ def averaged_bins(
     bins["bias"] = bias_rad_s[lasts]
     bins["bias_variance"] = (sd[lasts, 3:] ** 2).mean(axis=1) + settings.moving_bias_rad_s**2
     bins["tilt_rad2"] = np.add.reduceat((sd[:, :2] ** 2).mean(axis=1), firsts) / counts
-    seen = finite_rows(rows["field"])
-    readings = np.add.reduceat(seen.astype(float), firsts)[:, None]
+    readable = finite_rows(rows["field"])
+    readings = np.add.reduceat(readable.astype(float), firsts)[:, None]
     bins["seen"] = readings[:, 0] > 0.0
-    field, level = np.where(seen[:, None], rows["field"], 0.0), Rotation.from_quat(levels)
+    field, level = np.where(readable[:, None], rows["field"], 0.0), Rotation.from_quat(levels)
     bins["level"] = np.add.reduceat(level.as_matrix(), firsts) / counts[:, None, None]
     turning = np.cross(rows["rate"] - bias_rad_s, field)
     for name, vectors in (("field", field), ("field_rate", turning)):
@@ -172,7 +172,7 @@ class HeadingFilter:
         """`NORTH` after each step by the last whole bin, or else the first; what is left is one `to_end`."""
         per_bin, before = steps_per_bin(self._settings), len(self._rows)
         rows, north = np.concatenate([self._rows, rows]), self._north
-        done = (np.arange(before, len(rows)) + 1) // per_bin + len(north) - 1
+        bin_of_row = (np.arange(before, len(rows)) + 1) // per_bin + len(north) - 1
         whole = len(rows) if to_end else len(rows) // per_bin * per_bin
         self._rows = rows[whole:]
         if whole:
@@ -180,11 +180,11 @@ class HeadingFilter:
             bins = averaged_bins(rows, rows["start"], rows["bias"], rows["sd"], self._settings)
             estimates = self._run(bins)
             weights, best = self._weights(estimates)
-            more = self._unsteady(estimates, best, bins)
-            north = np.concatenate([north, _combine(estimates, weights, best, bins, more)])
+            unsteady = self._unsteady(estimates, best, bins)
+            north = np.concatenate([north, _combine(estimates, weights, best, bins, unsteady)])
         self._north = north[-1:]
         north = north if len(north) else np.array([UNKNOWN])
-        return np.asarray(north[np.clip(done, 0, len(north) - 1)])
+        return np.asarray(north[np.clip(bin_of_row, 0, len(north) - 1)])
 
     def smooth(self, bins: Any) -> FloatArray:
         """North over a whole stretch, smoothed backward; the stray at first is the recording's."""
@@ -238,8 +238,8 @@ class HeadingFilter:
         slip = np.cumsum(lately[:, _FILTERS])
         gyroscope = slip[last] - slip[first] + bins["bias_variance"] * _STEADY_S**2
         self._lately = lately[-_STEADY:]
-        moved = _angle(lately[last, best] - lately[first, best])
-        return np.where(last < _STEADY, 0.0, np.maximum(moved**2 - gyroscope, 0.0))
+        move = _angle(lately[last, best] - lately[first, best])
+        return np.where(last < _STEADY, 0.0, np.maximum(move**2 - gyroscope, 0.0))
 
     def _run(self, bins: Any, arrays: list[FloatArray] | None = None) -> Any:
         """What each filter finds in each bin, shape (n, filters)."""
@@ -255,7 +255,7 @@ def _angle(difference: FloatArray) -> FloatArray:
 def _empty_arrays(*shape: int) -> list[FloatArray]:
     """Arrays for states, covariances, transitions and noises."""
     size = kernel.SIZE
-    return [np.zeros((*shape, *each)) for each in ((size,), *3 * [(size, size)])]
+    return [np.zeros((*shape, *dims)) for dims in ((size,), *3 * [(size, size)])]
 
 
 def _combine(rows: Any, weights: FloatArray, best: IntArray, bins: Any, more_rad2: Any) -> FloatArray:
@@ -264,8 +264,8 @@ def _combine(rows: Any, weights: FloatArray, best: IntArray, bins: Any, more_rad
     off = _angle(rows["turn_rad"] - turn)
     variance = np.minimum((weights * (rows["variance"] + off**2)).sum(axis=1) + more_rad2, np.pi**2)
     trust, stray = ((weights * rows[name]).sum(axis=1) for name in ("trust", "stray"))
-    disturbed = bins["seen"] & (trust < _DISTRUSTED)
-    return np.column_stack([turn, np.sqrt(variance), disturbed, stray, weights[:, _IRON]])
+    distrust = bins["seen"] & (trust < _LEAST_TRUST)
+    return np.column_stack([turn, np.sqrt(variance), distrust, stray, weights[:, _IRON]])
 
 
 def _smooth_backward(

@@ -113,9 +113,11 @@ class OnlineFilter:
             If a step is not positive and finite, the gyroscope is not in rad/s or, by its mean at the start,
             the accelerometer is not in m/s^2.
         """
-        steps, rates, forces, fields = _checked(step_s, gyroscope_rad_s, accelerometer_m_s2, magnetometer_au)
+        steps, rates, forces, fields = _require_readings(
+            step_s, gyroscope_rad_s, accelerometer_m_s2, magnetometer_au
+        )
         for step_s, rate, force, field in zip(map(float, steps), rates, forces, fields, strict=True):
-            reading = self._measured(step_s, rate, force, field)
+            reading = self._reading(step_s, rate, force, field)
             if reading is None:
                 continue
             if reading[0] > PAUSE_S:
@@ -132,20 +134,20 @@ class OnlineFilter:
         """Filter what is pending."""
         if not self._pending:
             return
-        found = self._filter.run(Samples(*map(np.array, zip(*self._pending, strict=True))))
+        estimate = self._filter.run(Samples(*map(np.array, zip(*self._pending, strict=True))))
         self._pending = []
         if len(last := self._filter.last):
             if last["started"][0]:
                 require_metres(self._filter.start_force_m_s2, "accelerometer_m_s2")
             self._state = OnlineState(
-                Rotation.from_quat(found.xyzw[-1]),
-                found.sd_rad[-1],
-                found.bias_rad_s[-1],
-                bool(found.disturbed[-1]),
-                bool(found.resting[-1]),
+                Rotation.from_quat(estimate.xyzw[-1]),
+                estimate.sd_rad[-1],
+                estimate.bias_rad_s[-1],
+                bool(estimate.distrust[-1]),
+                bool(estimate.resting[-1]),
                 bool(last["started"][0]),
-                float(found.field_stray[-1]),
-                float(found.field_iron[-1]),
+                float(estimate.field_stray[-1]),
+                float(estimate.field_iron[-1]),
             )
 
     @property
@@ -154,7 +156,7 @@ class OnlineFilter:
         self._run()
         return self._state
 
-    def _measured(
+    def _reading(
         self, step_s: float, rate: FloatArray, force: FloatArray, field: FloatArray
     ) -> tuple[Any, ...] | None:
         """A sample as `Samples` has it, its step from the last one; None of what is no measurement."""
@@ -165,17 +167,17 @@ class OnlineFilter:
         if not (np.isfinite(rate).all() and self._forceless_s <= PAUSE_S and np.isfinite(self._force).all()):
             return None
         step_s, self._skipped_s = self._skipped_s, 0.0
-        lost = 0.0
+        lost_rad2 = 0.0
         if self._rate is None:
             self._usual_s = min(step_s, PAUSE_S)
         elif step_s > LOST * self._usual_s:
             steps, rates = np.array([0.0, step_s]), np.array([self._rate, rate])
-            lost = float(lost_variance(steps, rates, self._usual_s)[0])
+            lost_rad2 = float(lost_variance(steps, rates, self._usual_s)[0])
         self._usual_s += _FOLLOWS * (min(step_s, LOST * self._usual_s) - self._usual_s)
-        return step_s, rate, self._force, field, lost
+        return step_s, rate, self._force, field, lost_rad2
 
 
-def _checked(
+def _require_readings(
     step_s: npt.ArrayLike,
     gyroscope_rad_s: npt.ArrayLike,
     accelerometer_m_s2: npt.ArrayLike,

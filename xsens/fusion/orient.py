@@ -122,7 +122,7 @@ def orient(
     if not isinstance(log, ImuLog):
         raise InvalidInputError(f"expected an ImuLog, as read_log(path) gives, got {type(log).__name__}")
     settings, method = settings or FusionSettings(), method_of(method)
-    used, samples, notes = usable_samples(log)
+    rows, samples, notes = usable_samples(log)
     if settings.use_magnetometer and not finite_rows(samples.field_au).any():
         notes.append("no magnetometer: the heading is relative to the start")
         settings = replace(settings, use_magnetometer=False)
@@ -135,10 +135,10 @@ def orient(
         notes.append(f"a gyroscope bias of {np.rad2deg(bias):.1f} deg/s: found again, foreseen so large")
         estimate = _estimate(samples, breaks, replace(settings, bias_sd_rad_s=bias), method)
     return Orientation(
-        TimedRotations(log.time_s[used], Rotation.from_quat(estimate.xyzw)),
+        TimedRotations(log.time_s[rows], Rotation.from_quat(estimate.xyzw)),
         estimate.sd_rad,
         estimate.bias_rad_s,
-        estimate.disturbed,
+        estimate.distrust,
         estimate.resting,
         method,
         tuple(notes),
@@ -150,21 +150,23 @@ def orient(
 
 def _estimate(samples: Samples, breaks: IntArray, settings: FusionSettings, method: Method) -> Estimate:
     """Each stretch by the method asked for, or by its on-line twin if it is short."""
-    from xsens.fusion.engines import Filter, smoothed  # which loads numba
+    from xsens.fusion.engines import Filter, smooth  # which loads numba
     from xsens.fusion.vqf_engine import by_vqf
 
     estimates: list[Estimate] = []
-    kept = Filter(settings)
+    online = Filter(settings)
     step_s = float(np.median(samples.step_s))
     for first, last in pairwise([0, *breaks.tolist(), len(samples)]):
         if first == last:
             continue
         stretch = samples[first:last]
         if first:
-            kept.begin(float(stretch.step_s[0]))
+            online.begin(float(stretch.step_s[0]))
             stretch = replace(stretch, step_s=np.append(step_s, stretch.step_s[1:]))
         offline = method.offline and float(stretch.step_s.sum()) > _SHORTEST_S
-        own = smoothed(stretch, settings) if offline else kept.run(stretch, to_end=True)
-        estimates.append(by_vqf(stretch, own, offline, settings.use_magnetometer) if method.is_vqf else own)
+        estimate = smooth(stretch, settings) if offline else online.run(stretch, to_end=True)
+        estimates.append(
+            by_vqf(stretch, estimate, offline, settings.use_magnetometer) if method.is_vqf else estimate
+        )
     columns = zip(*(vars(estimate).values() for estimate in estimates), strict=True)
     return Estimate(*map(np.concatenate, columns)) if len(estimates) > 1 else estimates[0]

@@ -11,7 +11,7 @@ from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from xsens.fusion.settings import BRIDGED_S, LOST
 from xsens.logs.clocks import SHORTEST_S
 from xsens.logs.contradictions import contradictions
-from xsens.logs.faults import measured
+from xsens.logs.faults import without_faults
 from xsens.logs.samples import ImuLog, finite_rows
 
 FORCE_M_S2 = (4.0, 25.0)
@@ -68,7 +68,8 @@ class Estimate:
     sd_rad : ndarray, shape (m, 3)
         About the world's axes.
     bias_rad_s : ndarray, shape (m, 3)
-    disturbed, resting : ndarray of bool, shape (m,)
+    distrust, resting : ndarray of bool, shape (m,)
+        Whether the magnetic field was not trusted, and the sensor lay still.
     field_stray, field_iron : ndarray, shape (m,)
         As `xsens.fusion.heading.NORTH` says; NaN where no field tells the heading.
     """
@@ -76,13 +77,13 @@ class Estimate:
     xyzw: FloatArray
     sd_rad: FloatArray
     bias_rad_s: FloatArray
-    disturbed: BoolArray
+    distrust: BoolArray
     resting: BoolArray
     field_stray: FloatArray
     field_iron: FloatArray
 
 
-def turned(angles_rad: FloatArray | float, xyzw: FloatArray) -> FloatArray:
+def turn_about_up(angles_rad: FloatArray | float, xyzw: FloatArray) -> FloatArray:
     """Quaternions, shape (k, 4), turned about up."""
     c, s = np.cos(0.5 * angles_rad), np.sin(0.5 * angles_rad)
     x, y, z, w = xyzw.T
@@ -109,20 +110,23 @@ def usable_samples(log: ImuLog) -> tuple[IntArray, Samples, list[str]]:
         If times, accelerometer or gyroscope are in other units.
     """
     source = log.source or "log"
-    before, log = len(log.notes), measured(log)
+    before, log = len(log.notes), without_faults(log)
     notes, rate, force = list(log.notes[before:]), log.gyroscope_rad_s, log.accelerometer_m_s2
     if rate is None or force is None:
         missing = (name for name, rows in (("gyroscope", rate), ("accelerometer", force)) if rows is None)
-        got = [f"no {' and no '.join(missing)}"]
-        got += [note for note in log.notes if note.startswith(("columns", "gyro", "accel"))]
+        problems = [f"no {' and no '.join(missing)}"]
+        problems += [note for note in log.notes if note.startswith(("columns", "gyro", "accel"))]
         if log.oriented.any():
-            got.append("--method sensor takes the sensor's own orientation")
-        raise InsufficientDataError(f"{source}: expected gyroscope and accelerometer, got {'; '.join(got)}")
-    turns, told = map(finite_rows, (rate, force))
-    used = np.flatnonzero(_near(log.time_s, turns) & _near(log.time_s, told))
-    if turns[used].sum() < 2 or told[used].sum() < 2:
+            problems.append("--method sensor takes the sensor's own orientation")
         raise InsufficientDataError(
-            f"{source}: expected two samples of gyroscope and accelerometer or more, got {told[used].sum()}"
+            f"{source}: expected gyroscope and accelerometer, got {'; '.join(problems)}"
+        )
+    turns, pulls = finite_rows(rate), finite_rows(force)
+    rows = np.flatnonzero(_near(log.time_s, turns) & _near(log.time_s, pulls))
+    count = min(turns[rows].sum(), pulls[rows].sum())
+    if count < 2:
+        raise InsufficientDataError(
+            f"{source}: expected two samples of gyroscope and accelerometer or more, got {count}"
         )
     steps_s = np.diff(log.time_s)
     median_s, fast = np.median(steps_s), np.percentile(np.linalg.norm(rate[turns], axis=1), _SHOWN_BY)
@@ -131,36 +135,24 @@ def usable_samples(log: ImuLog) -> tuple[IntArray, Samples, list[str]]:
             f"{source}: expected samples {SHORTEST_S:g} to {BRIDGED_S:g} s apart, got a median of "
             f"{median_s:.4g} s: times in milliseconds?"
         )
-    require_metres(force[told], source)
+    require_metres(force[pulls], source)
     if fast > FASTEST_RAD_S:
         raise InvalidInputError(
             f"{source}: expected a gyroscope in rad/s, got one in a hundred over {fast:.3g}: in deg/s?"
         )
     notes += _agreement(log, source)
-    if left_out := len(log) - used.size:
+    if left_out := len(log) - rows.size:
         notes.append(f"{left_out} samples without gyroscope or accelerometer left out")
-    for name, there in (("gyroscope", turns), ("accelerometer", told)):
-        if count := int((~there[used]).sum()):
-            notes.append(f"{count} {name} readings missing: interpolated")
-    time_s, field = log.time_s[used], np.full((used.size, 3), np.nan)
-    if log.magnetometer_au is not None:
-        field = log.magnetometer_au[used]
+    rate, force, turns, pulls, time_s = rate[rows], force[rows], turns[rows], pulls[rows], log.time_s[rows]
+    for name, valid in (("gyroscope", turns), ("accelerometer", pulls)):
+        if not valid.all():
+            notes.append(f"{int((~valid).sum())} {name} readings missing: interpolated")
+    field = np.full((rows.size, 3), np.nan) if log.magnetometer_au is None else log.magnetometer_au[rows]
     step_s = np.diff(time_s, prepend=time_s[0] - np.median(np.diff(time_s)))
-    lost_rad2 = np.zeros(used.size)
-    known = np.flatnonzero(turns[used])
-    lost_rad2[known[1:]] = lost_variance(time_s[known], rate[used][known], float(np.median(step_s)))
-    rate, force = (
-        _bridging(_filled(time_s, rows[used], there[used]), step_s)
-        for rows, there in ((rate, turns), (force, told))
-    )
-    return used, Samples(step_s, rate, force, field, lost_rad2), notes
-
-
-def _filled(time_s: FloatArray, readings: FloatArray, there: BoolArray) -> FloatArray:
-    """Readings, interpolated where missing."""
-    if there.all():
-        return readings
-    return np.column_stack([np.interp(time_s, time_s[there], column[there]) for column in readings.T])
+    lost_rad2 = np.zeros(rows.size)
+    lost_rad2[np.flatnonzero(turns)[1:]] = lost_variance(time_s[turns], rate[turns], float(np.median(step_s)))
+    rate, force = (_interpolated_means(time_s, step_s, *part) for part in ((rate, turns), (force, pulls)))
+    return rows, Samples(step_s, rate, force, field, lost_rad2), notes
 
 
 def lost_variance(time_s: FloatArray, rate_rad_s: FloatArray, usual_s: float) -> FloatArray:
@@ -169,8 +161,8 @@ def lost_variance(time_s: FloatArray, rate_rad_s: FloatArray, usual_s: float) ->
     Its shape is (m - 1,). The rate may change as much as it did from the sample before to the one after.
     """
     step_s, change = np.diff(time_s), np.diff(rate_rad_s, axis=0)
-    lost = (step_s > LOST * usual_s) & (step_s <= PAUSE_S)
-    return np.where(lost, step_s**2 * np.einsum("ij,ij->i", change, change), 0.0)
+    gap = (step_s > LOST * usual_s) & (step_s <= PAUSE_S)
+    return np.where(gap, step_s**2 * np.einsum("ij,ij->i", change, change), 0.0)
 
 
 def _agreement(log: ImuLog, source: str) -> list[str]:
@@ -178,27 +170,29 @@ def _agreement(log: ImuLog, source: str) -> list[str]:
 
     An orientation that contradicts both is noted.
     """
-    told = contradictions(log)
-    against = [text for text in told.values() if text]
-    if not against:
-        return []
-    if told.get("accelerometer") == "":
+    sentences = contradictions(log)
+    against = [text for text in sentences.values() if text]
+    if not against or sentences.get("accelerometer") == "":
         return against
     raise InvalidInputError(f"{source}: {against[0]}")
 
 
-def _bridging(readings: FloatArray, step_s: FloatArray) -> FloatArray:
+def _interpolated_means(
+    time_s: FloatArray, step_s: FloatArray, readings: FloatArray, valid: BoolArray
+) -> FloatArray:
     """Mean reading since the sample before, shape (m, 3), where samples between the two were lost.
 
     A reading tells the last usual step alone; before that it is taken for the mean of the two.
     """
+    if not valid.all():
+        readings = np.column_stack([np.interp(time_s, time_s[valid], axis[valid]) for axis in readings.T])
     usual = float(np.median(step_s))
     late = np.flatnonzero((step_s > LOST * usual) & (step_s <= PAUSE_S))
     if not late.size:
         return readings
-    told = (usual / step_s[late])[:, None]
+    share = (usual / step_s[late])[:, None]
     means = readings.copy()
-    means[late] = 0.5 * ((1.0 + told) * readings[late] + (1.0 - told) * readings[late - 1])
+    means[late] = 0.5 * ((1.0 + share) * readings[late] + (1.0 - share) * readings[late - 1])
     return means
 
 
@@ -213,13 +207,13 @@ def require_metres(force_m_s2: FloatArray, source: str) -> None:
         )
 
 
-def _near(time_s: FloatArray, there: BoolArray) -> BoolArray:
-    """Where a reading is there, or one before and one after it at most a bridged pause apart."""
-    known = time_s[there]
-    if there.all() or not known.size:
-        return there
-    after = np.searchsorted(known, time_s)
-    before = np.searchsorted(known, time_s, side="right") - 1
-    inside = (after < known.size) & (before >= 0)
-    span = known[np.minimum(after, known.size - 1)] - known[np.maximum(before, 0)]
+def _near(time_s: FloatArray, valid: BoolArray) -> BoolArray:
+    """Where a reading is valid, or one before and one after it at most a bridged pause apart."""
+    valid_s = time_s[valid]
+    if valid.all() or not valid_s.size:
+        return valid
+    after = np.searchsorted(valid_s, time_s)
+    before = np.searchsorted(valid_s, time_s, side="right") - 1
+    inside = (after < valid_s.size) & (before >= 0)
+    span = valid_s[np.minimum(after, valid_s.size - 1)] - valid_s[np.maximum(before, 0)]
     return np.asarray(inside & (span <= PAUSE_S))

@@ -14,10 +14,10 @@ from scipy.spatial.transform import Rotation
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
-from xsens.fusion.readings import Estimate, Samples, turned
+from xsens.fusion.readings import Estimate, Samples, turn_about_up
 
 
-def by_vqf(stretch: Samples, own: Estimate, offline: bool, magnetic: bool) -> Estimate:
+def by_vqf(stretch: Samples, claims: Estimate, offline: bool, magnetic: bool) -> Estimate:
     """Orientation of a stretch by VQF.
 
     Parameters
@@ -43,8 +43,8 @@ def by_vqf(stretch: Samples, own: Estimate, offline: bool, magnetic: bool) -> Es
             "the methods vqf and vqf-online need the package vqf, got none installed: pip install vqf, "
             "which may need a C++ compiler, or choose smoother or filter"
         ) from error
-    known = np.flatnonzero(np.isfinite(stretch.field_au[:, 0]))
-    magnetic = magnetic and known.size > 0
+    with_field = np.flatnonzero(np.isfinite(stretch.field_au[:, 0]))
+    magnetic = magnetic and with_field.size > 0
     place = np.cumsum(stretch.step_s) - stretch.step_s[0]
     mean_s = float(place[-1]) / max(len(place) - 1, 1) or float(stretch.step_s[0])
     # Losses make the mean step longer than the median, bursts shorter: at most two for one.
@@ -57,7 +57,7 @@ def by_vqf(stretch: Samples, own: Estimate, offline: bool, magnetic: bool) -> Es
     rate[0] = stretch.rate_rad_s[0]
     force, field = _at(grid, place, stretch.force_m_s2), None
     if magnetic:
-        field = _at(grid, place[known], stretch.field_au[known])
+        field = _at(grid, place[with_field], stretch.field_au[with_field])
     find = vqf.offlineVQF if offline else vqf.VQF(step_s).updateBatch
     estimate = find(rate, force, field, *([step_s] if offline else []))
     xyzw = estimate["quat9D" if magnetic else "quat6D"][:, [1, 2, 3, 0]]
@@ -68,27 +68,27 @@ def by_vqf(stretch: Samples, own: Estimate, offline: bool, magnetic: bool) -> Es
     xyzw /= np.sqrt(np.einsum("ij,ij->i", xyzw, xyzw))[:, None]
     north_rad = -0.5 * np.pi  # from VQF's world, x east
     if not magnetic:  # about up as the other engine begins
-        first = Rotation.from_quat(own.xyzw[0]) * Rotation.from_quat(xyzw[0]).inv()
+        first = Rotation.from_quat(claims.xyzw[0]) * Rotation.from_quat(xyzw[0]).inv()
         north_rad = 2.0 * float(np.arctan2(*first.as_quat()[2:]))
-    xyzw = turned(north_rad, xyzw)
+    xyzw = turn_about_up(north_rad, xyzw)
     at = np.minimum(np.rint(place).astype(np.int64), len(grid) - 1)
-    detected = estimate["magDistDetected"][at] if magnetic else np.zeros(len(stretch), dtype=bool)
+    disturbance = estimate["magDistDetected"][at] if magnetic else np.zeros(len(stretch), dtype=bool)
     return replace(
-        own,
+        claims,
         xyzw=xyzw,
-        sd_rad=np.minimum(np.hypot(own.sd_rad, _apart(xyzw, own.xyzw)), np.pi),
+        sd_rad=np.minimum(np.hypot(claims.sd_rad, _apart(xyzw, claims.xyzw)), np.pi),
         bias_rad_s=estimate["bias"][at],
-        disturbed=detected,
+        distrust=disturbance,
         resting=estimate["restDetected"][at],
     )
 
 
-def _at(places: FloatArray, known: FloatArray, values: FloatArray) -> FloatArray:
+def _at(places: FloatArray, grid: FloatArray, values: FloatArray) -> FloatArray:
     """Columns interpolated at places, from those at known ones."""
-    return np.column_stack([np.interp(places, known, column) for column in values.T])
+    return np.column_stack([np.interp(places, grid, column) for column in values.T])
 
 
-def _apart(one: FloatArray, other: FloatArray) -> FloatArray:
+def _apart(first: FloatArray, second: FloatArray) -> FloatArray:
     """Turn between quaternions, scalar last, about each of the world's axes, to a sign, rad."""
-    (v, w), (u, z) = ((q[:, :3], q[:, 3:]) for q in (one, other))
+    (v, w), (u, z) = ((q[:, :3], q[:, 3:]) for q in (first, second))
     return np.asarray(2.0 * np.arcsin(np.clip(z * v - w * u - np.cross(v, u), -1.0, 1.0)))

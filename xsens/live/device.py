@@ -33,12 +33,12 @@ _TRIES = 3
 _EVERY = 0xFFFF
 """Rate of an MTData2 item that is sent as often as there is a message."""
 
-_CALIBRATED = (0x4020, 0x8020, 0xC020)
+_VECTOR_ITEMS = (0x4020, 0x8020, 0xC020)
 _CONTENTS = {
     "as set": (0, ()),
     "raw": (OutputMode.RAW, (0xA010,)),
-    "calibrated": (OutputMode.CALIBRATED, _CALIBRATED),
-    "orientation": (OutputMode.CALIBRATED | OutputMode.ORIENTATION, (0x2010, *_CALIBRATED)),
+    "calibrated": (OutputMode.CALIBRATED, _VECTOR_ITEMS),
+    "orientation": (OutputMode.CALIBRATED | OutputMode.ORIENTATION, (0x2010, *_VECTOR_ITEMS)),
 }
 """Output mode of an MTData sensor and items of an MTData2 one."""
 
@@ -103,7 +103,7 @@ class Device:
 
     def receive(self) -> list[Message]:
         """Messages that arrive within a twentieth of a second."""
-        with self._there():
+        with self._on_port():
             data = self._port.read(max(1, self._port.in_waiting))
         if data and self.tap is not None:
             self.tap(data)
@@ -111,11 +111,11 @@ class Device:
 
     def send(self, message: Message) -> None:
         """Send without waiting for an answer."""
-        with self._there():
+        with self._on_port():
             self._port.write(encode(message))
 
     @contextmanager
-    def _there(self) -> Iterator[None]:
+    def _on_port(self) -> Iterator[None]:
         try:
             yield
         except DeviceError:
@@ -125,7 +125,7 @@ class Device:
 
     def request(self, mid: int, payload: bytes = b"", tries: int = _TRIES) -> Message:
         """Answer to a request; `DeviceError` if there is none after `tries`, or it is an error."""
-        with self._there():
+        with self._on_port():
             while self._port.in_waiting:  # a late answer to an earlier request is not one to this
                 self.receive()
         for _ in range(tries):
@@ -166,25 +166,25 @@ def connect(port_name: str, baud: int | None = None) -> Device:
     """
     rates = COMMON_BAUD if baud is None else (baud,)
     for rate in rates:
-        device = Device(_opened(port_name, rate))
+        device = Device(_open_port(port_name, rate))
         with ExitStack() as undo, suppress(DeviceError):
             undo.callback(device.close)
             device.request(MessageId.GO_TO_CONFIG, tries=2 if baud is None else _TRIES)
             undo.pop_all()
             return device
-    tried = ", ".join(str(rate) for rate in rates)
-    raise DeviceError(f"{port_name}: expected a sensor, got no answer at {tried} baud")
+    rates_text = ", ".join(str(rate) for rate in rates)
+    raise DeviceError(f"{port_name}: expected a sensor, got no answer at {rates_text} baud")
 
 
-def _opened(port_name: str, baud: int) -> Serial:
+def _open_port(port_name: str, baud: int) -> Serial:
     """Open a serial port for this process alone: 8 data bits, no parity, 2 stop bits."""
     serial = extra_module("serial", "live", "a live sensor")
     stop = serial.STOPBITS_TWO
     try:
-        opened: Serial = serial.Serial(
+        port: Serial = serial.Serial(
             port_name, baud, stopbits=stop, timeout=_POLL_S, write_timeout=ANSWER_S, exclusive=True
         )
-        return opened
+        return port
     except (OSError, ValueError) as error:
         reason = _first_line(error)
         raise DeviceError(f"{port_name}: cannot be opened as a serial port: {reason}") from error
@@ -212,10 +212,10 @@ def prepare(device: Device, settings: DeviceSettings) -> DeviceInfo:
         rate = round(settings.rate_hz or 100.0)
         items = [(item, rate) for item in _CONTENTS[settings.content][1]]
         items = [(_COUNTER, _EVERY), (_TIME, _EVERY), *items, (_STATUS, _EVERY)]
-        packed = b"".join(struct.pack(">HH", *item) for item in items)
-        outputs = device.request(MessageId.OUTPUT_CONFIGURATION, packed)
-    asked = (device.ask(MessageId.REQ_CONFIGURATION), device.ask(MessageId.REQ_EMTS), outputs)
-    return DeviceInfo(number, tuple(message for message in asked if message is not None))
+        request = b"".join(struct.pack(">HH", *item) for item in items)
+        outputs = device.request(MessageId.OUTPUT_CONFIGURATION, request)
+    answers = (device.ask(MessageId.REQ_CONFIGURATION), device.ask(MessageId.REQ_EMTS), outputs)
+    return DeviceInfo(number, tuple(message for message in answers if message is not None))
 
 
 def _set_legacy(device: Device, settings: DeviceSettings) -> None:

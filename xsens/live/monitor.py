@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 _MOST_PENDING = 1 << 14
 """Messages kept until the state is asked for, as many as eight seconds bring at most."""
-_SEEN = 9
+_RATE_STATES = 9
 """States over which the rate is taken: two seconds if they come four times a second, long against the 16 ms
 between two deliveries of an adapter."""
 
@@ -115,7 +115,7 @@ class Monitor:
     def _begin(self, header: tuple[Message, ...]) -> None:
         self._header = b"".join(map(encode, header))
         self._framer, self._pending = Framer(), list[Message]()
-        self._seen = deque([(time.monotonic(), self._now.samples)], maxlen=_SEEN)
+        self._seen = deque([(time.monotonic(), self._now.samples)], maxlen=_RATE_STATES)
         self._counter: int | None = None
         self._filter: OnlineFilter | None = None
         self._step_s = _NAN
@@ -123,28 +123,28 @@ class Monitor:
     def _set(self, **changes: Any) -> None:
         self._now = replace(self._now, **changes)
 
-    def started(self, header: tuple[Message, ...]) -> None:
+    def begin(self, header: tuple[Message, ...]) -> None:
         """Note that the sensor begins to measure; its counter may start anywhere."""
         with self._lock:
             self._digest()
             self._begin(header)
             self._set(connected=True)
 
-    def arrived(self, received: bytes) -> None:
+    def take(self, data: bytes) -> None:
         """Take in received bytes, in pieces of any size."""
         with self._lock:
-            data = [message for message in self._framer.feed(received) if message.mid in _DATA]
-            self._set(samples=self._now.samples + len(data))
-            self._pending += data
+            messages = [message for message in self._framer.feed(data) if message.mid in _DATA]
+            self._set(samples=self._now.samples + len(messages))
+            self._pending += messages
             if len(self._pending) > _MOST_PENDING:  # nobody has asked for a while
                 self._digest()
 
-    def interrupted(self, reason: str) -> None:
+    def interrupt(self, reason: str) -> None:
         """Note that the connection is lost, or still is."""
         with self._lock:
             self._digest()
-            lost = self._now.interruptions + self._now.connected
-            self._set(connected=False, interruptions=lost, world_from_sensor=None, fused=None, note=reason)
+            count = self._now.interruptions + self._now.connected
+            self._set(connected=False, interruptions=count, world_from_sensor=None, fused=None, note=reason)
 
     def state(self) -> LiveState:
         """The state now."""

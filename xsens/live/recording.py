@@ -88,7 +88,7 @@ class Recorder:
     ) -> None:
         self._port, self._settings = port, settings or DeviceSettings()
         self._baud, self._info = self._settings.baud, DeviceInfo(-1, ())
-        device = self._prepared()
+        device = self._prepare()
         try:
             warm_up()
             self._file = RawFile(path, append)
@@ -122,7 +122,7 @@ class Recorder:
         self._file.sync()
         return self._monitor.state()
 
-    def _prepared(self) -> Device:
+    def _prepare(self) -> Device:
         """The sensor, ready to measure; always the same one."""
         with naming(self._port), ExitStack() as undo:
             device = connect(self._port, self._baud)
@@ -143,24 +143,24 @@ class Recorder:
                         self._measure(device)
                     break
                 except DeviceError as error:
-                    self._monitor.interrupted(str(error))
-                    device = self._found_again()
+                    self._monitor.interrupt(str(error))
+                    device = self._reconnect()
         except Speckle3DError as error:
             self._failure = error
 
-    def _found_again(self) -> Device | None:
+    def _reconnect(self) -> Device | None:
         """The sensor, ready to measure; None if told to stop before it is found."""
         while not self._stop.is_set():
             try:
-                return self._prepared()
+                return self._prepare()
             except (DeviceError, InvalidInputError) as error:  # and no others: a full disk stays full
-                self._monitor.interrupted(str(error))
+                self._monitor.interrupt(str(error))
                 self._stop.wait(RETRY_S)
         return None
 
     def _measure(self, device: Device) -> None:
         self._file.append(b"".join(map(encode, (*self._info.header, utc_message()))))
-        self._monitor.started(self._info.header)
+        self._monitor.begin(self._info.header)
         device.tap = self._take
         device.request(MessageId.GO_TO_MEASUREMENT)
         self._listen(device)
@@ -169,7 +169,7 @@ class Recorder:
 
     def _take(self, data: bytes) -> None:
         self._file.append(data)
-        self._monitor.arrived(data)
+        self._monitor.take(data)
 
     def _listen(self, device: Device) -> None:
         heard = time.monotonic()

@@ -55,7 +55,7 @@ class Stamps:
     Attributes
     ----------
     counter : ndarray of int, shape (m,), optional
-        As `unwrapped` has it.
+        As `unwrap` has it.
     time_s : ndarray, shape (m,), optional
         By the sensor's clock, likewise.
     period_s : float
@@ -71,12 +71,12 @@ class Stamps:
     counter: IntArray | None = None
     time_s: FloatArray | None = None
     period_s: float = float("nan")
-    others: IntArray | None = None
+    extras: IntArray | None = None
     starts: BoolArray | None = None
     computer_s: FloatArray | None = None
 
-    def __getitem__(self, which: Any) -> Stamps:
-        arrays: dict[str, Any] = {k: v[which] for k, v in vars(self).items() if isinstance(v, np.ndarray)}
+    def __getitem__(self, index: Any) -> Stamps:
+        arrays: dict[str, Any] = {k: v[index] for k, v in vars(self).items() if isinstance(v, np.ndarray)}
         return replace(self, **arrays)
 
 
@@ -94,20 +94,20 @@ class Timeline:
     notes: tuple[str, ...] = ()
 
 
-def require_rate(rate_hz: float, what: str) -> None:
+def require_rate(rate_hz: float, name: str) -> None:
     """Raise `InvalidInputError` if no sensor has such a sampling rate."""
     low, high = _RATES_HZ
     if not low <= rate_hz <= high:
-        raise InvalidInputError(f"{what}: expected {low:g} to {high:g} Hz, got {rate_hz:g}")
+        raise InvalidInputError(f"{name}: expected {low:g} to {high:g} Hz, got {rate_hz:g}")
 
 
-def unwrapped(values: Any, span: int) -> Any:
+def unwrap(values: Any, span: int) -> Any:
     """Unwrap a counter or clock that wraps round at a span; one that never falls stays as it is."""
     steps = np.diff(values)
     if (steps >= 0).all():
         return values
     steps = (steps + span // 2) % span - span // 2
-    return values[0] + _summed(steps)
+    return values[0] + _running_sums(steps)
 
 
 def spread(stamps: Stamps, readings: Sequence[FloatArray | None]) -> tuple[Stamps, tuple[str, ...]]:
@@ -119,16 +119,16 @@ def spread(stamps: Stamps, readings: Sequence[FloatArray | None]) -> tuple[Stamp
         return stamps, ()
     steps = np.diff(stamps.time_s)
     together = (steps >= 0.0) & (steps < SHORTEST_S)
-    others = np.any([(rows[1:] != rows[:-1]).any(axis=1) for rows in readings if rows is not None], axis=0)
-    if together.all() or 2 * (together & others).sum() <= steps.size:
+    differ = np.any([(rows[1:] != rows[:-1]).any(axis=1) for rows in readings if rows is not None], axis=0)
+    if together.all() or 2 * (together & differ).sum() <= steps.size:
         return stamps, ()
     first = np.flatnonzero(np.append(True, ~together))
-    counts, arrived_s = np.diff(np.append(first, steps.size + 1)), stamps.time_s[first]
-    spans = np.diff(arrived_s) / counts[1:]
+    counts, arrival_s = np.diff(np.append(first, steps.size + 1)), stamps.time_s[first]
+    spans = np.diff(arrival_s) / counts[1:]
     usual = np.median(spans)
     period_s = np.append(usual, np.minimum(spans, _LONGER * usual))
     before = np.repeat(first + counts - 1, counts) - np.arange(steps.size + 1)
-    time_s = np.repeat(arrived_s, counts) - before * np.repeat(period_s, counts)
+    time_s = np.repeat(arrival_s, counts) - before * np.repeat(period_s, counts)
     note = f"{counts.size} stamps for {time_s.size} samples: spread evenly between stamps"
     return replace(stamps, time_s=time_s), (note,)
 
@@ -147,9 +147,9 @@ def timeline(stamps: Stamps) -> Timeline:
     if stamps.time_s is None and stamps.period_s > 0.0:
         require_rate(1.0 / stamps.period_s, "sampling rate")
     elif stamps.time_s is None:
-        got = "neither" if stamps.counter is None else "a counter, but no rate"
+        evidence = "neither" if stamps.counter is None else "a counter, but no rate"
         raise InvalidInputError(
-            f"expected samples with a clock, or with a sampling rate, got {got}: give --rate-hz"
+            f"expected samples with a clock, or with a sampling rate, got {evidence}: give --rate-hz"
         )
     key, starts = _rising(stamps)
     notes, rows = list[str](), None
@@ -159,17 +159,17 @@ def timeline(stamps: Stamps) -> Timeline:
         late = int((rank < np.maximum.accumulate(rank)).sum())
         notes.append(f"{late} samples came out of order and were sorted")
         key = key[rows]
-    kept = np.append(True, np.diff(key) > 0)
-    if left_out := int((~kept).sum()):
-        rows = (np.arange(kept.size) if rows is None else rows)[kept]
+    distinct = np.append(True, np.diff(key) > 0)
+    if left_out := int((~distinct).sum()):
+        rows = (np.arange(distinct.size) if rows is None else rows)[distinct]
         notes.append(f"{left_out} samples at the time of another were left out")
-        key = key[kept]
+        key = key[distinct]
     if rows is None:
-        return _spaced(stamps, key, starts[1:], notes)
-    return replace(_spaced(stamps[rows], key, np.diff(np.cumsum(starts)[rows]) > 0, notes), rows=rows)
+        return _build(stamps, key, starts[1:], notes)
+    return replace(_build(stamps[rows], key, np.diff(np.cumsum(starts)[rows]) > 0, notes), rows=rows)
 
 
-def _summed(steps: Any) -> Any:
+def _running_sums(steps: Any) -> Any:
     """Sums of steps, from zero on; in one array, as logs may be large."""
     sums = np.zeros(len(steps) + 1, steps.dtype)
     np.cumsum(steps, out=sums[1:])
@@ -197,26 +197,26 @@ def _rising(stamps: Stamps) -> tuple[Any, BoolArray]:
     anew[0] = False
     if anew.any():
         steps[anew[1:]] = LATE * usual
-        values = _summed(steps)
+        values = _running_sums(steps)
     return values, anew
 
 
-def _spaced(stamps: Stamps, key: Any, anew: BoolArray, notes: list[str]) -> Timeline:
+def _build(stamps: Stamps, key: Any, anew: BoolArray, notes: list[str]) -> Timeline:
     """Times, rising counter and gaps of samples in order, without repeats."""
-    period_s, irregular, taken = stamps.period_s, False, None
+    period_s, irregular, periods = stamps.period_s, False, None
     if stamps.counter is not None:
         counts = np.diff(stamps.counter)
-        taken = _by_counter(counts if stamps.others is None else counts - np.diff(stamps.others), anew)
+        periods = _by_counter(counts if stamps.extras is None else counts - np.diff(stamps.extras), anew)
     if stamps.time_s is not None:
         seconds = np.diff(key)
         period_s = float(np.median(seconds[~anew])) if (~anew).any() else float("nan")
-        if taken is None:
-            taken, irregular = _by_clock(seconds, anew)
+        if periods is None:
+            periods, irregular = _by_clock(seconds, anew)
         else:
             _require_agreement(seconds[~anew], counts[~anew], 1.0 / stamps.period_s)
     else:
-        assert taken is not None  # there is a clock or a counter
-        seconds = taken * period_s
+        assert periods is not None  # there is a clock or a counter
+        seconds = periods * period_s
     if irregular:
         shortest, longest = 1e3 * seconds.min(), 1e3 * seconds.max()
         notes.append(
@@ -224,21 +224,21 @@ def _spaced(stamps: Stamps, key: Any, anew: BoolArray, notes: list[str]) -> Time
         )
     if anew.any():
         pauses = _pauses(stamps, anew, seconds)
-        measured = anew & np.isfinite(pauses)
-        seconds = np.where(anew, np.where(measured, pauses, UNKNOWN_PAUSE_S), seconds)
+        certain = anew & np.isfinite(pauses)
+        seconds = np.where(anew, np.where(certain, pauses, UNKNOWN_PAUSE_S), seconds)
         notes.append(
             f"the sensor started anew {anew.sum()} times; the pause is by the computer's clock "
-            f"{measured.sum()} times, else not known and taken as {UNKNOWN_PAUSE_S:g} s"
+            f"{certain.sum()} times, else not known and taken as {UNKNOWN_PAUSE_S:g} s"
         )
     long = (seconds > _LONGER * period_s) & (not irregular)
-    at = np.flatnonzero((taken > 1.5) | anew | long)
-    missing = np.where(anew[at], 0, np.round(np.minimum(taken[at], _MOST_PERIODS)) - 1)
-    gaps = tuple(Gap(int(i), int(lost), float(seconds[i])) for i, lost in zip(at, missing, strict=True))
+    at = np.flatnonzero((periods > 1.5) | anew | long)
+    missing = np.where(anew[at], 0, np.round(np.minimum(periods[at], _MOST_PERIODS)) - 1)
+    gaps = tuple(Gap(int(i), int(count), float(seconds[i])) for i, count in zip(at, missing, strict=True))
     time_s, counter = stamps.time_s, stamps.counter
     if time_s is None or anew.any():
-        time_s = (0.0 if time_s is None else time_s[0]) + _summed(seconds)
+        time_s = (0.0 if time_s is None else time_s[0]) + _running_sums(seconds)
     if counter is not None:
-        counter = counter[0] + _summed(np.maximum(counts, 1))
+        counter = counter[0] + _running_sums(np.maximum(counts, 1))
     return Timeline(slice(None), time_s, counter, gaps, tuple(notes))
 
 
@@ -277,7 +277,7 @@ def _pauses(stamps: Stamps, anew: BoolArray, seconds: FloatArray) -> FloatArray:
     pauses = np.full(anew.size, np.nan)
     if stamps.computer_s is None:
         return pauses
-    running = _summed(np.where(anew, 0.0, seconds))
+    running = _running_sums(np.where(anew, 0.0, seconds))
     behind = stamps.computer_s - running  # constant while the sensor runs, and larger by each pause
     for before, after in pairwise(np.flatnonzero(np.isfinite(behind))):
         if anew[before:after].sum() == 1:

@@ -18,13 +18,13 @@ _MOVING_RAD_S = 0.2
 _TURNING_RAD_S = 0.5
 """RMS rate from which a gyroscope must be followed: below it movement hides it."""
 
-_FOLLOWED = (0.7, 1.6)
+_HONEST_SHARES = (0.7, 1.6)
 """Share of the gyroscope's turn, axis by axis, that the other must show: 1 if all is right, 1/57 if the unit
 is deg/s, another if the rate of samples is, -1 or about 0 if axes are exchanged. BROAD's trials and simulated
 hands show 0.85 to 1.09; rocking once a second about a point 0.07 m above
 the sensor shows 0.7, 0.12 m below it 1.5."""
 
-_ALIKE, _MORE = 0.9, 3.0
+_ALIKE, _TIMES_LARGER = 0.9, 3.0
 """Correlation from which so many times the gyroscope's turn is another unit, not the hand's acceleration."""
 
 _CALM = 0.1
@@ -47,13 +47,13 @@ def contradictions(log: ImuLog) -> dict[str, str]:
     return sentences
 
 
-def _sentence(name: str, gyroscope: FloatArray, other: FloatArray) -> str:
-    rate, shown = _rms(gyroscope), _rms(other)
-    common = float((gyroscope * other).sum(axis=1).mean())
+def _sentence(name: str, gyroscope: FloatArray, reference: FloatArray) -> str:
+    rate, reference_rate = _rms(gyroscope), _rms(reference)
+    common = float((gyroscope * reference).sum(axis=1).mean())
     share = common / max(rate, 1e-9) ** 2
-    if rate > _TURNING_RAD_S and not _FOLLOWED[0] < share < _FOLLOWED[1]:
+    if rate > _TURNING_RAD_S and not _HONEST_SHARES[0] < share < _HONEST_SHARES[1]:
         doubt = "in deg/s" if 0.0 < share < 0.05 else "as it is told, in rate, axes and signs"
-    elif common > _ALIKE * rate * shown and shown > _MORE * rate:
+    elif common > _ALIKE * rate * reference_rate and reference_rate > _TIMES_LARGER * rate:
         doubt = "in rad/s"
     else:
         return ""

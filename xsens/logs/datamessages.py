@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
-from xsens.logs.clocks import COUNTS, TICK_S, TICKS, Stamps, unwrapped
+from xsens.logs.clocks import COUNTS, TICK_S, TICKS, Stamps, unwrap
 from xsens.logs.faults import at_ends
 from xsens.logs.parts import Parts
 from xsens.logs.samples import VECTORS
@@ -21,23 +21,23 @@ from xsens.messages.control import Configuration, MessageId, utc_time_s
 from xsens.messages.framing import Frames, Message
 from xsens.messages.mtdata import DataLayout, OutputMode, as_floats
 from xsens.messages.mtdata2 import ORIENTATIONS, STAMPS, read_items
-from xsens.messages.rawcounts import BLOCK_SIZE, NOT_COMPENSATED, RawCalibration
+from xsens.messages.rawcounts import BLOCK_SIZE, COMPENSATION_NOTE, RawCalibration
 
 _STARTS = (MessageId.WAKE_UP, MessageId.GO_TO_MEASUREMENT_ACK, MessageId.UTC_TIME)
 """Messages after which the sensor's counter may have begun anew."""
 
 
-def _stretches(frames: Frames, which: IntArray) -> Stamps:
+def _stretches(frames: Frames, indices: IntArray) -> Stamps:
     """Mark the data messages before which the sensor was started anew, with the computer's clock then."""
     at = np.flatnonzero(np.isin(frames.mid, _STARTS))
-    after = np.searchsorted(which, at)
-    starts, computer_s = np.zeros(which.size, dtype=bool), None
+    after = np.searchsorted(indices, at)
+    starts, computer_s = np.zeros(indices.size, dtype=bool), None
     for i, place in zip(at.tolist(), after.tolist(), strict=True):
-        if place == which.size:
+        if place == indices.size:
             break
         starts[place] = True
         if frames.mid[i] == MessageId.UTC_TIME:
-            computer_s = np.full(which.size, np.nan) if computer_s is None else computer_s
+            computer_s = np.full(indices.size, np.nan) if computer_s is None else computer_s
             computer_s[place] = utc_time_s(frames.message(i))
     return Stamps(starts=starts, computer_s=computer_s)
 
@@ -46,11 +46,11 @@ def _stretches(frames: Frames, which: IntArray) -> Stamps:
 
 _RAW_VECTORS = ("raw_accelerometer", "raw_gyroscope", "raw_magnetometer")
 _NOTATIONS = ("quaternion_wxyz", "matrix", "euler_deg")
-_WANTED = ("counter", *VECTORS, *_NOTATIONS)
+_READ_FIELDS = ("counter", *VECTORS, *_NOTATIONS)
 
 
-def legacy_samples(frames: Frames, which: IntArray) -> Parts:
-    """Read the samples of the MTData messages at indices `which`.
+def legacy_samples(frames: Frames, indices: IntArray) -> Parts:
+    """Read the samples of the MTData messages at `indices`.
 
     Raises
     ------
@@ -60,21 +60,21 @@ def legacy_samples(frames: Frames, which: IntArray) -> Parts:
     configuration = _last(frames, frames.mid == MessageId.CONFIGURATION, Configuration.from_message)
     blocks = (frames.mid == MessageId.EMTS) & (frames.payload_size == BLOCK_SIZE)
     calibration = _last(frames, blocks, RawCalibration.from_message)
-    layout, notes = _layout(frames[which], configuration), []
-    fits = frames.payload_size[which] == layout.size
+    layout, notes = _layout(frames[indices], configuration), []
+    fits = frames.payload_size[indices] == layout.size
     if not fits.any():
         raise InvalidInputError(f"expected data messages of {layout.size} bytes, as configured, got none")
     if not fits.all():
         notes.append(f"{(~fits).sum()} data messages were not as long as configured: left out")
-        which = which[fits]
+        indices = indices[fits]
     rates = [source.rate_hz for source in (configuration, calibration) if source is not None]
     rate_hz = next((rate for rate in rates if rate > 0.0), float("nan"))
-    data = frames[which]
-    values = {f.name: as_floats(layout.decode(data, f.name)) for f in layout.fields if f.name in _WANTED}
+    data = frames[indices]
+    values = {f.name: as_floats(layout.decode(data, f.name)) for f in layout.fields if f.name in _READ_FIELDS}
     if layout.mode & (OutputMode.RAW | OutputMode.MT9):
         if calibration is None:
             raise InvalidInputError("expected a calibration block before raw counts, got none")
-        notes.append(NOT_COMPENSATED)
+        notes.append(COMPENSATION_NOTE)
         for sensor, name in enumerate(VECTORS):
             counts = layout.decode(data, _RAW_VECTORS[sensor])
             ends = at_ends(counts)  # which the units' mixture of axes would hide
@@ -85,9 +85,9 @@ def legacy_samples(frames: Frames, which: IntArray) -> Parts:
     counter = values.get("counter")
     return Parts(
         replace(
-            _stretches(frames, which),
+            _stretches(frames, indices),
             period_s=1.0 / rate_hz,
-            counter=None if counter is None else unwrapped(counter[:, 0].astype(np.int64), COUNTS),
+            counter=None if counter is None else unwrap(counter[:, 0].astype(np.int64), COUNTS),
         ),
         tuple(map(values.get, VECTORS)),
         next((values[name] for name in _NOTATIONS if name in values), None),
@@ -96,9 +96,9 @@ def legacy_samples(frames: Frames, which: IntArray) -> Parts:
     )
 
 
-def _last(frames: Frames, which: BoolArray, read: Callable[[Message], Any]) -> Any:
+def _last(frames: Frames, indices: BoolArray, read: Callable[[Message], Any]) -> Any:
     """The last of some messages that can be read."""
-    for i in np.flatnonzero(which)[::-1].tolist():
+    for i in np.flatnonzero(indices)[::-1].tolist():
         with suppress(InvalidInputError):
             return read(frames.message(i))
     return None
@@ -122,8 +122,8 @@ def _layout(data: Frames, configuration: Configuration | None) -> DataLayout:
 # -- MTData2
 
 
-def mtdata2_samples(frames: Frames, which: IntArray) -> Parts:
-    """Read the samples of the MTData2 messages at indices `which`.
+def mtdata2_samples(frames: Frames, indices: IntArray) -> Parts:
+    """Read the samples of the MTData2 messages at `indices`.
 
     Messages without a measurement, as those of a satellite receiver, are no samples, but raise the counter.
 
@@ -132,24 +132,24 @@ def mtdata2_samples(frames: Frames, which: IntArray) -> Parts:
     InvalidInputError
         If none holds a measurement, or none a time.
     """
-    items, world, rows, damaged = read_items(frames[which])
+    items, world, rows, damage = read_items(frames[indices])
     notes = []
-    if damaged.any():
-        notes.append(f"{damaged.sum()} messages could not be taken apart and were left out")
+    if damage.any():
+        notes.append(f"{damage.sum()} messages could not be taken apart and were left out")
     stamps = [items.pop(name, None) for name in STAMPS]
     for stamp in stamps:
         rows &= True if stamp is None else np.isfinite(stamp[:, 0])
     if not rows.any():
         raise InvalidInputError(
-            f"expected measurements with a time in {which.size} MTData2 messages, got none"
+            f"expected measurements with a time in {indices.size} MTData2 messages, got none"
         )
-    others = None
+    extras = None
     if not rows.all():
         notes.append(f"{(~rows).sum()} messages without a measurement or its time are no samples")
         items = {name: values[rows] for name, values in items.items()}
-        others, which = np.cumsum(~rows, dtype=np.int64)[rows], which[rows]
+        extras, indices = np.cumsum(~rows, dtype=np.int64)[rows], indices[rows]
     counter, ticks = (
-        None if stamp is None else unwrapped(stamp[rows, 0].astype(np.int64), span)
+        None if stamp is None else unwrap(stamp[rows, 0].astype(np.int64), span)
         for stamp, span in zip(stamps, (COUNTS, TICKS), strict=True)
     )
     force, rate = items.get("acceleration_m_s2"), items.get("rate_of_turn_rad_s")
@@ -162,18 +162,18 @@ def mtdata2_samples(frames: Frames, which: IntArray) -> Parts:
         notes.append("rate of turn is the sensor's orientation increments over its sampling period")
         increments.append(VECTORS[1])
     notation = next((name for name in ORIENTATIONS if name in items), None)
-    own = None if notation is None else items[notation]
-    if own is not None and notation == ORIENTATIONS[1]:
-        own = own.reshape(-1, 3, 3).swapaxes(1, 2).reshape(-1, 9)
+    orientations = None if notation is None else items[notation]
+    if orientations is not None and notation == ORIENTATIONS[1]:
+        orientations = orientations.reshape(-1, 3, 3).swapaxes(1, 2).reshape(-1, 9)
     return Parts(
         replace(
-            _stretches(frames, which),
+            _stretches(frames, indices),
             counter=counter,
             time_s=None if ticks is None else ticks * TICK_S,
-            others=others,
+            extras=extras,
         ),
         (force, rate, items.get("magnetic_field_au")),
-        own,
+        orientations,
         Claim(world or "NWU", "as its messages say"),
         tuple(notes),
         tuple(increments),
@@ -183,6 +183,6 @@ def mtdata2_samples(frames: Frames, which: IntArray) -> Parts:
 def _rotation_vectors(wxyz: FloatArray) -> FloatArray:
     """Rotation vectors of quaternions; NaN of those that are damage."""
     wxyz = quaternions_of(wxyz)
-    there = np.isfinite(wxyz)
-    turns = Rotation.from_quat(np.where(there, wxyz, 1.0), scalar_first=True)
-    return np.where(there[:, :1], turns.as_rotvec(), np.nan)
+    finite = np.isfinite(wxyz)
+    turns = Rotation.from_quat(np.where(finite, wxyz, 1.0), scalar_first=True)
+    return np.where(finite[:, :1], turns.as_rotvec(), np.nan)

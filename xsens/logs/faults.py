@@ -58,7 +58,7 @@ _TURNS_APART = 5.0
 """Of rows in turn of several sensors, how much farther neighbours are apart than rows of one sensor."""
 
 _NOISY = 10.0
-"""Last digits by which readings change that never repeat by chance."""
+"""Last digits by which readings change that are not repeated by chance."""
 
 _WRAPS = 1.5
 """Change between two readings, in largest ones, that is an overflow: twice as much, less what it turned."""
@@ -69,7 +69,7 @@ _LOOKED_AT = 1000
 """Rows on either side of the log's middle that tell whether sensors take turns."""
 
 
-def measured(log: ImuLog) -> ImuLog:
+def without_faults(log: ImuLog) -> ImuLog:
     """The log with all that is no measurement missing, counted in its notes.
 
     Raises
@@ -117,6 +117,12 @@ def _change(rows: FloatArray, order: int) -> FloatArray:
     return np.sqrt(square, out=square)
 
 
+def _digit(readings: FloatArray) -> float:
+    """Smallest change along the rows, of any axis: the last digit of a sensor."""
+    steps = np.abs(np.diff(readings, axis=0))
+    return float(np.min(steps, where=steps > 0.0, initial=np.inf))
+
+
 def _bad(
     name: str, rows: FloatArray, dead: BoolArray, force: FloatArray | None, rate: FloatArray | None
 ) -> dict[str, BoolArray]:
@@ -158,7 +164,7 @@ def _repeats(
 ) -> BoolArray:
     """Rows that repeat the one before for longer than two samples of the sensor's rate, and then change.
 
-    Where readings before and after change by many of their last digits, no sensor at rest repeats one.
+    Where readings before and after change by many of their last digits, none is repeated by chance.
     """
     changes = np.logical_or.reduce([axis[1:] != axis[:-1] for axis in rows.T])
     start = np.flatnonzero(np.append(True, changes))
@@ -169,11 +175,7 @@ def _repeats(
         return np.zeros(len(rows), dtype=bool)
     step = np.pad(_change(rows, 1), 1, constant_values=np.nan)
     before, after = step[start], step[start + length]
-    noisy = np.ones(len(start), dtype=bool)
-    for axis in rows.T:
-        steps = np.abs(np.diff(axis, prepend=np.nan, append=np.nan))
-        digit = np.min(steps, where=steps > 0.0, initial=np.inf)
-        noisy &= np.minimum(steps[start], steps[start + length]) > _NOISY * digit
+    noisy = np.minimum(before, after) > _NOISY * _digit(rows)
     moves = noisy | (after > change) | (np.isnan(after) & (start > 0))
     if name == VECTORS[1]:  # a resting one may read its bias, or zero
         still = np.ones(len(start), dtype=bool)
@@ -197,11 +199,9 @@ def at_ends(rows: FloatArray) -> BoolArray:
             at = np.flatnonzero(axis == end)
             if at.size < 3:
                 continue
-            steps = np.pad(np.diff(axis), 2)  # into each sample from the second before it, and out
-            np.abs(steps, out=steps)
-            digit = np.min(steps, where=steps > 0.0, initial=np.inf)
+            steps = np.abs(np.pad(np.diff(axis), 2))  # into each sample from the second before it, and out
             first, last = at[np.diff(at, prepend=-2) > 1], at[np.diff(at, append=len(axis) + 1) > 1]
-            steep = np.minimum(steps[first], steps[last + 3]) > 3.0 * digit
+            steep = np.minimum(steps[first], steps[last + 3]) > 3.0 * _digit(axis)
             for i, k in zip(first[steep], last[steep], strict=True):
                 others_go_on = (rows[i + 1 : k + 1] != rows[i:k]).any(axis=1).sum() > 1
                 bad[i : k + 1] |= others_go_on

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from speckle3d.core.arrays import FloatArray
 from xsens.logs.clocks import Stamps, require_rate, spread, timeline
-from xsens.logs.faults import measured
+from xsens.logs.faults import without_faults
 from xsens.logs.samples import ImuLog
 from xsens.logs.worlds import Claim, nwu_from, quaternions_of, world_of
 
@@ -69,7 +69,7 @@ class Parts:
     increments: tuple[str, ...] = ()
 
 
-def assembled(parts: Parts, hints: Hints, source: str) -> ImuLog:
+def assemble_log(parts: Parts, hints: Hints, source: str) -> ImuLog:
     """Build the log of samples, without those that are no measurements.
 
     Raises
@@ -81,25 +81,27 @@ def assembled(parts: Parts, hints: Hints, source: str) -> ImuLog:
     stamps, notes, rows = parts.stamps, list(parts.notes), parts.orientations
     if hints.rate_hz is not None:
         stamps = replace(stamps, period_s=1.0 / hints.rate_hz)
-    counted = stamps.counter is not None
-    if not counted and stamps.time_s is None and stamps.period_s > 0.0:
+    has_counter = stamps.counter is not None
+    if not has_counter and stamps.time_s is None and stamps.period_s > 0.0:
         samples = next(len(v) for v in (stamps.starts, *parts.vectors, rows) if v is not None)
         stamps = replace(stamps, counter=np.arange(samples))
         notes.append("samples have no counter: losses cannot be found")
-    own, there = None, np.zeros(0, dtype=bool)
+    rotations, oriented = None, np.zeros(0, dtype=bool)
     if rows is not None:
         wxyz = quaternions_of(rows)
-        there = np.asarray(np.isfinite(wxyz).all(axis=1))
+        oriented = np.asarray(np.isfinite(wxyz).all(axis=1))
         claim = parts.claim if hints.world is None else Claim(hints.world, "as given", final=True)
         world = "NWU" if claim is None else claim.world
-        if claim is not None and not hints.as_stated and there.any():
-            world, told = world_of(claim, wxyz, parts.vectors[0], parts.vectors[2])
-            notes += told
-        own = nwu_from(world) * Rotation.from_quat(np.where(there[:, None], wxyz, 0.5), scalar_first=True)
-        if not there.all():
-            notes.append(f"{int((~there).sum())} samples lack the sensor's own orientation")
-    stamps, shared = spread(stamps, (*parts.vectors, rows))
-    notes += shared
+        if claim is not None and not hints.as_stated and oriented.any():
+            world, world_notes = world_of(claim, wxyz, parts.vectors[0], parts.vectors[2])
+            notes += world_notes
+        rotations = nwu_from(world) * Rotation.from_quat(
+            np.where(oriented[:, None], wxyz, 0.5), scalar_first=True
+        )
+        if not oriented.all():
+            notes.append(f"{int((~oriented).sum())} samples lack the sensor's own orientation")
+    stamps, burst_notes = spread(stamps, (*parts.vectors, rows))
+    notes += burst_notes
     line = timeline(stamps)
     force, rate, field = (None if vectors is None else vectors[line.rows] for vectors in parts.vectors)
     log = ImuLog(
@@ -107,13 +109,13 @@ def assembled(parts: Parts, hints: Hints, source: str) -> ImuLog:
         force,
         rate,
         field,
-        own[line.rows] if own is not None and there.any() else None,
-        line.counter if counted else None,
+        rotations[line.rows] if rotations is not None and oriented.any() else None,
+        line.counter if has_counter else None,
         line.gaps,
         (*notes, *line.notes),
         source,
-        there[line.rows] if there.any() else np.zeros(0, dtype=bool),
+        oriented[line.rows] if oriented.any() else np.zeros(0, dtype=bool),
     )
     for name in parts.increments:
         log = replace(log, **{name: getattr(log, name) * log.rate_hz})
-    return measured(log)
+    return without_faults(log)

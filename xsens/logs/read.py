@@ -13,7 +13,7 @@ from speckle3d.core.arrays import ByteArray, IntArray
 from speckle3d.core.errors import FileError, InvalidInputError, naming
 from speckle3d.core.files import PathLike, open_regular
 from xsens.logs.datamessages import legacy_samples, mtdata2_samples
-from xsens.logs.parts import Hints, assembled
+from xsens.logs.parts import Hints, assemble_log
 from xsens.logs.samples import ImuLog
 from xsens.logs.textlogs import parse_text
 from xsens.messages.control import MessageId
@@ -23,8 +23,8 @@ MOST_BYTES = 1 << 27
 """Of a log: five hours of raw counts at 256 Hz. Reading takes 2.1 times the memory of text, 3.7 to 6 times
 that of messages, whose numbers are shorter than a double: raw counts alone become 3.3 times as large."""
 
-_SNIFFED = 1 << 16
-_DAMAGED = 0.01
+_HEAD_BYTES = 1 << 16
+_DAMAGE_SHARE = 0.01
 _TEXT_CONTROLS = np.array([code < 32 and chr(code) not in "\t\n\r\f" for code in range(256)])
 """Bytes that text does not hold unless it is damaged."""
 
@@ -67,7 +67,7 @@ def read_log(path: PathLike, hints: Hints | None = None) -> ImuLog:
     (4, 2)
     """
     with open_regular(path) as file:
-        head = file.read(_SNIFFED)
+        head = file.read(_HEAD_BYTES)
         size = file.seek(0, os.SEEK_END)
         file.seek(0)
         if size > MOST_BYTES:
@@ -85,7 +85,7 @@ def _is_text(first: bytes) -> bool:
     """Whether hardly any byte is a control character and the bytes hold no message of the sensor."""
     head = np.frombuffer(first, dtype=np.uint8)
     controls = int((_TEXT_CONTROLS[head]).sum())
-    return (first.startswith(_WIDE) or controls <= _DAMAGED * head.size) and not len(find_frames(head))
+    return (first.startswith(_WIDE) or controls <= _DAMAGE_SHARE * head.size) and not len(find_frames(head))
 
 
 # -- the sensor's own bytes
@@ -114,30 +114,30 @@ def parse_stream(data: bytes | ByteArray, hints: Hints | None = None, source: st
     """
     with naming(source):
         frames = find_frames(data)
-        which = _of_one_kind(frames)
-        read = legacy_samples if frames.mid[which[0]] == MessageId.MT_DATA else mtdata2_samples
-        parts = read(frames, which)
-        parts = replace(parts, notes=(*_passed_over(frames, which), *parts.notes))
-        del data, frames, which  # as large as the samples
-        return assembled(parts, hints or Hints(), source)
+        indices = _of_one_kind(frames)
+        read = legacy_samples if frames.mid[indices[0]] == MessageId.MT_DATA else mtdata2_samples
+        parts = read(frames, indices)
+        parts = replace(parts, notes=(*_passed_over(frames, indices), *parts.notes))
+        del data, frames, indices  # as large as the samples
+        return assemble_log(parts, hints or Hints(), source)
 
 
 def _of_one_kind(frames: Frames) -> IntArray:
     """Indices of the data messages of the most common kind and bus id."""
     data = np.flatnonzero(np.isin(frames.mid, _DATA))
     if not data.size:
-        got = f"{len(frames)} others in {frames.data.size} bytes"
+        content = f"{len(frames)} others in {frames.data.size} bytes"
         raise InvalidInputError(
-            f"expected messages with data, got {got if frames.data.any() else 'nothing but zeros'}"
+            f"expected messages with data, got {content if frames.data.any() else 'nothing but zeros'}"
         )
     kinds = frames.mid[data].astype(np.uint16) * 256 + frames.bid[data]
     return np.asarray(data[kinds == np.bincount(kinds).argmax()].astype(frames.start.dtype))
 
 
-def _passed_over(frames: Frames, which: IntArray) -> Iterator[str]:
+def _passed_over(frames: Frames, indices: IntArray) -> Iterator[str]:
     """Notes on bytes and messages that hold no samples of the log."""
-    if runs := frames.skipped():
+    if runs := frames.gaps():
         size = sum(length for _, length in runs)
         yield f"{size} bytes in {len(runs)} places, first at byte {runs[0][0]}, belong to no message"
-    if others := int(np.isin(frames.mid, _DATA).sum()) - which.size:
-        yield f"{others} data messages of another kind or unit were left out"
+    if omitted_count := int(np.isin(frames.mid, _DATA).sum()) - indices.size:
+        yield f"{omitted_count} data messages of another kind or unit were left out"

@@ -19,8 +19,8 @@ import numpy as np
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.parts import whole_file
-from xsens.logs.clocks import COUNTS, SHORTEST_S, TICK_S, TICKS, Stamps, unwrapped
-from xsens.logs.parts import Hints, Parts, assembled
+from xsens.logs.clocks import COUNTS, SHORTEST_S, TICK_S, TICKS, Stamps, unwrap
+from xsens.logs.parts import Hints, Parts, assemble_log
 from xsens.logs.samples import VECTORS, ImuLog
 from xsens.logs.texttables import (
     STAMPS,
@@ -28,7 +28,7 @@ from xsens.logs.texttables import (
     Names,
     TextTable,
     column_of,
-    not_understood,
+    describe_unknown,
     number,
     read_table,
 )
@@ -83,7 +83,7 @@ def parse_text(text: str | Iterable[str], hints: Hints | None = None, source: st
         table = read_table(StringIO(text, newline=None) if isinstance(text, str) else text)
         table = table if table.names else _mt9_export(table)
         parts = _samples(table)
-        return assembled(replace(parts, notes=(*table.notes, *parts.notes)), hints or Hints(), source)
+        return assemble_log(replace(parts, notes=(*table.notes, *parts.notes)), hints or Hints(), source)
 
 
 def _mt9_export(table: TextTable) -> TextTable:
@@ -105,7 +105,7 @@ def _mt9_export(table: TextTable) -> TextTable:
 def _samples(table: TextTable) -> Parts:
     """Samples of a table whose columns are known."""
     columns, notes = dict(table.columns), list[str]()
-    if "time" in columns and table.names and "time" not in table.stated:
+    if "time" in columns and table.names and "time" not in table.with_unit:
         unit = _unit_of(columns["time"], TIMES)
         if unit is None:  # steps of one: milliseconds, or the samples' numbers
             columns.setdefault("counter", columns.pop("time"))
@@ -116,26 +116,26 @@ def _samples(table: TextTable) -> Parts:
                 notes.append(f"times without a unit: taken as in {unit}, by their steps")
     if not columns.keys() & {"time", "ticks"} and (utc_s := _utc_s(columns)) is not None:
         columns["time"] = utc_s
-    stamped = np.ones(len(next(iter(columns.values()), ())), dtype=bool)
+    timely = np.ones(len(next(iter(columns.values()), ())), dtype=bool)
     for key in columns.keys() & set(STAMPS):
-        stamped &= np.abs(columns[key]) < (np.inf if key == "time" else 2.0**53)
-    if not stamped.any():
+        timely &= np.abs(columns[key]) < (np.inf if key == "time" else 2.0**53)
+    if not timely.any():
         raise InvalidInputError("expected lines with a time, got none")
-    if not stamped.all():
-        notes.append(f"{(~stamped).sum()} lines without a time were left out")
-        columns = {key: column[stamped] for key, column in columns.items()}
+    if not timely.all():
+        notes.append(f"{(~timely).sum()} lines without a time were left out")
+        columns = {key: column[timely] for key, column in columns.items()}
     counter, ticks, time_s = (columns.get(key) for key in ("counter", "ticks", "time"))
     dot = any("devicetag" in line.lower() for line in table.header)
     if ticks is not None and time_s is None:
-        ticks = unwrapped(ticks.astype(np.int64), TICKS)
+        ticks = unwrap(ticks.astype(np.int64), TICKS)
         if not dot and _unit_of(ticks, _TICKS) == "DOT":
             dot = True
             notes.append("taken for a DOT's export by its clock: ticks of 1 us, gyroscope in deg/s")
         time_s = ticks * _TICKS["DOT" if dot else "MT Manager"]
     if counter is not None:
-        counter = unwrapped(counter.astype(np.int64), TICKS if dot else COUNTS)
+        counter = unwrap(counter.astype(np.int64), TICKS if dot else COUNTS)
     force, rate, field = (_side_by_side(columns, keys) for keys in _VECTORS)
-    if rate is not None and dot and "gyr_x" not in table.stated:
+    if rate is not None and dot and "gyr_x" not in table.with_unit:
         rate = np.deg2rad(rate)
     if force is None and any(key.startswith("free_") for key in columns):
         force = _side_by_side(columns, [f"free_{axis}" for axis in "xyz"])
@@ -143,32 +143,32 @@ def _samples(table: TextTable) -> Parts:
             force = None
             notes.append("acceleration without gravity is no accelerometer's reading and was left out")
     plain = "time" in table.columns
-    odd = _not_understood(table, plain)
+    odd = _unknown_columns(table, plain)
     claim = None
-    if (own := _side_by_side(columns, _OPTICAL)) is not None:
+    if (orientation := _side_by_side(columns, _OPTICAL)) is not None:
         notes.append("orientation: by cameras, in a world of their own: x and z need not be north and up")
     else:
         claim = _claim(table, plain, dot)
         notations = (_side_by_side(columns, keys) for keys in (_QUATERNION, _MATRIX, _EULER))
-        own = next((rows for rows in notations if rows is not None), None)
+        orientation = next((rows for rows in notations if rows is not None), None)
         if (
             plain
-            and own is not None
-            and own.shape[1] == 3
+            and orientation is not None
+            and orientation.shape[1] == 3
             and table.names
-            and "euler_roll" not in table.stated
+            and "euler_roll" not in table.with_unit
         ):
-            own = own * _degrees(own, force)
-    if all(part is None for part in (force, rate, field, own)):
-        got = "; ".join(odd) or not_understood(table.names)
+            orientation = orientation * _degrees(orientation, force)
+    if all(part is None for part in (force, rate, field, orientation)):
+        columns_text = "; ".join(odd) or describe_unknown(table.names)
         raise InvalidInputError(
-            f"expected columns of acceleration, rate of turn, field or orientation, {got}"
+            f"expected columns of acceleration, rate of turn, field or orientation, {columns_text}"
         )
-    stated = _RATE.search("\n".join(table.header))
-    rate_hz = number(stated[1]) if stated else float("nan")
+    rate_line = _RATE.search("\n".join(table.header))
+    rate_hz = number(rate_line[1]) if rate_line else float("nan")
     period_s = 1.0 / rate_hz if rate_hz > 0.0 else float("nan")
-    sent = Stamps(counter, time_s, period_s)
-    return Parts(sent, (force, rate, field), own, claim, (*odd, *notes))
+    stamps = Stamps(counter, time_s, period_s)
+    return Parts(stamps, (force, rate, field), orientation, claim, (*odd, *notes))
 
 
 def _unit_of(times: FloatArray, units: dict[str, float]) -> str | None:
@@ -233,10 +233,10 @@ def _claim(table: TextTable, plain: bool, dot: bool) -> Claim:
             return Claim(match[2].upper(), "as the file says", final=match[1] == "# world")
     if plain:
         return Claim("NWU", "as plain files are" if table.names else "as the MT9 software's are")
-    return Claim("ENU", "as the sensor's are" if dot else "the program's default", assumed=True)
+    return Claim("ENU", "as the sensor's are" if dot else "the program's default", by_default=True)
 
 
-def _not_understood(table: TextTable, plain: bool) -> Names:
+def _unknown_columns(table: TextTable, plain: bool) -> Names:
     """Note on unknown columns, and on those of a quantity some of whose axes are missing.
 
     A program's exports hold many other columns: of theirs, only those that look like a sensor's are listed.
@@ -246,7 +246,7 @@ def _not_understood(table: TextTable, plain: bool) -> Names:
     for quantity in (*_VECTORS, _QUATERNION):
         columns = [name for name, key in keys.items() if key in quantity]
         odd += columns if len(columns) < len(quantity) else []
-    return (not_understood(filter(None, odd)),) if any(odd) else ()
+    return (describe_unknown(filter(None, odd)),) if any(odd) else ()
 
 
 # -- writing

@@ -20,7 +20,7 @@ from scipy.constants import g
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
-from xsens.logs.clocks import COUNTS, LATE, TICKS, unwrapped
+from xsens.logs.clocks import COUNTS, LATE, TICKS, unwrap
 
 Names = tuple[str, ...]
 Header = list[str]
@@ -135,12 +135,12 @@ def column_of(name: str) -> tuple[str, float | None] | None:
     return None
 
 
-def not_understood(names: Iterable[str]) -> str:
+def describe_unknown(names: Iterable[str]) -> str:
     """Sentence on names of columns, with some of those that are understood."""
     names = list(names)
-    more = f" and {len(names) - 9} more" if len(names) > 9 else ""
-    listed = ", ".join(name[:40] for name in names[:9])
-    return f"columns not understood: {listed}{more} (expected time_s, acc_x, gyr_x_rad_s, mag_x)"
+    rest_count = f" and {len(names) - 9} more" if len(names) > 9 else ""
+    examples = ", ".join(name[:40] for name in names[:9])
+    return f"columns not understood: {examples}{rest_count} (expected time_s, acc_x, gyr_x_rad_s, mag_x)"
 
 
 # -- tables
@@ -150,7 +150,7 @@ def not_understood(names: Iterable[str]) -> str:
 class TextTable:
     """A table of numbers: the lines before it, names in lower case, and the columns that are understood.
 
-    `columns` are in SI units by key, without blank ones, those of `stated` by a unit in their name; where
+    `columns` are in SI units by key, without blank ones, those of `with_unit` by a unit in their name; where
     none has a name, all by number. `notes` count lines of another length than the first or without a digit,
     and cells that hold no number.
     """
@@ -158,7 +158,7 @@ class TextTable:
     header: Header
     names: Names
     columns: dict[str, FloatArray]
-    stated: frozenset[str]
+    with_unit: frozenset[str]
     notes: Names = ()
 
 
@@ -178,12 +178,12 @@ def read_table(lines: Iterable[str]) -> TextTable:
         comment = line.startswith(_COMMENT)
         for separator in () if comment else _SEPARATORS:
             cells, above = _cells(line, separator), _cells(header[-1].lstrip("#% "), separator)
-            for names in (cells, _joined(above, cells)):
+            for names in (cells, _join(above, cells)):
                 if sum(column_of(name) is not None for name in names) >= 2:
-                    return _named(rows, header, names, separator)
+                    return _read_columns(rows, header, names, separator)
             if len(cells) >= 4 and all(cell == "nan" or _is_number(cell) for cell in cells):
                 if len(above) == len(cells) and any(above) and not any(map(_is_number, above)):
-                    return _named(chain([line], rows), header, above, separator)
+                    return _read_columns(chain([line], rows), header, above, separator)
                 columns = {str(i): (i, None) for i in range(len(cells))}
                 return _rows(chain([line], rows), header, (), columns, separator)
         header.append(line.rstrip("\n"))
@@ -224,7 +224,7 @@ def _is_number(cell: str) -> bool:
     return not math.isnan(number(cell))
 
 
-def _joined(above: Names, below: Names) -> Names:
+def _join(above: Names, below: Names) -> Names:
     """Names in two lines, of which the upper one may name a group at its first column alone."""
     names, group = list[str](), ""
     for over, under in zip(above, below, strict=False):
@@ -233,15 +233,15 @@ def _joined(above: Names, below: Names) -> Names:
     return tuple(names) if len(above) == len(below) else ()
 
 
-def _named(rows: Iterator[str], header: Header, names: Names, separator: str | None) -> TextTable:
+def _read_columns(rows: Iterator[str], header: Header, names: Names, separator: str | None) -> TextTable:
     while not names[-1]:  # what a separator at the end of the line makes
         names = names[:-1]
     first = next(rows, "")
     cells = _cells(first, separator)
-    joined = _joined(names, cells)
-    if any(map(column_of, joined)) and not any(map(_is_number, cells)):  # a line of units
-        pairs = zip(names, joined, strict=True)
-        names, first = tuple(both if column_of(both) else name for name, both in pairs), next(rows, "")
+    pairs = _join(names, cells)
+    if any(map(column_of, pairs)) and not any(map(_is_number, cells)):  # a line of units
+        pairs = zip(names, pairs, strict=True)
+        names, first = tuple(pair if column_of(pair) else name for name, pair in pairs), next(rows, "")
     blanks = tuple(part for name in names for part in name.split())
     if len(names) != len(cells) == len(blanks):  # a blank where a tab should be
         names = blanks
@@ -258,7 +258,7 @@ def _named(rows: Iterator[str], header: Header, names: Names, separator: str | N
         if key not in columns or (columns[key][1] is None and scale is not None):
             columns[key] = i, scale
     if not columns:
-        raise InvalidInputError(not_understood(names))
+        raise InvalidInputError(describe_unknown(names))
     return _rows(chain([first], rows), header, names, columns, separator)
 
 
@@ -271,7 +271,7 @@ def _rows(
 ) -> TextTable:
     """Read columns, of which index and unit are known by key."""
     count = len(names or columns)
-    which = [i for i, _ in columns.values()]
+    indices = [i for i, _ in columns.values()]
     sensors = {i: dict[str, None]() for i, name in enumerate(names) if _WHOSE.match(name)}
     values, left_out, words = array("d"), 0, 0
     for line in lines:
@@ -284,10 +284,10 @@ def _rows(
         for i, ids in sensors.items():
             ids[cells[i].strip()] = None
         try:
-            values.extend([float(cells[i]) for i in which])
+            values.extend([float(cells[i]) for i in indices])
         except ValueError:  # quoted, blank, a time, or a word
-            row = [number(cells[i]) for i in which]
-            blank = [cells[i].strip().lower() in ("", "nan") for i in which]
+            row = [number(cells[i]) for i in indices]
+            blank = [cells[i].strip().lower() in ("", "nan") for i in indices]
             words += int(np.sum(np.isnan(row) & ~np.array(blank)))
             values.extend(row)
     if not values:
@@ -296,33 +296,33 @@ def _rows(
         )
     for i, ids in sensors.items():
         if len(ids) > 1:
-            listed = ", ".join(list(ids)[:4])
+            examples = ", ".join([*ids][:4])
             raise InvalidInputError(
-                f"column {names[i]}: expected rows of one sensor, got {len(ids)} ({listed}): split the table"
+                f"column {names[i]}: expected rows of one sensor, got {len(ids)} ({examples}): split it"
             )
     notes = []
     if left_out:
         notes.append(f"{left_out} lines of another length or without a digit were left out")
     if words:
         notes.append(f"{words} cells hold something else than a number: missing")
-    rows, quantities = np.frombuffer(values).reshape(-1, len(which)), {}
+    rows, quantities = np.frombuffer(values).reshape(-1, len(indices)), {}
     for (key, (_, scale)), column in zip(columns.items(), rows.T, strict=True):
         if not names or np.isfinite(column).any():
             with np.errstate(over="ignore"):  # damage, which is left out as no measurement
-                quantities[key] = (_risen(column) if key in STAMPS else column) * (scale or 1.0)
-    stated = frozenset(key for key, (_, scale) in columns.items() if scale is not None)
-    return TextTable(header, names, quantities, stated, tuple(notes))
+                quantities[key] = (_unwrap_column(column) if key in STAMPS else column) * (scale or 1.0)
+    with_unit = frozenset(key for key, (_, scale) in columns.items() if scale is not None)
+    return TextTable(header, names, quantities, with_unit, tuple(notes))
 
 
-def _risen(column: FloatArray) -> FloatArray:
+def _unwrap_column(column: FloatArray) -> FloatArray:
     """A counter or clock unwrapped where it wraps round as `_SPANS` have it; any other as it is."""
-    known = np.isfinite(column)
-    steps = np.diff(column[known])
+    finite = np.isfinite(column)
+    steps = np.diff(column[finite])
     for span in _SPANS:
         falls = steps < -0.5 * span
-        if falls.any() and column[known].max() < span:
+        if falls.any() and column[finite].max() < span:
             rising = column.copy()
-            rising[known] = unwrapped(column[known], span)
-            if np.diff(rising[known])[falls].max() <= LATE * np.median(steps[steps > 0.0]):
+            rising[finite] = unwrap(column[finite], span)
+            if np.diff(rising[finite])[falls].max() <= LATE * np.median(steps[steps > 0.0]):
                 return rising
     return column

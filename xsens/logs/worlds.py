@@ -48,13 +48,13 @@ _NORTH_DEG = 30.0
 class Claim:
     """World named, and by whom in words.
 
-    `final` if nothing outweighs it; `assumed` if nobody said so, which is always noted.
+    `final` if nothing outweighs it; `by_default` if nobody said so, which is always noted.
     """
 
     world: str
     by: str
     final: bool = False
-    assumed: bool = False
+    by_default: bool = False
 
 
 def nwu_from(world: str) -> Rotation:
@@ -118,43 +118,43 @@ def world_of(
     InvalidInputError
         If acceleration and orientation contradict each other, unless the claim is final.
     """
-    taken, vectors = claim.world.upper(), _turned(wxyz, acceleration)
+    world, vectors = claim.world.upper(), _in_world(wxyz, acceleration)
     if vectors is None:
-        note = f"orientation: taken as {taken}, {claim.by}: no accelerometer's reading tells"
-        return taken, ((note,) if claim.assumed else ())
+        note = f"orientation: taken as {world}, {claim.by}: no accelerometer's reading tells"
+        return world, ((note,) if claim.by_default else ())
     length = np.linalg.norm(vectors, axis=1)
-    rest = np.abs(length - np.median(length)) < _AT_REST * np.median(length)
-    up = float(np.median(vectors[rest if rest.sum() >= _FEWEST else slice(None), 2]) / np.median(length))
+    calm = np.abs(length - np.median(length)) < _AT_REST * np.median(length)
+    up = float(np.median(vectors[calm if calm.sum() >= _FEWEST else slice(None), 2]) / np.median(length))
     if abs(up) < _UPRIGHT:
         tilt = np.degrees(np.arccos(up))
         off = f"the orientation turns the accelerometer's reading {tilt:.0f} degrees from the vertical"
         if claim.final:
-            return taken, (f"orientation: {taken}, {claim.by}, although {off}",)
+            return world, (f"orientation: {world}, {claim.by}, although {off}",)
         raise InvalidInputError(f"expected an orientation in ENU, NWU or NED, but {off}: give --world")
     north_deg = _north_deg(wxyz, field)
-    shown = "NWU" if taken == "NED" else taken
+    evident = "NWU" if world == "NED" else world
     if up < 0.0:
-        shown = "NED"
+        evident = "NED"
     elif abs(north_deg) <= _NORTH_DEG:
-        shown = "NWU"
+        evident = "NWU"
     elif abs(north_deg - 90.0) <= _NORTH_DEG:
-        shown = "ENU"
+        evident = "ENU"
     sensors = f"its own accelerometer{'' if np.isnan(north_deg) else ' and magnetometer'}"
     if claim.final:
-        note = f"{taken}, {claim.by}; by {sensors} it is {shown}"
-    elif taken != shown:
-        note = f"{shown} by {sensors}, not {taken}, {claim.by}"
+        note = f"{world}, {claim.by}; by {sensors} it is {evident}"
+    elif world != evident:
+        note = f"{evident} by {sensors}, not {world}, {claim.by}"
     elif np.isnan(north_deg):
-        note = f"taken as {taken}, {claim.by}: no steady field tells; see --world"
+        note = f"taken as {world}, {claim.by}: no steady field tells; see --world"
     else:
-        note = f"{shown} by {sensors}"
-    world = taken if claim.final else shown
-    return world, ((f"orientation: {note}",) if taken != shown or claim.assumed else ())
+        note = f"{evident} by {sensors}"
+    notes = (f"orientation: {note}",) if world != evident or claim.by_default else ()
+    return world if claim.final else evident, notes
 
 
 def _north_deg(wxyz: FloatArray, field: FloatArray | None) -> float:
     """Direction of the field's horizontal part from x towards y; NaN if it has none."""
-    vectors = _turned(wxyz, field)
+    vectors = _in_world(wxyz, field)
     if vectors is None:
         return float("nan")
     along = vectors[:, :2] / np.maximum(np.hypot(vectors[:, 0], vectors[:, 1]), 1e-12)[:, None]
@@ -164,14 +164,14 @@ def _north_deg(wxyz: FloatArray, field: FloatArray | None) -> float:
     return float(np.degrees(np.arctan2(y, x)))
 
 
-def _turned(wxyz: FloatArray, vectors: FloatArray | None) -> FloatArray | None:
+def _in_world(wxyz: FloatArray, vectors: FloatArray | None) -> FloatArray | None:
     """Readings turned into the world, shape (n, 3), of some thousand samples; None if there are too few."""
     if vectors is None:
         return None
-    known = np.flatnonzero(np.isfinite(wxyz[:, 0]))
-    some = known[:: len(known) // _MOST + 1]
-    wxyz, vectors = wxyz[some], vectors[some]
-    there = (np.abs(vectors) < 1e6).all(axis=1) & (vectors != 0.0).any(axis=1)
-    if there.sum() < _FEWEST:
+    indices = np.flatnonzero(np.isfinite(wxyz[:, 0]))
+    sample = indices[:: len(indices) // _MOST + 1]
+    wxyz, vectors = wxyz[sample], vectors[sample]
+    valid = (np.abs(vectors) < 1e6).all(axis=1) & (vectors != 0.0).any(axis=1)
+    if valid.sum() < _FEWEST:
         return None
-    return Rotation.from_quat(wxyz[there], scalar_first=True).apply(vectors[there])
+    return Rotation.from_quat(wxyz[valid], scalar_first=True).apply(vectors[valid])

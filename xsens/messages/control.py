@@ -87,9 +87,9 @@ _UTC = struct.Struct(">IH6B")
 _UTC_ALL_VALID = 7
 
 
-def utc_message(now: datetime | None = None) -> Message:
+def utc_message(moment: datetime | None = None) -> Message:
     """The computer's time in the form in which the sensors send theirs; now by default."""
-    t = now or datetime.now(UTC)
+    t = moment or datetime.now(UTC)
     fields = (t.microsecond * 1000, t.year, t.month, t.day, t.hour, t.minute, t.second, _UTC_ALL_VALID)
     return Message(MessageId.UTC_TIME, _UTC.pack(*fields))
 

@@ -24,7 +24,7 @@ MOST_PAYLOAD = 8192
 """Longest payload that the vendor's own software accepts; no sensor sends more than 2048 bytes. Lengths
 beyond it are damage, and waiting for so many bytes would stop a live stream."""
 
-_EXTENDED = 0xFF
+_LONG_LENGTH = 0xFF
 _BLOCK = 1 << 20
 """Bytes scanned at a time, which bounds the memory that a file of nothing but FA takes."""
 
@@ -74,7 +74,7 @@ def encode(message: Message) -> bytes:
     'faff3000d1'
     """
     size = len(message.payload)
-    length = bytes([size]) if size < _EXTENDED else bytes([_EXTENDED, size >> 8, size & 0xFF])
+    length = bytes([size]) if size < _LONG_LENGTH else bytes([_LONG_LENGTH, size >> 8, size & 0xFF])
     body = bytes([message.bid, message.mid]) + length + message.payload
     return bytes([PREAMBLE]) + body + bytes([-sum(body) & 0xFF])
 
@@ -118,8 +118,8 @@ class Frames:
     def __len__(self) -> int:
         return int(self.start.size)
 
-    def __getitem__(self, which: Any) -> Frames:
-        return Frames(self.data, self.start[which], self.end[which])
+    def __getitem__(self, index: Any) -> Frames:
+        return Frames(self.data, self.start[index], self.end[index])
 
     @cached_property
     def bid(self) -> ByteArray:
@@ -134,7 +134,7 @@ class Frames:
     @cached_property
     def payload_start(self) -> IntArray:
         """First bytes of the payloads, shape (n,)."""
-        head = np.where(self.data[self.start + 3] == _EXTENDED, 6, 4)
+        head = np.where(self.data[self.start + 3] == _LONG_LENGTH, 6, 4)
         return np.asarray(self.start + head.astype(self.start.dtype))
 
     @cached_property
@@ -151,12 +151,12 @@ class Frames:
         """All messages, in order."""
         return (self.message(i) for i in range(len(self)))
 
-    def skipped(self) -> list[tuple[int, int]]:
+    def gaps(self) -> list[tuple[int, int]]:
         """Runs of bytes that belong to no message, as (first byte, length)."""
         before = np.concatenate(([0], self.end))
         size = np.concatenate((self.start, [self.data.size])) - before
-        there = size > 0
-        return list(zip(before[there].tolist(), size[there].tolist(), strict=True))
+        positive = size > 0
+        return list(zip(before[positive].tolist(), size[positive].tolist(), strict=True))
 
 
 def rows_at(data: ByteArray, start: IntArray, size: int) -> ByteArray:
@@ -179,10 +179,10 @@ def find_frames(data: bytes | ByteArray) -> Frames:
     place = np.int32 if array.size < np.iinfo(np.int32).max else np.int64
     starts, ends, at = [np.zeros(0, place)], [np.zeros(0, place)], 0
     while at < array.size:
-        start, end, used = _scan(array[at : at + _BLOCK], at + _BLOCK >= array.size)
+        start, end, stop = _scan(array[at : at + _BLOCK], at + _BLOCK >= array.size)
         starts.append((start + at).astype(place))
         ends.append((end + at).astype(place))
-        at += used
+        at += stop
     return Frames(array, np.concatenate(starts), np.concatenate(ends))
 
 
@@ -206,8 +206,8 @@ class Framer:
         """Messages that `data` completes; the bytes of an unfinished one are kept for the next call."""
         data = self._rest + data
         array = np.frombuffer(data, dtype=np.uint8)
-        start, end, used = _scan(array, False)
-        self._rest = data[used:]
+        start, end, stop = _scan(array, False)
+        self._rest = data[stop:]
         return list(Frames(array, start, end).messages())
 
 
@@ -217,25 +217,25 @@ def _scan(data: ByteArray, final: bool) -> tuple[IntArray, IntArray, int]:
     Unless `final`, a possible message that later bytes may complete, and all after it, is left for later.
     """
     start = np.flatnonzero(data == PREAMBLE)
-    padded = np.append(data, np.zeros(5, dtype=np.uint8))
-    size, high, low = (padded[start + k].astype(np.int64) for k in (3, 4, 5))
-    extended = size == _EXTENDED
-    size = np.where(extended, 256 * high + low + 2, size)
-    plausible = size <= MOST_PAYLOAD + 2 * extended
+    tail = np.append(data, np.zeros(5, dtype=np.uint8))
+    size, high, low = (tail[start + k].astype(np.int64) for k in (3, 4, 5))
+    long = size == _LONG_LENGTH
+    size = np.where(long, 256 * high + low + 2, size)
+    plausible = size <= MOST_PAYLOAD + 2 * long
     start, end = start[plausible], (start + 5 + size)[plausible]
     whole = end <= data.size  # without the whole head it is not, as what is missing is taken for zeros
-    unfinished = start[~whole]
+    partial = start[~whole]
     start, end = start[whole], end[whole]
-    summed = np.cumsum(data, dtype=np.uint8)
-    valid = summed[end - 1] == summed[start]
+    sums = np.cumsum(data, dtype=np.uint8)
+    valid = sums[end - 1] == sums[start]
     start, end = _without_overlaps(start[valid], end[valid])
-    if final or not unfinished.size:
+    if final or not partial.size:
         return start, end, data.size
-    before = np.append(0, end)[np.searchsorted(start, unfinished)]
-    waiting = unfinished[before <= unfinished]  # not inside an accepted one
-    used = int(waiting[0]) if waiting.size else data.size
-    settled = start < used
-    return start[settled], end[settled], used
+    before = np.append(0, end)[np.searchsorted(start, partial)]
+    waiting = partial[before <= partial]  # not inside an accepted one
+    stop = int(waiting[0]) if waiting.size else data.size
+    final_part = start < stop
+    return start[final_part], end[final_part], stop
 
 
 def _without_overlaps(start: IntArray, end: IntArray) -> tuple[IntArray, IntArray]:
@@ -243,13 +243,15 @@ def _without_overlaps(start: IntArray, end: IntArray) -> tuple[IntArray, IntArra
     if not start.size:
         return start, end
     opens = np.concatenate(([True], start[1:] >= np.maximum.accumulate(end)[:-1], [True]))
-    kept = opens[:-1] & opens[1:]  # nearly all overlap no other
-    rest = np.flatnonzero(~kept)
-    followed = start[np.minimum(np.searchsorted(start, end[rest]), start.size - 1)] == end[rest]
-    better = np.where(followed, start[rest], np.iinfo(np.int64).max)
+    accepted = opens[:-1] & opens[1:]  # nearly all overlap no other
+    overlapping = np.flatnonzero(~accepted)
+    continued = (
+        start[np.minimum(np.searchsorted(start, end[overlapping]), start.size - 1)] == end[overlapping]
+    )
+    better = np.where(continued, start[overlapping], np.iinfo(np.int64).max)
     better = np.minimum.accumulate(better[::-1])[::-1]  # the next that is followed
     free = 0
-    for i in rest[followed | (better >= end[rest])].tolist():
+    for i in overlapping[continued | (better >= end[overlapping])].tolist():
         if start[i] >= free:
-            kept[i], free = True, end[i]
-    return start[kept], end[kept]
+            accepted[i], free = True, end[i]
+    return start[accepted], end[accepted]

@@ -85,7 +85,7 @@ _RAW = (
 )
 _COUNTER = Field("counter", 1, ">u2")
 _ORIENTATION = (Field("quaternion_wxyz", 4), Field("euler_deg", 3), Field("matrix", 9))
-_MEASURED = (
+_PARTS = (
     (OutputMode.TEMPERATURE, 0, Field("temperature_c", 1)),
     (OutputMode.CALIBRATED, OutputSettings.NO_ACCELEROMETER, Field("accelerometer_m_s2", 3)),
     (OutputMode.CALIBRATED, OutputSettings.NO_GYROSCOPE, Field("gyroscope_rad_s", 3)),
@@ -99,7 +99,7 @@ _MEASURED = (
 )
 """Part, the setting that leaves the field out, and the field (None: by the settings), in order."""
 
-_KNOWN = sum(OutputMode)
+_ALL_MODES = sum(OutputMode)
 
 
 @dataclass(frozen=True)
@@ -123,7 +123,7 @@ class DataLayout:
 
     def __post_init__(self) -> None:
         raw = self.mode & (OutputMode.RAW | OutputMode.MT9)
-        if not self.mode or self.mode & ~_KNOWN or (raw and self.mode not in tuple(OutputMode)):
+        if not self.mode or self.mode & ~_ALL_MODES or (raw and self.mode not in tuple(OutputMode)):
             raise InvalidInputError(
                 f"output mode: expected raw counts alone or any of the others, got {self.mode:#06x}"
             )
@@ -144,14 +144,14 @@ class DataLayout:
             return (_COUNTER, *_RAW)
         counter = (_COUNTER,) if self.settings & OutputSettings.COUNTER else ()
         utc = (Field("utc", 12, ">u1"),) if self.settings & OutputSettings.UTC else ()
-        body = _RAW if self.mode == OutputMode.RAW else self._measured()
+        body = _RAW if self.mode == OutputMode.RAW else self._calibrated_fields()
         return (*body, *counter, *utc)
 
-    def _measured(self) -> tuple[Field, ...]:
+    def _calibrated_fields(self) -> tuple[Field, ...]:
         orientation = _ORIENTATION[(self.settings >> 2) & 3]
         return tuple(
             field or orientation
-            for part, off, field in _MEASURED
+            for part, off, field in _PARTS
             if self.mode & part and not self.settings & off
         )
 

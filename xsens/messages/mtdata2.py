@@ -43,14 +43,14 @@ def kind_of(identifier: int) -> Field | None:
 class Items(NamedTuple):
     """Numbers of m messages by name, shape (m, count), NaN where missing.
 
-    `world` is that of the orientations, "" without; `measured` marks messages with more than time stamps, and
-    `damaged` those whose last item claims more bytes than there are: of them nothing is read.
+    `world` is that of the orientations, "" without; `is_sample` marks messages with more than time stamps,
+    `damage` those whose last item claims more bytes than there are: of them nothing is read.
     """
 
     values: Values
     world: str
-    measured: BoolArray
-    damaged: BoolArray
+    is_sample: BoolArray
+    damage: BoolArray
 
 
 def read_items(frames: Frames) -> Items:
@@ -60,33 +60,33 @@ def read_items(frames: Frames) -> Items:
     """
     values: Values = {}
     world = ""
-    measured, damaged = np.zeros((2, len(frames)), dtype=bool)
+    is_sample, damage = np.zeros((2, len(frames)), dtype=bool)
     data, rows, at, end = frames.data, np.arange(len(frames)), frames.payload_start, frames.end - 1
     while (left := at < end).any():
         rows, at, end = rows[left], at[left], end[left]
         identifiers = rows_at(data, at, 2).view(">u2")[:, 0]
         sizes = data.take(at + 2, mode="clip")  # behind a last identifier the data may end
         after = at + 3 + sizes
-        damaged[rows[after > end]] = True
+        damage[rows[after > end]] = True
         for identifier in np.unique(identifiers).tolist():
             if (kind := kind_of(identifier)) is None:
                 continue
             number = np.dtype(kind.whole or REAL[identifier & 3])
             size = kind.count * number.itemsize
-            there = (identifiers == identifier) & (sizes == size) & (after <= end)
-            if not there.any():
+            matches = (identifiers == identifier) & (sizes == size) & (after <= end)
+            if not matches.any():
                 continue
-            measured[rows[there]] |= kind.name not in STAMPS
+            is_sample[rows[matches]] |= kind.name not in STAMPS
             if kind.name in ORIENTATIONS:
-                own = _WORLDS[identifier >> 2 & 3]
-                world = world or own
-                if own != world:
+                frame = _WORLDS[identifier >> 2 & 3]
+                world = world or frame
+                if frame != world:
                     continue
             if kind.name not in values:
                 values[kind.name] = np.full((len(frames), kind.count), np.nan)
-            values[kind.name][rows[there]] = as_floats(rows_at(data, at[there] + 3, size).view(number))
+            values[kind.name][rows[matches]] = as_floats(rows_at(data, at[matches] + 3, size).view(number))
         at = after
-    measured &= ~damaged
+    is_sample &= ~damage
     for column in values.values():
-        column[damaged] = np.nan
-    return Items(values, world, measured, damaged)
+        column[damage] = np.nan
+    return Items(values, world, is_sample, damage)

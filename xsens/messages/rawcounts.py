@@ -19,12 +19,12 @@ from xsens.messages.framing import Message
 BLOCK_SIZE = 168
 """Bytes of the payload; blocks of later sensors are longer, in an unknown layout."""
 
-NOT_COMPENSATED = (
+COMPENSATION_NOTE = (
     "raw counts: dependence on temperature is not compensated (expect about 1 % of gravity), "
     "nor the housing's alignment applied"
 )
 
-_SOME = 1 << 12
+_CHUNK = 1 << 12
 """Rows at a time."""
 
 _BLOCK = np.dtype(
@@ -97,6 +97,6 @@ class RawCalibration:
         The numbers take the place of the counts, as logs may be large.
         """
         axes = (np.linalg.inv(self.misalignments[sensor]) / self.gains[sensor]).T
-        for part in np.array_split(counts, 1 + len(counts) // _SOME):
+        for part in np.array_split(counts, 1 + len(counts) // _CHUNK):
             part[:] = (part - self.offsets[sensor]) @ axes
         return counts

@@ -94,7 +94,7 @@ _DOUBT_S, _BESIDE_S = 1.0, 3.0
 """Times of movement after which odds are less by e: of a field that is disbelieved to be the room's after
 all, and of a sensor that began beside iron to be still there: iron's field is uneven over a hand's length."""
 
-_ADAPTED = 1.5
+_INFORMATION = 1.5
 """Fisher's information on the logarithm of a variance that one vector gives."""
 
 _LARGEST_SCORE, _LARGEST_CHANGE = 50.0, 0.5
@@ -223,13 +223,13 @@ def _correct(s: Any, b: Any, m: Any, rows: FloatArray, f: FloatArray, q: FloatAr
         rows[i, ROOM + i] = rows[i, PLACE + i] = rows[i, STRAY + i] = 1.0
         rows[i, LAG] = b.field_rate[i] / s.norm
         rows[i, IRON : IRON + 3] = b.level[i]
-    for known in (False, True):
+    for again in (False, True):
         off, cross, total = _innovation(s, b, m, rows)
         weight, determinant = inverse(total)
         misfit = float(off @ (weight @ off))
-        if not (known or b.resting):
+        if not (again or b.resting):
             _adapt(s, b, off, misfit, weight)
-        if known or misfit <= _OUTLIER or not _changed(s, m, f, q, off, total):
+        if again or misfit <= _OUTLIER or not _foresee_change(s, m, f, q, off, total):
             break
     v = _FREEDOM
     out.trust = min((v + 3.0) / (v + misfit), 1.0)
@@ -240,8 +240,8 @@ def _correct(s: Any, b: Any, m: Any, rows: FloatArray, f: FloatArray, q: FloatAr
         out.trust = 0.0
         return
     if out.trust < 1.0:
-        more = (1.0 / out.trust - 1.0) * (total[0, 0] + total[1, 1] + total[2, 2]) / 3.0
-        weight, _ = inverse(total + more * np.eye(3))
+        extra = (1.0 / out.trust - 1.0) * (total[0, 0] + total[1, 1] + total[2, 2]) / 3.0
+        weight, _ = inverse(total + extra * np.eye(3))
     gain = cross @ weight
     s.x[:] += gain @ off
     p = s.p - gain @ cross.T
@@ -249,7 +249,7 @@ def _correct(s: Any, b: Any, m: Any, rows: FloatArray, f: FloatArray, q: FloatAr
 
 
 @compiled
-def _changed(s: Any, m: Any, f: FloatArray, q: FloatArray, off: FloatArray, total: FloatArray) -> bool:
+def _foresee_change(s: Any, m: Any, f: FloatArray, q: FloatArray, off: FloatArray, total: FloatArray) -> bool:
     """Whether an outlier is iron put on the sensor, or iron beside it left behind; if so, foresee it."""
     if m.iron_put_on > 0.0 and s.changing_s <= 0.0:
         s.changing_s = _CHANGE_S
@@ -285,11 +285,11 @@ def _innovation(s: Any, b: Any, m: Any, rows: FloatArray) -> tuple[FloatArray, F
 @compiled
 def _adapt(s: Any, b: Any, off: FloatArray, misfit: float, weight: FloatArray) -> None:
     """Follow the stray's variance by the slope of the reading's likelihood: the room may become another."""
-    weighted = weight @ off
-    believed = min(1.0, _LARGEST_SCORE / misfit)
+    score_vector = weight @ off
+    share = min(1.0, _LARGEST_SCORE / misfit)
     score = 0.0
     for i in range(3):
-        score += 0.5 * s.p[STRAY + i, STRAY + i] * (believed * weighted[i] ** 2 - weight[i, i])
-    change = score * b.span_s / (_ADAPTED * _ADAPTS_S)
+        score += 0.5 * s.p[STRAY + i, STRAY + i] * (share * score_vector[i] ** 2 - weight[i, i])
+    change = score * b.span_s / (_INFORMATION * _ADAPTS_S)
     s.stray *= math.exp(0.5 * min(max(change, -_LARGEST_CHANGE), _LARGEST_CHANGE))
     s.stray = min(max(s.stray, _LEAST_STRAY), _MOST_STRAY)

@@ -29,12 +29,12 @@ from speckle3d.kernels.orientation.rotations import (
     Quaternion,
     compiled,
     inverse,
-    inverted,
+    invert,
     norm,
     product,
     quaternion,
     quaternion_of,
-    rotated,
+    rotate,
     three,
     turn_by,
 )
@@ -121,7 +121,7 @@ def run_filter(
     to_end: bool,
     filters: Any,
     limits: Any,
-    unfinished: Any,
+    partial: Any,
     steps: Any,
     covariance: FloatArray,
     transition: FloatArray,
@@ -149,7 +149,7 @@ def run_filter(
     xyzw : ndarray, shape (m, 4)
         Level axes from the sensor's at every sample, by what came before it.
     """
-    s, r, step, f, n = filters[0], limits[0], unfinished[0], np.zeros((SIZE, SIZE)), 0
+    s, r, step, f, n = filters[0], limits[0], partial[0], np.zeros((SIZE, SIZE)), 0
     for k in range(step_s.shape[0]):
         if s.pause_s >= 0.0:
             _set_up(s, r, force_m_s2[k])
@@ -162,7 +162,7 @@ def run_filter(
             if covariance.shape[0] > 0:
                 covariance[n], transition[n] = s.p, f
             step.last = k + 1
-            steps[n] = unfinished[0]
+            steps[n] = partial[0]
             n += 1
             _open(s, step)
         level = quaternion(s.level)
@@ -183,12 +183,12 @@ def _add(step: Any, dt: float, rate: FloatArray, force: FloatArray, field: Float
     """Add a sample to an increment, with the increment's bias."""
     half = turn_by(rate, step.start_bias, 0.5 * dt)
     q = product(quaternion(step.turn), half)
-    for i, part in enumerate(rotated(q, three(force))):
+    for i, part in enumerate(rotate(q, three(force))):
         step.force[i] += dt * part
         step.rate[i] += dt * rate[i]
     q = product(q, half)
     if math.isfinite(field[0] + field[1] + field[2]):
-        for i, part in enumerate(rotated(q, three(field))):
+        for i, part in enumerate(rotate(q, three(field))):
             step.field[i] += part
         step.fields += 1.0
     step.turn[:] = q
@@ -229,10 +229,12 @@ def _upright(force: FloatArray) -> Quaternion:
 @compiled
 def _set_up(s: Any, r: Any, force: FloatArray) -> None:
     """Begin before the first sample: anew, or after a pause with the bias found so far."""
-    kept = s.p[BIAS : BIAS + 3, BIAS : BIAS + 3].copy()
+    bias_variance = s.p[BIAS : BIAS + 3, BIAS : BIAS + 3].copy()
     s.p[:] = np.diag(s.fresh)
     if s.running:
-        s.p[BIAS : BIAS + 3, BIAS : BIAS + 3] = kept + r.bias_walk_rad_s_sqrt_s**2 * s.pause_s * np.eye(3)
+        s.p[BIAS : BIAS + 3, BIAS : BIAS + 3] = (
+            bias_variance + r.bias_walk_rad_s_sqrt_s** 2 * s.pause_s * np.eye(3)
+        )
     s.running = s.starting = True
     s.resting = s.rest_known = False
     s.still_s = s.start_s = 0.0
@@ -246,7 +248,7 @@ def _set_up(s: Any, r: Any, force: FloatArray) -> None:
 def _begin(s: Any, step: Any) -> None:
     """Set up from the mean force since the start."""
     turn = quaternion(s.start_turn)
-    s.start_force += np.array(rotated(turn, three(step.force)))
+    s.start_force += np.array(rotate(turn, three(step.force)))
     turn = product(turn, quaternion(step.turn))
     s.start_turn[:] = turn
     s.start_s += step.duration_s
@@ -283,7 +285,7 @@ def _predict(s: Any, r: Any, step: Any, f: FloatArray) -> None:
     f[:] = np.eye(SIZE)
     span = 0.0 if s.resting else duration
     for j in range(3):
-        axis = np.array(rotated(level, three(_AXES[j])))
+        axis = np.array(rotate(level, three(_AXES[j])))
         f[:BIAS, BIAS + j] = -span * axis
         f[SPEED:, BIAS + j] = span * np.cross(axis, s.speed)
     f[6, 1], f[7, 0] = r.gravity_m_s2 * duration, -r.gravity_m_s2 * duration
@@ -297,7 +299,7 @@ def _predict(s: Any, r: Any, step: Any, f: FloatArray) -> None:
     s.p[:] = f @ s.p @ f.T
     for i in range(SIZE):
         s.p[i, i] += step.noise[i]
-    s.speed += np.array(rotated(level, three(step.force)))
+    s.speed += np.array(rotate(level, three(step.force)))
     s.speed[2] -= r.gravity_m_s2 * duration
     if not s.resting:
         s.level[:] = product(level, quaternion(step.turn))
@@ -312,7 +314,7 @@ def _correct_by_speed(s: Any, r: Any, step: Any) -> None:
     the bias about up is corrected by it, and their errors count as noise (Schmidt).
     """
     speed, time_s = (_REST_SPEED_M_S, _REST_TIME_S) if s.resting else (r.speed_m_s, r.speed_time_s)
-    up = np.array(rotated(inverted(quaternion(s.level)), (0.0, 0.0, 1.0)))
+    up = np.array(rotate(invert(quaternion(s.level)), (0.0, 0.0, 1.0)))
     gain = _correct(s.p, SPEED, 2.0 * speed**2 * time_s / step.duration_s, up)
     _inject(s, -gain @ s.speed)
 
@@ -334,8 +336,8 @@ def _correct(p: FloatArray, first: int, variance: float, up: FloatArray) -> Floa
         about_up = up[0] * gain[3, j] + up[1] * gain[4, j] + up[2] * gain[5, j]
         for i in range(3):
             gain[3 + i, j] -= about_up * up[i]
-    rest = p - gain @ cross
-    p[:] = rest - (rest[:, first : first + 3] - variance * gain) @ gain.T
+    remainder = p - gain @ cross
+    p[:] = remainder - (remainder[:, first : first + 3] - variance * gain) @ gain.T
     return gain
 
 
@@ -344,6 +346,6 @@ def _inject(s: Any, error: FloatArray) -> None:
     """Apply the estimated error to the state."""
     turn = quaternion_of(error[0], error[1], error[2])
     s.level[:] = product(turn, quaternion(s.level))
-    s.speed[:] = rotated(turn, three(s.speed))
+    s.speed[:] = rotate(turn, three(s.speed))
     s.speed[:] = s.speed + error[SPEED:]
     s.bias[:] = s.bias + error[BIAS:SPEED]

@@ -74,13 +74,13 @@ def product(p: Quaternion, q: Quaternion) -> Quaternion:
 
 
 @compiled
-def inverted(q: Quaternion) -> Quaternion:
+def invert(q: Quaternion) -> Quaternion:
     """Quaternion of the rotation back."""
     return -q[0], -q[1], -q[2], q[3]
 
 
 @compiled
-def rotated(q: Quaternion, v: Vector) -> Vector:
+def rotate(q: Quaternion, v: Vector) -> Vector:
     """A vector turned by a unit quaternion."""
     x, y, z, w = q
     a = 2.0 * (y * v[2] - z * v[1])

@@ -14,11 +14,11 @@ from speckle3d.core.arrays import FloatArray
 from speckle3d.kernels.orientation.inclination import BIAS, SIZE, SPEED
 from speckle3d.kernels.orientation.rotations import (
     compiled,
-    inverted,
+    invert,
     product,
     quaternion,
     quaternion_of,
-    rotated,
+    rotate,
     three,
     turn_by,
     vector_of,
@@ -52,26 +52,26 @@ def smooth_steps(
     for k in range(n - 2, first - 1, -1):
         step, after, f, p = steps[k], steps[k + 1], transition[k + 1], covariance[k]
         ahead = f @ p
-        predicted = ahead @ f.T + np.diag(after.noise)
-        gain = np.linalg.solve(predicted, ahead).T
-        covariance[k] = p + gain @ (covariance[k + 1] - predicted) @ gain.T
-        turn = product(quaternion(levels[k + 2]), inverted(quaternion(after.predicted)))
+        forecast = ahead @ f.T + np.diag(after.noise)
+        gain = np.linalg.solve(forecast, ahead).T
+        covariance[k] = p + gain @ (covariance[k + 1] - forecast) @ gain.T
+        turn = product(quaternion(levels[k + 2]), invert(quaternion(after.predicted)))
         off[:3] = vector_of(turn)
         off[3:6] = biases[k + 2] - step.bias
         off[6:] = speed
-        off[6:] -= np.array(rotated(turn, three(after.predicted_speed)))
+        off[6:] -= np.array(rotate(turn, three(after.predicted_speed)))
         error = gain @ off
         turn = quaternion_of(error[0], error[1], error[2])
         levels[k + 1] = product(turn, quaternion(step.level))
         biases[k + 1] = step.bias + error[BIAS:SPEED]
-        speed[:] = rotated(turn, three(step.speed))
+        speed[:] = rotate(turn, three(step.speed))
         speed += error[SPEED:]
     for k in range(first, -1, -1):
         step = steps[k]
         biases[k], levels[k] = biases[k + 1], levels[k + 1]
         if not step.resting:
             turn = product(quaternion(step.turn), turn_by(step.start_bias, biases[k], step.duration_s))
-            levels[k] = product(quaternion(levels[k + 1]), inverted(turn))
+            levels[k] = product(quaternion(levels[k + 1]), invert(turn))
 
 
 @compiled
@@ -102,7 +102,7 @@ def orient_samples(
             if not steps[n].resting:
                 q = product(q, turn_by(rate_rad_s[k], biases[n], step_s[k]))
             xyzw[k] = q
-        x, y, z = vector_of(product(quaternion(nodes[n + 1]), inverted(q)))
+        x, y, z = vector_of(product(quaternion(nodes[n + 1]), invert(q)))
         whole_s = step_s[first:last].sum()
         for k in range(first, last):
             span_s += step_s[k]

@@ -10,16 +10,18 @@ from xsens.accuracy.comparison import compare_orientations
 TIME_S = np.arange(0.0, 5.0, 0.05)
 
 
-def streams(turned):
+def streams(second):
     """A moving sensor, and the same seen through a turn of the world."""
     moving = Rotation.from_euler("ZYX", np.column_stack([TIME_S, 0.4 * np.sin(TIME_S), 0.3 * np.cos(TIME_S)]))
-    return TimedRotations(TIME_S, turned * moving), TimedRotations(TIME_S, moving)
+    return TimedRotations(TIME_S, second * moving), TimedRotations(TIME_S, moving)
 
 
 def test_a_turn_about_up_is_heading_alone():
     turn_rad = np.pi - 0.01
-    found = compare_orientations(*streams(Rotation.from_rotvec([0.0, 0.0, turn_rad])))
-    assert (found.heading_rms_rad, found.total_rms_rad) == pytest.approx((turn_rad, turn_rad), abs=1e-9)
-    assert found.inclination_rms_rad == pytest.approx(0.0, abs=1e-7)
-    assert found.heading_rms_without_offset_rad == pytest.approx(0.0, abs=1e-9)
-    assert found.heading_offset_rad == pytest.approx(turn_rad)
+    comparison = compare_orientations(*streams(Rotation.from_rotvec([0.0, 0.0, turn_rad])))
+    assert (comparison.heading_rms_rad, comparison.total_rms_rad) == pytest.approx(
+        (turn_rad, turn_rad), abs=1e-9
+    )
+    assert comparison.inclination_rms_rad == pytest.approx(0.0, abs=1e-7)
+    assert comparison.heading_rms_without_offset_rad == pytest.approx(0.0, abs=1e-9)
+    assert comparison.heading_offset_rad == pytest.approx(turn_rad)

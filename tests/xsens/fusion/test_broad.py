@@ -35,14 +35,14 @@ def folder(realdata):
 def scores(folder, name):
     """By method: total error as BROAD counts it and without a constant heading, degrees; coverage of both."""
     log, true, moving = read_trial(folder, name)
-    scored = moving & (np.arange(len(log)) % EVERY == 0)
-    found = {method: estimate(log, method) for method in ONLINE + OFFLINE}
+    counts = moving & (np.arange(len(log)) % EVERY == 0)
+    estimates = {method: estimate(log, method) for method in ONLINE + OFFLINE}
     return {
         method: [
-            (errors_deg(each.wxyz, true, scored, steady)[0], coverage(each, true, scored, steady))
+            (errors_deg(result.wxyz, true, counts, steady)[0], coverage(result, true, counts, steady))
             for steady in (False, True)
         ]
-        for method, each in found.items()
+        for method, result in estimates.items()
     }
 
 
@@ -53,12 +53,12 @@ def errors_of(folder, method):
 
 def coverages(folder, name, method):
     """Coverage as BROAD counts and without a constant heading."""
-    return [covered for _, covered in scores(folder, name)[method]]
+    return [share for _, share in scores(folder, name)[method]]
 
 
 def ratios(folder, name, methods):
-    theirs, ours = ([error for error, _ in scores(folder, name)[method]] for method in methods)
-    return np.divide(ours, theirs)
+    vqf_values, own_values = ([error for error, _ in scores(folder, name)[method]] for method in methods)
+    return np.divide(own_values, vqf_values)
 
 
 @pytest.mark.realdata
@@ -72,16 +72,16 @@ def test_beside_a_magnet_the_error_is_less_than_vqfs(folder, methods):
 @pytest.mark.slow
 @kinds
 def test_mean_error_is_a_fifth_less_than_vqfs(folder, methods):
-    theirs, ours = (errors_of(folder, method).mean(axis=0) for method in methods)
-    assert (ours <= GAIN * theirs).all(), (ours, theirs)
+    vqf_values, own_values = (errors_of(folder, method).mean(axis=0) for method in methods)
+    assert (own_values <= GAIN * vqf_values).all(), (own_values, vqf_values)
 
 
 @pytest.mark.realdata
 @pytest.mark.slow
 @kinds
 def test_no_trial_is_much_worse_than_with_vqf(folder, methods):
-    found = {name: ratios(folder, name, methods) for name in trials_in(folder)}
-    assert {name: ratio.round(2).tolist() for name, ratio in found.items() if ratio.max() > WORSE} == {}
+    by_trial = {name: ratios(folder, name, methods) for name in trials_in(folder)}
+    assert {name: ratio.round(2).tolist() for name, ratio in by_trial.items() if ratio.max() > WORSE} == {}
 
 
 @pytest.mark.realdata
@@ -92,8 +92,11 @@ def test_claimed_sigma_fits_the_errors(folder, methods, part):
     # Heading as BROAD counts it: sigma is about north, and the cameras' is the field's at rest, to one degree
     # in most trials. Without a constant heading, errors are less and sigma is still that of north.
     names = trials_in(folder)
-    counted, steady = zip(*(coverages(folder, name, methods[1]) for name in names), strict=True)
-    share, least = (np.mean([getattr(each, f"{part}_share") for each in held]) for held in (counted, steady))
+    as_broad, steady = zip(*(coverages(folder, name, methods[1]) for name in names), strict=True)
+    share, least = (
+        np.mean([getattr(result, f"{part}_share") for result in part_shares])
+        for part_shares in (as_broad, steady)
+    )
     assert SHARES[0] <= share <= SHARES[1]
-    assert max(getattr(each, f"{part}_ratio") for each in (*counted, *steady)) <= WIDEST
+    assert max(getattr(result, f"{part}_ratio") for result in (*as_broad, *steady)) <= WIDEST
     assert least >= SHARES[0]

@@ -12,7 +12,7 @@ from xsens.fusion.orient import orient
 GOOD = FieldFound(np.radians(1.4), 0.02, 0.01, 0.0, np.radians(3.2), 186.0)
 
 
-def judged(log):
+def judge(log):
     return field_of(log, orient(log))
 
 
@@ -32,8 +32,8 @@ def test_each_doubt_counts():
 @pytest.mark.realdata
 def test_a_magnet_on_the_sensor_is_told_in_a_recorded_trial(realdata):
     log, _, _ = read_trial(realdata / "broad", "35_disturbed_attached_magnet_4cm")
-    found = judged(log)
-    assert found.trust is Trust.CARE
-    assert found.iron > 0.5
+    field = judge(log)
+    assert field.trust is Trust.CARE
+    assert field.iron > 0.5
     log, _, _ = read_trial(realdata / "broad", "05_undisturbed_slow_rotation_with_breaks_B")
-    assert judged(log).trust is Trust.YES
+    assert judge(log).trust is Trust.YES

@@ -38,9 +38,9 @@ def recording(kind, amount, seed):
 @pytest.mark.parametrize(("kind", "amount", "seed"), KINDS)
 def test_no_heading_is_confident_and_wrong(kind, amount, seed, methods):
     log, true, moving = recording(kind, amount, seed)
-    vqf, estimated = (estimate(log, method) for method in methods)
-    vqf_error, error = (errors_deg(result.wxyz, true, moving)[1] for result in (vqf, estimated))
-    sigma = rms_deg(estimated.sigma_rad[counting(true, moving), 2])
+    vqf_result, own = (estimate(log, method) for method in methods)
+    vqf_error, error = (errors_deg(result.wxyz, true, moving)[1] for result in (vqf_result, own))
+    sigma = rms_deg(own.sigma_rad[counting(true, moving), 2])
     assert error <= max(SIGMAS * sigma, WORSE * vqf_error * (kind not in WANDERING)), (
         f"{error:.2f}, claimed {sigma:.2f}, VQF {vqf_error:.2f}"
     )

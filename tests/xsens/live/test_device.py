@@ -39,5 +39,5 @@ class TestDevice:
         with closing(connect(str(sensor.path), BAUD)) as device:
             prepare(device, DeviceSettings("orientation", rate_hz=80.0))
         items = dict(sensor.outputs)
-        assert {0x1020, 0x1060, 0xE020} == {each for each, rate in items.items() if rate == 0xFFFF}
-        assert {0x2010, 0x4020, 0x8020, 0xC020} == {each for each, rate in items.items() if rate == 80}
+        assert {0x1020, 0x1060, 0xE020} == {request for request, rate in items.items() if rate == 0xFFFF}
+        assert {0x2010, 0x4020, 0x8020, 0xC020} == {request for request, rate in items.items() if rate == 80}

@@ -30,14 +30,14 @@ def path(tmp_path):
 
 def counters(path) -> list[int]:
     """Sample counters in a file: first in an MT9-B's message, last in a legacy one, an item in MTData2."""
-    found = []
+    counts = []
     for message in decode(path.read_bytes()):
         if message.mid == MessageId.MT_DATA:
             first = len(message.payload) == 22
-            found.append(int.from_bytes(message.payload[:2] if first else message.payload[-2:], "big"))
+            counts.append(int.from_bytes(message.payload[:2] if first else message.payload[-2:], "big"))
         elif message.mid == MessageId.MT_DATA2:
-            found.append(int.from_bytes(message.payload[3:5], "big"))
-    return found
+            counts.append(int.from_bytes(message.payload[3:5], "big"))
+    return counts
 
 
 class TestRecording:
@@ -49,20 +49,22 @@ class TestRecording:
         assert states[-1].samples == len(sensor.run) > 20
         assert sensor.state == "configuration"
 
-        (told,) = [each.payload for each in decode(path.read_bytes()) if each.mid == MessageId.UTC_TIME]
-        assert abs(read_utc(told) - before) < timedelta(seconds=5)
+        (moment,) = [
+            message.payload for message in decode(path.read_bytes()) if message.mid == MessageId.UTC_TIME
+        ]
+        assert abs(read_utc(moment) - before) < timedelta(seconds=5)
         log = read_log(path)
         np.testing.assert_array_equal(log.counter - log.counter[0], np.arange(len(sensor.run)))
         assert log.gaps == ()
         assert log.rate_hz == pytest.approx(sensor.rate_hz, rel=1e-9)
         if sensor.kind != "mt9":
-            turned = log.rotations().world_from_sensor
-            angle = (turned[0].inv() * turned[-1]).as_rotvec(degrees=True)
-            degrees = 10.0 * (len(turned) - 1) / sensor.rate_hz
+            rotations = log.rotations().world_from_sensor
+            angle = (rotations[0].inv() * rotations[-1]).as_rotvec(degrees=True)
+            degrees = 10.0 * (len(rotations) - 1) / sensor.rate_hz
             np.testing.assert_allclose(angle, [0.0, 0.0, degrees], atol=1e-3)
 
     @pytest.mark.slow
-    def test_killed_it_loses_only_what_was_not_sent(self, sensor, path):
+    def test_killed_it_loses_only_what_comes_after(self, sensor, path):
         code = (
             "import sys; from xsens import DeviceSettings, record\n"
             "for state in record(sys.argv[1], sys.argv[2], DeviceSettings(baud=115200)): pass"
@@ -71,13 +73,13 @@ class TestRecording:
             wait_until(lambda: path.exists() and len(counters(path)) > 50, 20.0)
             sensor.settle()
             recording.send_signal(signal.SIGKILL)
-        sent = list(sensor.run)
-        assert counters(path) == sent
+        counts_sent = list(sensor.run)
+        assert counters(path) == counts_sent
         sensor.resume()
-        killed = path.read_bytes()
+        before = path.read_bytes()
         list(record(str(sensor.path), path, FAST, append=True, duration_s=0.3))
-        assert path.read_bytes().startswith(killed)
-        assert counters(path) == sent + sensor.run
+        assert path.read_bytes().startswith(before)
+        assert counters(path) == counts_sent + sensor.run
         assert len(sensor.run) > 10
 
     @of_kind(*KINDS)
@@ -85,7 +87,7 @@ class TestRecording:
         with Recorder(str(sensor.path), path, FAST) as recorder:
             wait_until(lambda: len(sensor.run) > 20)
             sensor.unplug()
-            sent = list(sensor.run)
+            counts_sent = list(sensor.run)
             wait_until(lambda: not recorder.state().connected)
             time.sleep(0.3)
             first = len(sensor.runs)
@@ -93,7 +95,7 @@ class TestRecording:
             wait_until(lambda: recorder.state().connected and len(sensor.runs) > first)
             wait_until(lambda: len(sensor.run) > 20)
             assert recorder.state().interruptions == 1
-        assert counters(path) == sent + sensor.run
+        assert counters(path) == counts_sent + sensor.run
 
 
 def read_utc(payload: bytes) -> datetime:

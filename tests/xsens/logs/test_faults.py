@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from speckle3d.core.errors import InvalidInputError, Speckle3DError
 from xsens.fusion.orient import orient
-from xsens.logs.faults import measured
+from xsens.logs.faults import without_faults
 from xsens.logs.read import parse_stream
 from xsens.logs.samples import VECTORS, ImuLog
 from xsens.logs.textlogs import parse_text
@@ -38,21 +38,21 @@ def with_rows(log, names, change):
     return replace(log, **{name: change(getattr(log, name).copy()) for name in names})
 
 
-def gone(log):
+def in_second_half(log):
     """Half of each second."""
     return log.time_s % 1.0 >= 0.5
 
 
-def repeated(rows, where):
+def repeat_rows(rows, where):
     return rows[np.maximum.accumulate(np.where(where, 0, np.arange(len(rows))))]
 
 
 def errors(log, truth, method):
     """Largest tilt in degrees, RMS of it and of its claim, and of the heading and its claim."""
-    found = orient(log, method=method)
-    at = np.searchsorted(log.time_s, found.rotations.time_s)
-    off = np.rad2deg((found.rotations.world_from_sensor * truth[at].inv()).as_rotvec())
-    sd = np.rad2deg(found.standard_deviation_rad)
+    orientation = orient(log, method=method)
+    at = np.searchsorted(log.time_s, orientation.rotations.time_s)
+    off = np.rad2deg((orientation.rotations.world_from_sensor * truth[at].inv()).as_rotvec())
+    sd = np.rad2deg(orientation.standard_deviation_rad)
     tilt, claim = np.hypot(off[:, 0], off[:, 1]), np.hypot(sd[:, 0], sd[:, 1])
     return tilt.max(), *(np.sqrt(np.mean(v**2)) for v in (tilt, claim, off[:, 2], sd[:, 2]))
 
@@ -66,17 +66,17 @@ SENSORS = [VECTORS, *((name,) for name in VECTORS)]
 @pytest.mark.parametrize("names", SENSORS, ids=["all", "accelerometer", "gyroscope", "magnetometer"])
 def test_half_of_each_second_gone_is_missing_and_costs_certainty(names, kind, noise, method):
     log, truth = swinging(noise=noise)
-    where = gone(log)
+    where = in_second_half(log)
     change = {
         "zeros": lambda rows: np.where(where[:, None], 0.0, rows),
-        "repeats": lambda rows: repeated(rows, where),
+        "repeats": lambda rows: repeat_rows(rows, where),
     }[kind]
-    spoiled = with_rows(log, names, change)
+    faulty = with_rows(log, names, change)
     for name in names:
-        rows = getattr(measured(spoiled), name)
+        rows = getattr(without_faults(faulty), name)
         assert np.isnan(rows).any(axis=1)[where].mean() > 0.9
         assert not np.isnan(rows).any(axis=1)[~where].any()
-    worst, tilt, claim, heading, heading_claim = errors(spoiled, truth, method)
+    worst, tilt, claim, heading, heading_claim = errors(faulty, truth, method)
     assert worst < 2.0
     assert tilt < claim
     assert heading < heading_claim
@@ -88,9 +88,9 @@ def test_half_of_each_second_gone_is_missing_and_costs_certainty(names, kind, no
 def test_a_slow_sensor_that_is_stuck_for_a_fifth_of_a_second_is_missing_then(names):
     log, _ = swinging(12.0, speed=0.1)
     where = log.time_s % 1.0 >= 0.8
-    stuck = measured(with_rows(log, names, lambda rows: repeated(rows, where)))
+    faulty = without_faults(with_rows(log, names, lambda rows: repeat_rows(rows, where)))
     for name in names:
-        missing = np.isnan(getattr(stuck, name)).any(axis=1)
+        missing = np.isnan(getattr(faulty, name)).any(axis=1)
         assert missing[where].mean() > 0.9
         assert not missing[~where].any()
 
@@ -115,12 +115,12 @@ def with_every(step, rows, value):
 @pytest.mark.parametrize("method", ["smoother", "filter"])
 def test_saturation_and_values_no_hand_makes_are_missing(name, spoil, method):
     log, truth = swinging()
-    spoiled = with_rows(log, [name], spoil)
-    wrong = np.abs(getattr(spoiled, name) - getattr(log, name)).max(axis=1) > 1e-9
-    missing = np.isnan(getattr(measured(spoiled), name)).any(axis=1)
+    faulty = with_rows(log, [name], spoil)
+    wrong = np.abs(getattr(faulty, name) - getattr(log, name)).max(axis=1) > 1e-9
+    missing = np.isnan(getattr(without_faults(faulty), name)).any(axis=1)
     assert missing[wrong].mean() > 0.9
     assert missing[~wrong].mean() < 0.02
-    worst, tilt, claim, heading, heading_claim = errors(spoiled, truth, method)
+    worst, tilt, claim, heading, heading_claim = errors(faulty, truth, method)
     assert tilt < claim
     assert heading < heading_claim
     assert worst < 8.0
@@ -128,36 +128,36 @@ def test_saturation_and_values_no_hand_makes_are_missing(name, spoil, method):
 
 def test_raw_counts_at_the_end_of_their_range_are_missing():
     log, _ = swinging()
-    made = {"world_from_sensor": None, **{name: getattr(log, name) for name in VECTORS}}
+    values_by_name = {"world_from_sensor": None, **{name: getattr(log, name) for name in VECTORS}}
     unit = calibration()
-    values = raw_values(made, unit)
+    values = raw_values(values_by_name, unit)
     counts = values["raw_gyroscope"][:, 0]
     middle = np.median(counts)
     wrong = np.abs(counts - middle) > 1000
     values["raw_gyroscope"][:, 0] = np.clip(counts, middle - 1000, middle + 1000)
     records = frame_payloads(mtdata_payloads(DataLayout(OutputMode.MT9), values))
-    spoiled = parse_stream(encode(calibration_message(unit)) + b"".join(records))
-    missing = np.isnan(spoiled.gyroscope_rad_s).any(axis=1)
+    faulty = parse_stream(encode(calibration_message(unit)) + b"".join(records))
+    missing = np.isnan(faulty.gyroscope_rad_s).any(axis=1)
     assert missing[wrong].mean() > 0.9 > 0.02 > missing[~wrong].mean()
-    assert "gyroscope" in spoiled.notes[-1]
+    assert "gyroscope" in faulty.notes[-1]
 
 
 def test_what_a_sensor_may_repeat_is_a_measurement():
     log, _ = swinging()
     coarse = with_rows(log, [VECTORS[1]], lambda rows: np.trunc(rows / 0.0044) * 0.0044)
-    slow = with_rows(log, [VECTORS[2]], lambda rows: repeated(rows, np.arange(len(rows)) % 5 > 0))
-    rest = ImuLog(
+    slow = with_rows(log, [VECTORS[2]], lambda rows: repeat_rows(rows, np.arange(len(rows)) % 5 > 0))
+    resting = ImuLog(
         log.time_s, *(np.tile(v, (len(log), 1)) for v in ([0.0, 0.0, 9.8], [0.0] * 3, [0.4, 0.0, -0.9]))
     )
-    for one in (log, coarse, slow, rest):
-        assert measured(one).notes == ()
+    for sound in (log, coarse, slow, resting):
+        assert without_faults(sound).notes == ()
 
 
 FACTORS = (np.rad2deg(1.0), np.deg2rad(1.0), 1.5, 0.6, -1.0, 0.0)
 
 
 @pytest.mark.parametrize("mixing", [*(factor * np.eye(3) for factor in FACTORS), np.eye(3)[[1, 0, 2]]])
-def test_a_gyroscope_in_another_unit_rate_or_axes_or_that_is_dead_is_refused(mixing):
+def test_a_gyroscope_in_another_unit_rate_or_axes_or_a_dead_one_raises(mixing):
     log, _ = swinging(20.0)
     with pytest.raises(Speckle3DError, match="gyroscope"):
         orient(with_rows(log, [VECTORS[1]], lambda rows: rows @ mixing))
@@ -168,7 +168,7 @@ NAMES = "time_s," + ",".join(f"{kind}_{axis}" for kind in ("acc", "gyr", "mag") 
 
 @pytest.mark.parametrize("shift_s", [4e-4, 0.0])
 @pytest.mark.parametrize("whose", ["sensor,", ""])
-def test_two_sensors_in_one_table_are_refused(whose, shift_s):
+def test_two_sensors_in_one_table_raise(whose, shift_s):
     log, _ = swinging(4.0)
     rows = [NAMES if not whose else whose + NAMES]
     for time_s, *vectors in zip(log.time_s, *(getattr(log, name) for name in VECTORS), strict=True):
@@ -179,7 +179,7 @@ def test_two_sensors_in_one_table_are_refused(whose, shift_s):
         parse_text("\n".join(rows))
 
 
-def test_a_rate_that_the_times_contradict_is_refused():
+def test_a_rate_against_the_times_raises():
     names = "PacketCounter\tSampleTimeFine\tAcc_X\tAcc_Y\tAcc_Z"
     rows = [f"{i}\t{100 * i}\t0\t{0.01 * i}\t9.8" for i in range(50)]
     parse_text("\n".join(["// Update Rate: 100.0Hz", names, *rows]))

@@ -26,7 +26,7 @@ from xsens.messages.framing import encode
 from xsens.messages.mtdata import DataLayout, OutputMode, OutputSettings
 
 UNIT = calibration()
-COUNTED = OutputSettings.COUNTER
+COUNTER_SETTING = OutputSettings.COUNTER
 EVERYTHING = OutputMode.CALIBRATED | OutputMode.ORIENTATION
 VECTORS = ("accelerometer_m_s2", "gyroscope_rad_s", "magnetometer_au")
 
@@ -36,12 +36,12 @@ def s():
     return samples()
 
 
-def assert_same_samples(log, s, atol=1e-6, which=slice(None)):
+def assert_same_samples(log, s, atol=1e-6, rows=slice(None)):
     """Vectors to float32's 24 bits by default, orientation likewise."""
     for name in VECTORS:
-        np.testing.assert_allclose(getattr(log, name), s[name][which], rtol=0, atol=atol)
-    turned = log.world_from_sensor * s["world_from_sensor"][which].inv()
-    assert turned.magnitude().max() < 2 * atol
+        np.testing.assert_allclose(getattr(log, name), s[name][rows], rtol=0, atol=atol)
+    angle = log.world_from_sensor * s["world_from_sensor"][rows].inv()
+    assert angle.magnitude().max() < 2 * atol
 
 
 # The MT9 software's own files
@@ -70,7 +70,7 @@ def test_a_file_of_the_mt9_software(s, tmp_path):
 def test_legacy_data_by_their_configuration(s, form, shape, world):
     layout = DataLayout(
         EVERYTHING | OutputMode.TEMPERATURE | OutputMode.AUXILIARY | OutputMode.POSITION | OutputMode.STATUS,
-        COUNTED | OutputSettings.UTC | shape | form << 8 | world,
+        COUNTER_SETTING | OutputSettings.UTC | shape | form << 8 | world,
     )
     log = parse_stream(configuration(layout) + b"".join(legacy_messages(s, layout)))
     # FP12.20's last bit is 1e-6; of an angle in degrees it is 57 times less.
@@ -117,7 +117,7 @@ def test_increments_stand_in_for_rates(s):
 
 
 def test_a_sensor_plugged_in_again_is_away_as_long_as_the_computer_says(s):
-    layout = DataLayout(EVERYTHING, COUNTED)
+    layout = DataLayout(EVERYTHING, COUNTER_SETTING)
     begin = datetime(2026, 2, 28, 23, 59, 58, 500_000, tzinfo=UTC)
     stretches = [
         configuration(layout) + encode(utc_message(begin + timedelta(seconds=away))) + b"".join(messages)
@@ -145,8 +145,8 @@ def test_plain_files_come_back_exactly(s, tmp_path):
     for name in ("time_s", "counter", "oriented", *VECTORS):
         np.testing.assert_array_equal(getattr(back, name), getattr(log, name))
     assert [(g.after_index, g.lost) for g in back.gaps] == [(19, 5), (99, 1)]
-    turned = back.world_from_sensor[log.oriented] * log.world_from_sensor[log.oriented].inv()
-    assert turned.magnitude().max() < 1e-15
+    angle = back.world_from_sensor[log.oriented] * log.world_from_sensor[log.oriented].inv()
+    assert angle.magnitude().max() < 1e-15
     text = (tmp_path / "log.csv").read_text(encoding="utf-8")
     assert text.startswith("# source: a log\n")
     assert text.splitlines()[2].startswith("time_s,counter,accelerometer_x_m_s2,")

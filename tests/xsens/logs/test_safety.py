@@ -40,6 +40,6 @@ def survives(read, data):
 
 
 @pytest.mark.parametrize("path", CORPUS, ids=lambda path: path.stem)
-def test_the_corpus_is_survived(path):
+def test_the_corpus_raises_only_our_errors(path):
     survives(read_log, path)
     survives(parse_stream, path.read_bytes())

@@ -50,11 +50,13 @@ HEAD = """// Start Time: Unknown
 
 
 def mt_manager(s, separator="\t", blank=("SampleTimeFine", "UTC_Nano"), decimal="."):
-    acc, turned = s["accelerometer_m_s2"], (WORLDS["ENU"] * s["world_from_sensor"]).as_matrix()
+    acc, matrices = s["accelerometer_m_s2"], (WORLDS["ENU"] * s["world_from_sensor"]).as_matrix()
     columns = {"PacketCounter": [f"{i:05d}" for i in range(100, 160)]}
     columns |= {name: [""] * 60 for name in blank}
     columns |= {f"Acc_{axis}": [f"{v:.6f}" for v in acc[:, i]] for i, axis in enumerate("XYZ")}
-    columns |= {name: [f"{v:.6f}" for v in turned[:, int(name[4]) - 1, int(name[7]) - 1]] for name in MATRIX}
+    columns |= {
+        name: [f"{v:.6f}" for v in matrices[:, int(name[4]) - 1, int(name[7]) - 1]] for name in MATRIX
+    }
     table = [list(columns), *map(list, zip(*columns.values(), strict=True))]
     return HEAD + "\n".join(separator.join(row).replace(".", decimal) for row in table) + "\n"
 
@@ -91,9 +93,9 @@ def test_rates_of_turn_of_a_dot_are_degrees_and_its_clock_microseconds(s):
     rows = lines([1 + np.arange(60), ticks, *vectors, np.zeros(60)], ",").split("\n")
     del rows[10:12]
     log = parse_text(DOT + names + "\n".join(rows))
-    kept = np.delete(np.arange(60), [10, 11])
+    rows = np.delete(np.arange(60), [10, 11])
     for name in VECTORS:
-        np.testing.assert_allclose(getattr(log, name), s[name][kept], atol=1e-6)
+        np.testing.assert_allclose(getattr(log, name), s[name][rows], atol=1e-6)
     assert [(g.after_index, g.lost) for g in log.gaps] == [(9, 2)]
     assert log.duration_s == pytest.approx(59 / 60, abs=1e-5)
 

@@ -13,7 +13,7 @@ from xsens.logs.worlds import Claim
 UNNOTICED_DEG = 1e-3
 """Six decimals of a quaternion, in degrees, tenfold."""
 
-ENU = Claim("ENU", "the program's default", assumed=True)
+ENU = Claim("ENU", "the program's default", by_default=True)
 
 
 @pytest.fixture(scope="module")
@@ -21,11 +21,11 @@ def s():
     return samples(300)
 
 
-def mt_manager(s, turned, vectors=("Acc", "Gyr", "Mag")):
+def mt_manager(s, rotations, vectors=("Acc", "Gyr", "Mag")):
     """Text as MT Manager writes it; it does not name the world."""
     names = {"Acc": "accelerometer_m_s2", "Gyr": "gyroscope_rad_s", "Mag": "magnetometer_au"}
     heads = [f"{name}_{axis}" for name in vectors for axis in "XYZ"] + [f"Quat_q{i}" for i in range(4)]
-    rows = np.column_stack([*(s[names[name]] for name in vectors), turned.as_quat(scalar_first=True)])
+    rows = np.column_stack([*(s[names[name]] for name in vectors), rotations.as_quat(scalar_first=True)])
     lines = ["\t".join([f"{i:05d}", *(f"{v:.6f}" for v in row)]) for i, row in enumerate(rows.tolist())]
     return "\n".join(["// Update Rate: 100.0Hz", "\t".join(["PacketCounter", *heads]), *lines, ""])
 
@@ -43,7 +43,7 @@ def test_the_readings_say_which_world_it_is(s, world):
     assert ("not ENU" in note) == (world != "ENU")
 
 
-def test_readings_that_contradict_the_orientation_are_refused_unless_a_world_is_given(s):
+def test_readings_against_the_orientation_raise_unless_hints_name_a_world(s):
     text = mt_manager(s, s["world_from_sensor"].inv())
     with pytest.raises(InvalidInputError, match=r"^text: .*ENU, NWU or NED, but .*vertical.*--world$"):
         parse_text(text)
@@ -64,9 +64,9 @@ def test_readings_that_contradict_the_orientation_are_refused_unless_a_world_is_
 )
 def test_names_in_two_lines(s, names):
     """As in its two folders; the cameras' world is not the sensor's, so that nothing is asked of it."""
-    seen = Rotation.from_euler("y", 70.0, degrees=True) * s["world_from_sensor"]
+    optical = Rotation.from_euler("y", 70.0, degrees=True) * s["world_from_sensor"]
     columns = [
-        seen.as_quat(scalar_first=True),
+        optical.as_quat(scalar_first=True),
         *(s[n] for n in s if n not in ("time_s", "world_from_sensor")),
     ]
     rows = np.column_stack([np.round(s["time_s"], 3), *columns]).tolist()
@@ -76,6 +76,6 @@ def test_names_in_two_lines(s, names):
     assert log.rate_hz == pytest.approx(100.0)
     for name in ("accelerometer_m_s2", "gyroscope_rad_s", "magnetometer_au"):
         np.testing.assert_allclose(getattr(log, name), s[name], rtol=1e-7)
-    assert off_deg(log, seen) < 1e-4
+    assert off_deg(log, optical) < 1e-4
     (note,) = log.notes
     assert "by cameras" in note

@@ -17,9 +17,9 @@ messages = st.builds(
 
 def test_the_vendors_examples():
     data = ("faff3000d1", "faff0304037003f88c", "fa013000cf")
-    sent = [Message(0x30), Message(0x03, bytes.fromhex("037003f8")), Message(0x30, bid=1)]
-    assert decode(bytes.fromhex("".join(data))) == sent
-    assert tuple(encode(message).hex() for message in sent) == data
+    messages = [Message(0x30), Message(0x03, bytes.fromhex("037003f8")), Message(0x30, bid=1)]
+    assert decode(bytes.fromhex("".join(data))) == messages
+    assert tuple(encode(message).hex() for message in messages) == data
 
 
 # Framing in the presence of damage
@@ -31,13 +31,13 @@ def stream(count=50, size=22):
 
 
 def test_a_bad_checksum_and_lost_bytes_cost_the_messages_they_hit():
-    sent = stream()
-    pieces = [bytearray(encode(m)) for m in sent]
+    messages = stream()
+    pieces = [bytearray(encode(m)) for m in messages]
     pieces[10][8] ^= 0x40
     del pieces[20][5:9]
     frames = find_frames(b"".join(pieces))
-    assert list(frames.messages()) == [m for i, m in enumerate(sent) if i not in (10, 20)]
-    assert frames.skipped() == [(270, 27), (540, 23)]
+    assert list(frames.messages()) == [m for i, m in enumerate(messages) if i not in (10, 20)]
+    assert frames.gaps() == [(270, 27), (540, 23)]
 
 
 def test_of_two_that_overlap_the_one_that_another_follows_is_a_message():
@@ -51,13 +51,13 @@ def test_of_two_that_overlap_the_one_that_another_follows_is_a_message():
 
 @FEW
 @given(st.lists(messages, max_size=8), st.lists(st.integers(1, 400), max_size=40))
-def test_a_framer_finds_the_same_whatever_pieces_a_stream_comes_in(sent, pieces):
-    data = b"".join(map(encode, sent))
-    framer, found, at = Framer(), [], 0
+def test_a_framer_finds_the_same_whatever_pieces_a_stream_comes_in(messages, pieces):
+    data = b"".join(map(encode, messages))
+    framer, frames, at = Framer(), [], 0
     for piece in pieces:
-        found += framer.feed(data[at : at + piece])
+        frames += framer.feed(data[at : at + piece])
         at += piece
-    found += framer.feed(data[at:])
+    frames += framer.feed(data[at:])
     # A payload may itself hold a message; those a framer cannot tell apart before more bytes come.
-    if not any(0xFA in m.payload or 0xFA in (m.mid, m.bid) or m.mid == 0 for m in sent):
-        assert found == sent
+    if not any(0xFA in m.payload or 0xFA in (m.mid, m.bid) or m.mid == 0 for m in messages):
+        assert frames == messages
