@@ -105,6 +105,10 @@ def _mt9_export(table: TextTable) -> TextTable:
 def _samples(table: TextTable) -> Parts:
     """Samples of a table whose columns are known."""
     columns, notes = dict(table.columns), list[str]()
+    for key in STAMPS:
+        if key in columns and columns[key].size > 1 and not (columns[key] != columns[key][0]).any():
+            notes.append(f"{key}: the same in every line, left out")
+            del columns[key]
     if "time" in columns and table.names and "time" not in table.with_unit:
         unit = _unit_of(columns["time"], TIMES)
         if unit is None:  # steps of one: milliseconds, or the samples' numbers
@@ -174,9 +178,7 @@ def _samples(table: TextTable) -> Parts:
 def _unit_of(times: FloatArray, units: dict[str, float]) -> str | None:
     """The unit of times that makes their steps a sensor's, or steps of one those of an epoch."""
     steps = np.diff(times)
-    if times.size > 1 and not (steps > 0.0).any():
-        raise InvalidInputError(f"expected times that rise, got {times[0]:g} in every line")
-    usual = float(np.median(steps[steps > 0.0])) if steps.size else 0.01
+    usual = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else 0.01
     for unit, scale in units.items():
         if usual != 1.0 and SHORTEST_S <= usual * scale <= 1.0 / _SLOWEST_HZ:
             return unit
@@ -207,7 +209,7 @@ def _degrees(angles: FloatArray, force: FloatArray | None) -> float:
 
 
 def _utc_s(columns: dict[str, FloatArray]) -> FloatArray | None:
-    """Seconds since 1970, or since midnight, of columns of UTC; None if they are missing or stand still."""
+    """Seconds since 1970, or since midnight, of columns of UTC; None without any."""
     if "utc_s" not in columns:
         return None
     day, month, year, hour, minute, seconds, nano = (
@@ -216,8 +218,7 @@ def _utc_s(columns: dict[str, FloatArray]) -> FloatArray | None:
     )
     months = np.nan_to_num(12.0 * (year - 1970.0) + month - 1.0).astype("M8[M]")
     days = months.astype("M8[D]").astype(float) + day
-    utc_s = 86400.0 * days + 3600.0 * hour + 60.0 * minute + seconds + 1e-9 * nano
-    return utc_s if np.ptp(utc_s) > 0.0 else None
+    return np.asarray(86400.0 * days + 3600.0 * hour + 60.0 * minute + seconds + 1e-9 * nano)
 
 
 def _side_by_side(columns: dict[str, FloatArray], keys: list[str]) -> FloatArray | None:

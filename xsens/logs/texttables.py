@@ -238,9 +238,9 @@ def _read_columns(rows: Iterator[str], header: Header, names: Names, separator: 
         names = names[:-1]
     first = next(rows, "")
     cells = _cells(first, separator)
-    pairs = _join(names, cells)
-    if any(map(column_of, pairs)) and not any(map(_is_number, cells)):  # a line of units
-        pairs = zip(names, pairs, strict=True)
+    with_units = _join(names, cells)
+    if any(map(column_of, with_units)) and not any(map(_is_number, cells)):  # a line of units
+        pairs = zip(names, with_units, strict=True)
         names, first = tuple(pair if column_of(pair) else name for name, pair in pairs), next(rows, "")
     blanks = tuple(part for name in names for part in name.split())
     if len(names) != len(cells) == len(blanks):  # a blank where a tab should be
@@ -298,7 +298,8 @@ def _rows(
         if len(ids) > 1:
             examples = ", ".join([*ids][:4])
             raise InvalidInputError(
-                f"column {names[i]}: expected rows of one sensor, got {len(ids)} ({examples}): split it"
+                f"column {names[i]}: expected rows of one sensor, got {len(ids)} ({examples}): "
+                "split the table"
             )
     notes = []
     if left_out:

@@ -170,7 +170,7 @@ def test_steps_of_one_are_samples_unless_they_count_from_1970():
     # Stamps of whole seconds: the samples of each are spread over it.
     assert parse_text(table(1_714_600_000 + np.arange(300) // 60)).rate_hz == pytest.approx(60.0)
     assert len(parse_text(table([5]))) == 1
-    with pytest.raises(InvalidInputError, match="rise"):
+    with pytest.raises(InvalidInputError, match="--rate-hz"):
         parse_text(table([5] * 50))
 
 
