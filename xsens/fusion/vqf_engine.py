@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import Rotation, Slerp
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
@@ -50,7 +50,7 @@ def by_vqf(stretch: Samples, claims: Estimate, offline: bool, magnetic: bool) ->
     # Losses make the mean step longer than the median, bursts shorter: at most two for one.
     step_s = float(np.clip(np.median(stretch.step_s), 0.5 * mean_s, mean_s))
     place /= step_s
-    grid = np.arange(round(float(place[-1])) + 1.0)
+    grid = np.arange(max(round(float(place[-1])), 1) + 1.0)
     # A gyroscope's reading is the mean rate since the one before, here too: turns stay what they were.
     angle = np.cumsum(stretch.rate_rad_s * np.diff(place, prepend=place[0])[:, None], axis=0)
     rate = np.diff(_at(grid, place, angle), axis=0, prepend=0.0)
@@ -60,12 +60,8 @@ def by_vqf(stretch: Samples, claims: Estimate, offline: bool, magnetic: bool) ->
         field = _at(grid, place[with_field], stretch.field_au[with_field])
     find = vqf.offlineVQF if offline else vqf.VQF(step_s).updateBatch
     estimate = find(rate, force, field, *([step_s] if offline else []))
-    xyzw = estimate["quat9D" if magnetic else "quat6D"][:, [1, 2, 3, 0]]
-    # Neighbours of one sign, so that they can be interpolated: they are a small turn apart.
-    flips = np.einsum("ij,ij->i", xyzw[1:], xyzw[:-1]) < 0.0
-    xyzw[1:] *= np.where(np.cumsum(flips) % 2, -1.0, 1.0)[:, None]
-    xyzw = _at(place, grid, xyzw)
-    xyzw /= np.sqrt(np.einsum("ij,ij->i", xyzw, xyzw))[:, None]
+    rotations = Rotation.from_quat(estimate["quat9D" if magnetic else "quat6D"], scalar_first=True)
+    xyzw = Slerp(grid, rotations)(np.minimum(place, grid[-1])).as_quat()
     north_rad = -0.5 * np.pi  # from VQF's world, x east
     if not magnetic:  # about up as the other engine begins
         first = Rotation.from_quat(claims.xyzw[0]) * Rotation.from_quat(xyzw[0]).inv()

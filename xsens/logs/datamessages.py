@@ -29,16 +29,12 @@ _STARTS = (MessageId.WAKE_UP, MessageId.GO_TO_MEASUREMENT_ACK, MessageId.UTC_TIM
 
 def _stretches(frames: Frames, indices: IntArray) -> Stamps:
     """Mark the data messages before which the sensor was started anew, with the computer's clock then."""
-    at = np.flatnonzero(np.isin(frames.mid, _STARTS))
-    after = np.searchsorted(indices, at)
-    starts, computer_s = np.zeros(indices.size, dtype=bool), None
-    for i, place in zip(at.tolist(), after.tolist(), strict=True):
-        if place == indices.size:
-            break
-        starts[place] = True
+    starts, computer_s = np.zeros(indices.size, dtype=bool), np.full(indices.size, np.nan)
+    for i in np.flatnonzero(np.isin(frames.mid, _STARTS)).tolist():
+        after = slice(place := int(np.searchsorted(indices, i)), place + 1)
+        starts[after] = True
         if frames.mid[i] == MessageId.UTC_TIME:
-            computer_s = np.full(indices.size, np.nan) if computer_s is None else computer_s
-            computer_s[place] = utc_time_s(frames.message(i))
+            computer_s[after] = utc_time_s(frames.message(i))
     return Stamps(starts=starts, computer_s=computer_s)
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from speckle3d.core.arrays import FloatArray
-from speckle3d.kernels.orientation.rotations import compiled, inverse
+from speckle3d.kernels.orientation.rotations import compiled, inverse, norm
 
 ROOM, BIAS, IRON, PLACE, STRAY, LAG, SIZE = 0, 3, 6, 9, 12, 15, 16
 """Places in the state: the room's field (level axes), what is left of the gyroscope's bias (sensor axes), the
@@ -158,7 +158,7 @@ def turn_to_north(x: FloatArray, p: FloatArray) -> tuple[float, float]:
 def _begin(s: Any, b: Any, m: Any) -> None:
     """Begin with the bin's reading; after a pause with the iron and lag found so far."""
     if not s.ran:
-        s.norm = math.sqrt(b.field[0] ** 2 + b.field[1] ** 2 + b.field[2] ** 2)
+        s.norm = norm(b.field)
         _forget(s, IRON, 3, m.iron)
         _forget(s, LAG, 1, m.lag_s)
     _forget(s, ROOM, 3, 1.0)
@@ -187,7 +187,7 @@ def _predict(s: Any, b: Any, m: Any, f: FloatArray, q: FloatArray) -> None:
     keep_bias, keep_stray = math.exp(-span / _BIAS_S), math.exp(-moving * span / _STRAY_S)
     leaves = m.beside_iron and s.changing_s > 0.0  # iron, and at last for a place as any other
     place = m.first_place if leaves and s.changing_s > span else m.place
-    new_place = moves_on or leaves
+    moves_on = moves_on or leaves
     s.rested = b.resting
     s.x[BIAS : BIAS + 3] -= b.bias - s.bias
     s.bias[:] = b.bias
@@ -196,11 +196,11 @@ def _predict(s: Any, b: Any, m: Any, f: FloatArray, q: FloatArray) -> None:
         turn = moving * span * keep_bias * b.level[2, i]
         f[ROOM, BIAS + i], f[ROOM + 1, BIAS + i] = -turn * along, turn * across
         f[BIAS + i, BIAS + i], f[STRAY + i, STRAY + i] = keep_bias, keep_stray
-        f[PLACE + i, PLACE + i] = 1.0 if s.beside or not new_place else 0.0
+        f[PLACE + i, PLACE + i] = 1.0 if s.beside or not moves_on else 0.0
         q[ROOM + i, ROOM + i] = _WALK_SQRT_S**2 * span
         q[BIAS + i, BIAS + i] = (1.0 - keep_bias**2) * b.bias_variance
         q[IRON + i, IRON + i] = m.iron_put_on**2 if s.changing_s > 0.0 else 0.0
-        q[PLACE + i, PLACE + i] = place**2 if new_place else 0.0
+        q[PLACE + i, PLACE + i] = place**2 if moves_on else 0.0
         q[STRAY + i, STRAY + i] = (1.0 - keep_stray**2) * s.stray**2
     q[ROOM, ROOM] += b.slip_rad2 * along * along
     q[ROOM + 1, ROOM + 1] += b.slip_rad2 * across * across
@@ -240,7 +240,7 @@ def _correct(s: Any, b: Any, m: Any, rows: FloatArray, f: FloatArray, q: FloatAr
         out.trust = 0.0
         return
     if out.trust < 1.0:
-        extra = (1.0 / out.trust - 1.0) * (total[0, 0] + total[1, 1] + total[2, 2]) / 3.0
+        extra = (1.0 / out.trust - 1.0) * np.trace(total) / 3.0
         weight, _ = inverse(total + extra * np.eye(3))
     gain = cross @ weight
     s.x[:] += gain @ off
