@@ -164,12 +164,13 @@ def _repeats(
 ) -> BoolArray:
     """Rows that repeat the one before for longer than two samples of the sensor's rate, and then change.
 
+    One in ten of a sensor's samples may last longer: its rate is another than that of the log.
     Where readings before and after change by many of their last digits, none is repeated by chance.
     """
     changes = np.logical_or.reduce([axis[1:] != axis[:-1] for axis in rows.T])
     start = np.flatnonzero(np.append(True, changes))
     length = np.diff(np.append(start, len(rows)))
-    usual = int(np.median(length)) if len(length) > 1 else 1
+    usual = int(min(3.0 * np.median(length), np.percentile(length, 90))) if len(length) > 1 else 1
     long = length > max(2, 2 * usual)
     if not long.any():
         return np.zeros(len(rows), dtype=bool)
