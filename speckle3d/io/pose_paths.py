@@ -184,10 +184,9 @@ def _without_jumps(readings: TimedPoses) -> tuple[TimedPoses, list[str]]:
     pieces = [piece for piece in pieces if not is_lost[piece].all()] or pieces
     largest = int(np.argmax([piece.size for piece in pieces]))
     rows = pieces[largest]
-    for piece in pieces[largest + 1 :]:
-        rows = rows if is_jump(rows[-1:], piece[:1]) else np.append(rows, piece)
-    for piece in pieces[:largest][::-1]:
-        rows = rows if is_jump(piece[-1:], rows[:1]) else np.append(piece, rows)
+    for piece in (*pieces[largest + 1 :], *pieces[:largest][::-1]):
+        before, after = (rows, piece) if rows[-1] < piece[0] else (piece, rows)
+        rows = rows if is_jump(before[-1:], after[:1]) else np.concatenate([before, after])
     first = jumps[:1]
     length_mm, took_s = step_mm(first - 1, first)[0], np.diff(time_s)[first - 1][0]
     jump = f"{length_mm:.3g} mm in {1e3 * took_s:.3g} ms at {time_s[first][0]:.3f} s"
