@@ -160,28 +160,20 @@ class Recording:
         ]
         assumptions += self.assumptions
         words = [f"assumed, as the file does not say: {', '.join(assumptions)}"] if assumptions else []
-        return [
-            *self.contradictions(),
-            *self._frame_times[2],
-            *self.remarks,
-            *self._sweep_and_notes[1],
-            *words,
-        ]
+        contradictions = filter(None, (self._number(name)[1] for name in self.numbers))
+        notes = [*self._frame_times[2], *self.remarks, *self._sweep_and_notes[1]]
+        return [*contradictions, *notes, *words]
 
     def describe(self) -> list[Row]:
         """Rows of what the file says, where each number is from, and what is odd."""
         remarks = [*self._frame_times[2], *self.remarks]
         with suppress(InvalidInputError, FileError):  # which is told by who asks for the sweep
             remarks += self._sweep_and_notes[1]
-        numbers = () if self.fault else (self._number(name)[0] for name in self.numbers)
+        numbers = (self._number(name)[0] for name in self.numbers)
         return [*self.rows, *numbers, *(("note", text, "") for text in remarks)]
 
-    def contradictions(self) -> list[str]:
-        """Tell each number that is given and is another than the recording says, by more than 1 %."""
-        return [*filter(None, (self._number(name)[1] for name in self.numbers))]
-
     def _number(self, name: str) -> tuple[Row, str]:
-        """A number's row, and what contradicts it if it is given."""
+        """Row of a number; and a line where it is given and the recording says another, by more than 1 %."""
         value, setting = self.numbers[name], getattr(self.settings, name)
         words, number, unit = number_row(name, () if value.value is None else value.value)
         source = f" ({value.source})" if value.source else ""
