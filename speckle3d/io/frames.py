@@ -110,10 +110,20 @@ class HDF5Slices:
     axis: int | None = 0
 
     def __call__(self) -> ReadFrame:
-        """Open the file."""
+        """Open the file; one that grows is opened for each frame, as HDF5 keeps an open one as it was."""
         file = open_hdf5(self.path)
+        if not file.swmr_mode:
+            return self._reader(file)
+        file.close()
+        return self._frame_of_growing
+
+    def _reader(self, file: h5py.File) -> ReadFrame:
         reads = [_slice_reader(require_dataset(file, name), self.axis) for name in self.names]
         return lambda i: self.turn(*(read(i) for read in reads))
+
+    def _frame_of_growing(self, i: int) -> AnyArray:
+        with open_hdf5(self.path) as file:
+            return self._reader(file)(i)
 
     def frames(self, shape: tuple[int, int, int], dtype: npt.DTypeLike, **options: Any) -> FileFrames:
         """Frames of a shape (frame, vector, sample)."""

@@ -1,5 +1,8 @@
 """A sweep that grows: read at any moment, after a kill, and when closed."""
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 import sweep_examples
@@ -33,6 +36,33 @@ def test_frames_are_read_while_a_file_grows_and_when_it_is_whole(tmp_path, kind,
             assert f"{i + 1} frames so far" in open_recording(path).notes[0]
             sweep_so_far.frames.close()
     assert not any("frames" in note for note in open_recording(path).notes)
+
+
+WRITER = """
+import sys
+sys.path[:0] = sys.argv[2:]
+import sweep_examples
+from speckle3d.io.sweep_writer import GrowingSweep
+sweep = sweep_examples.rf_sweep()
+with GrowingSweep(sys.argv[1], sweep.grid, sweep.signal, "int16") as target:
+    for frame, time_s in zip(sweep.frames, sweep.frame_time_s):
+        target.append(frame, time_s)
+        print("frame", flush=True)
+        sys.stdin.readline()
+"""
+
+
+def test_another_process_sees_it_grow_whatever_it_still_holds(tmp_path):
+    sweep, path, earlier = SWEEPS["rf"], tmp_path / "s.h5", []
+    command = [sys.executable, "-c", WRITER, str(path), *sys.path]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as writer:
+        for i in range(3):
+            assert writer.stdout.readline() == "frame\n"
+            earlier.append(load_sweep(path))
+            np.testing.assert_array_equal(earlier[-1].frames[i], sweep.frames[i])
+            writer.stdin.write("\n")
+            writer.stdin.flush()
+        writer.kill()
 
 
 def test_a_file_that_is_there_stays_as_it_is(tmp_path):
