@@ -140,16 +140,17 @@ def _bad(
         beyond = size >= _ABSURD
     if beyond.any() or not finite.all():
         rows = np.where((finite & ~beyond)[:, None], rows, np.nan)
-    ends, spikes, overflows = at_ends(rows), _spikes(rows, limits.spike * unit), _overflows(rows)
+    ends, spikes = at_ends(rows), _spikes(rows, limits.spike * unit)
     if name == VECTORS[1]:  # at rest zero is a reading
         zero &= dead
     repeats = _repeats(name, rows, limits.change * unit, size, force, rate) & finite & ~zero
+    overflows = _overflows(np.where((repeats | zero)[:, None], np.nan, rows))
     return {
         "readings of zero": zero,
         "out of range": beyond,
         "repeated": repeats,
         "at the end of the range": ends & ~repeats & ~zero,
-        "beyond the range, wrapped round": overflows & ~ends & ~repeats & ~zero,
+        "beyond the range, wrapped round": overflows & ~ends,
         "single spikes": spikes & ~overflows & ~zero,
     }
 
@@ -187,8 +188,11 @@ def _repeats(
     else:  # what is repeated to the log's end was left while the sensor turned
         turn = 0.0 if rate is None else np.add.reduceat(np.nan_to_num(_norm(rate)), start)
         moves &= ~np.isnan(after) | (turn > _TURNING_RAD_S * length)
+    bad, first = long & moves, np.full(len(start), usual)
+    _, code, count = np.unique(rows[start[bad]], axis=0, return_inverse=True, return_counts=True)
+    first[bad] *= count[code] == 1  # what comes again is no reading, but a number for none
     place = np.arange(len(rows)) - np.repeat(start, length)
-    return np.asarray(np.repeat(long & moves, length) & (place >= usual))
+    return np.asarray(np.repeat(bad, length) & (place >= np.repeat(first, length)))
 
 
 def at_ends(rows: FloatArray) -> BoolArray:

@@ -108,7 +108,7 @@ _SPANS = (1 << 8, 1 << 10, 1 << 12, COUNTS, 86400, TICKS)
 """At which counters and clocks wrap round: words of so many bits, and midnight."""
 
 _WHOSE = re.compile(
-    r"(?:sensor|device|imu|node|unit)[ _]?(?:id|name|no|nr|number|tag|serial)?$"
+    r"(?:sensor|device|imu|node|unit|segment|body|placement)[ _]?(?:id|name|no|nr|number|tag|serial)?$"
     r"|(?:id|tag|mac(?:[ _]?address)?|serial(?:[ _]?number)?)$"
 )
 """Names of columns that say which sensor a row is of."""
@@ -166,7 +166,7 @@ def read_table(lines: Iterable[str]) -> TextTable:
     """Find the table in some lines and read it.
 
     Names may be in one line, or in two: ``Acceleration;;;Field`` above ``X;Y;Z;X`` names ``acceleration_x``.
-    A line that holds two known names at least is the line of names.
+    A line that holds three known names at least is the line of names.
 
     Raises
     ------
@@ -179,7 +179,7 @@ def read_table(lines: Iterable[str]) -> TextTable:
         for separator in () if comment else _SEPARATORS:
             cells, above = _cells(line, separator), _cells(header[-1].lstrip("#% "), separator)
             for names in (cells, _join(above, cells)):
-                if sum(column_of(name) is not None for name in names) >= 2:
+                if sum(column_of(name) is not None for name in names) >= 3:
                     return _read_columns(rows, header, names, separator)
             if len(cells) >= 4 and all(cell == "nan" or _is_number(cell) for cell in cells):
                 if len(above) == len(cells) and any(above) and not any(map(_is_number, above)):

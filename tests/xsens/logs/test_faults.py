@@ -95,6 +95,17 @@ def test_a_slow_sensor_that_is_stuck_for_a_fifth_of_a_second_is_missing_then(nam
         assert not missing[~where].any()
 
 
+@pytest.mark.parametrize("code", [-1.0, -999.0])
+def test_a_number_that_stands_for_none_is_missing_from_its_first_row(code):
+    log, truth = swinging()
+    where = log.time_s % 1.0 >= 0.9
+    faulty = with_rows(log, VECTORS, lambda rows: np.where(where[:, None], code, rows))
+    for name in VECTORS:
+        missing = np.isnan(getattr(without_faults(faulty), name)).any(axis=1)
+        np.testing.assert_array_equal(missing[20:-20], where[20:-20])
+    assert errors(faulty, truth, "filter")[0] < 2.0
+
+
 def with_every(step, rows, value):
     rows[::step] = value
     return rows

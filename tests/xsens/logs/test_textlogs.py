@@ -174,6 +174,21 @@ def test_steps_of_one_are_samples_unless_they_count_from_1970():
         parse_text(table([5] * 50))
 
 
+@pytest.mark.parametrize(
+    "header",
+    ["# Sampling rate: 100 Hz", "Sample Rate (Hz): 100", "Output Frequency = 100Hz", "Update rate;100"],
+)
+@pytest.mark.parametrize(
+    "world", ["// Coordinate system: NED", "Reference frame = NED", "CoordinateSystem;NED"]
+)
+def test_headers_name_rate_and_world(s, header, world):
+    turns = WORLDS["NED"] * s["world_from_sensor"]
+    rows = lines([np.arange(60), turns.as_quat(scalar_first=True)], ";")
+    log = parse_text(f"{header}\n{world}\nsample;qw;qx;qy;qz\n{rows}")
+    assert log.rate_hz == pytest.approx(100.0)
+    assert angle_to(log, s["world_from_sensor"]) < 2e-6
+
+
 def test_columns_of_utc_are_a_clock():
     names = "UTC_Nano UTC_Year UTC_Month UTC_Day UTC_Hour UTC_Minute UTC_Second Acc_X Acc_Y Acc_Z"
     rows = ["990000000 2024 12 31 23 59 59 0 0 9.8", "0 2025 1 1 0 0 0 0 0 9.8"]
