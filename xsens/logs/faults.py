@@ -58,7 +58,7 @@ _TURNS_APART = 5.0
 """Of rows in turn of several sensors, how much farther neighbours are apart than rows of one sensor."""
 
 _NOISY = 10.0
-"""Last digits by which readings change that are not repeated by chance."""
+"""Last digits by which readings change that are not repeated by chance; usual changes in a jump."""
 
 _WRAPS = 1.5
 """Change between two readings, in largest ones, that is an overflow: twice as much, less what it turned."""
@@ -190,7 +190,8 @@ def _repeats(
         moves &= ~np.isnan(after) | (turn > _TURNING_RAD_S * length)
     bad, first = long & moves, np.full(len(start), usual)
     _, code, count = np.unique(rows[start[bad]], axis=0, return_inverse=True, return_counts=True)
-    first[bad] *= count[code] == 1  # what comes again is no reading, but a number for none
+    # What readings jump to again and again is none, but a number that stands for none.
+    first[bad] *= (count[code] == 1) | ~(before[bad] > _NOISY * np.nanmedian(before))
     place = np.arange(len(rows)) - np.repeat(start, length)
     return np.asarray(np.repeat(bad, length) & (place >= np.repeat(first, length)))
 
