@@ -189,9 +189,9 @@ def _repeats(
         turn = 0.0 if rate is None else np.add.reduceat(np.nan_to_num(_norm(rate)), start)
         moves &= ~np.isnan(after) | (turn > _TURNING_RAD_S * length)
     bad, first = long & moves, np.full(len(start), usual)
-    _, code, count = np.unique(rows[start[bad]], axis=0, return_inverse=True, return_counts=True)
-    # What readings jump to again and again is none, but a number that stands for none.
-    first[bad] *= (count[code] == 1) | ~(before[bad] > _NOISY * np.nanmedian(before))
+    if bad.any():  # what readings jump to again and again is none, but a number that stands for none
+        _, code, count = np.unique(rows[start[bad]], axis=0, return_inverse=True, return_counts=True)
+        first[bad] *= (count[code] == 1) | ~(before[bad] > _NOISY * np.median(np.nan_to_num(before)))
     place = np.arange(len(rows)) - np.repeat(start, length)
     return np.asarray(np.repeat(bad, length) & (place >= np.repeat(first, length)))
 
