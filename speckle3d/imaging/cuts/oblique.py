@@ -41,8 +41,6 @@ def turned_frame_plane(
     world_from_image: RigidTransform, lateral_mm: float, angle_deg: float
 ) -> RigidTransform:
     """Place a plane in one frame's depth line, turned about it: at 90 degrees along the sweep."""
-    if not np.isfinite(angle_deg):
-        raise InvalidInputError(f"angle_deg: expected a finite angle, got {angle_deg}")
     line = RigidTransform.from_translation([lateral_mm, 0.0, 0.0])
     # Turned by -y, so that x goes from lateral to elevational.
     turn = RigidTransform.from_rotation(Rotation.from_euler("Y", -angle_deg, degrees=True))
