@@ -46,7 +46,7 @@ _LAST_LOOK_S = 1.0
 """For pages to show the end."""
 _SWITCH_S = 5e-4
 """For which one thread keeps the interpreter at most; Python's 5 ms a frame would wait for many times."""
-_IMPORTED = (
+_SETTINGS = (
     "sampling_rate_hz",
     "vector_pitch_mm",
     "speed_of_sound_m_s",
@@ -69,7 +69,7 @@ def live(
     transform: MaybeText = None,
     orientation: MaybeText = None,
     calibration: Paths = None,
-    imported: Annotated[Any, Fields("speckle3d.io.import_settings:ImportSettings", _IMPORTED)],
+    importing: Annotated[Any, Fields("speckle3d.io.import_settings:ImportSettings", _SETTINGS)],
     view: bool = False,
     serve: Annotated[int | None, typer.Option(min=0, max=65535)] = None,
     volume: bool = True,
@@ -147,7 +147,7 @@ def live(
     if recording.exists():
         raise InvalidInputError(f"{recording}: there already; expected a folder without a recorded sweep")
     require_own(out, RESULTS)
-    settings = SessionSettings(recording, image, transform, orientation, imported, config, volume, check)
+    settings = SessionSettings(recording, image, transform, orientation, importing, config, volume, check)
     note("loading")
     warm_up(curves, config)
     first = None
@@ -155,11 +155,11 @@ def live(
         with progress_bar(f"tracking {crossing_file.name}") as progress:
             first = CrossingCheck.of(load_sweep(crossing_file), curves, config, progress)
     with ExitStack() as pages, ExitStack() as links:
-        served = None if serve is None else links.enter_context(Server(serve))
-        if served is not None:
-            note(f"poses and volume at 127.0.0.1:{served.port}")
+        relay = None if serve is None else links.enter_context(Server(serve))
+        if relay is not None:
+            note(f"poses and volume at 127.0.0.1:{relay.port}")
         connection = links.enter_context(Connection(match[1], int(match[2])))
-        outlets = [connection.send] if served is None else [connection.send, served.send]
+        outlets = [connection.send] if relay is None else [connection.send, relay.send]
         note(f"listening to {server}")
         session, ends = Session(connection, outlets, curves, settings, first), list[str]()
         if view:
@@ -168,15 +168,15 @@ def live(
             note(address)
             webbrowser.open(address_for_once)
         _run(session, duration_s, connection, server)
-        done = session.progress
+        totals = session.progress
         ends.append(f"the sweep has ended; reconstructing it into {out} ...")
-        if not done.frames:
-            reasons = filter(None, (done.missing, _trouble(connection.state, server)))
+        if not totals.frames:
+            reasons = filter(None, (totals.missing, _trouble(connection.state, server)))
             raise InvalidInputError(f"{server}: no images came: {'; '.join(reasons) or 'none was sent'}")
         links.close()
-        note(f"{done.frames} frames in {recording}, {done.poses} placed as they came")
-        if done.missing:
-            note(done.missing)
+        note(f"{totals.frames} frames in {recording}, {totals.poses} placed as they came")
+        if totals.missing:
+            note(totals.missing)
         reconstruct(
             recording,
             out,
@@ -221,14 +221,16 @@ def _run(session: Session, duration_s: float | None, connection: Connection, nam
 
     def show(progress: Progress) -> None:
         nonlocal last_note
-        state, now = connection.state, time.monotonic()
+        state, now_s = connection.state, time.monotonic()
         trouble = _trouble(state, name)
         text = " | ".join(filter(None, (progress.line, trouble)))
         # A status of rich's would wrap where the terminal is narrow.
         line.update(Text(printable(text), no_wrap=True, overflow="ellipsis"))
-        if not console.is_terminal and (progress.words != last_note[1] or now - last_note[0] > _LOG_EVERY_S):
+        if not console.is_terminal and (
+            progress.words != last_note[1] or now_s - last_note[0] > _LOG_EVERY_S
+        ):
             note(text)
-            last_note = now, progress.words
+            last_note = now_s, progress.words
         if progress.frames and not state.peers and state.silent_s > _LEFT_S:
             note(f"{trouble}: taken for the end of the sweep")
             session.end()

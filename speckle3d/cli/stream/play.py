@@ -78,19 +78,19 @@ def play(
         note(f"{address}:{server.port}: {len(read)} frames of {read.name}; waiting for a client")
         while not server.wait_connected(1.0):
             server.receive(0.0)
-        sent, start_s = 0, time.monotonic()
+        count, start_s = 0, time.monotonic()
         for turn in range(sys.maxsize if loop else 1):
             for at_s, message, is_frame in send(shift_s + turn * round_s):
                 due_s = start_s + (turn * round_s + at_s) / rate
                 time.sleep(max(0.0, due_s - time.monotonic()))
                 server.send(message)
                 server.receive(0.0)
-                sent += is_frame
-                progress(sent, len(read) * (turn + 1))
+                count += is_frame
+                progress(count, len(read) * (turn + 1))
         server.drain(_LAST_S)
-        dropped = server.state.dropped
-        slow = f", {dropped} messages dropped: a client is too slow" if dropped else ""
-        note(f"{sent} frames sent{slow}")
+        losses = server.state.dropped
+        slow = f", {losses} messages dropped: a client is too slow" if losses else ""
+        note(f"{count} frames sent{slow}")
 
 
 def _frames(sweep: Sweep, kind: Kind | None) -> tuple[Frames, ImageGrid, bool]:
@@ -102,8 +102,8 @@ def _frames(sweep: Sweep, kind: Kind | None) -> tuple[Frames, ImageGrid, bool]:
     if kind == "rf" and is_grey:
         raise InvalidInputError(f"--as rf: expected echoes, got {sweep.name}, which holds B-mode")
     if is_grey or kind == "bmode":
-        is_stored = is_grey and sweep.frames.dtype == "uint8"
-        images = grey_images(sweep, levels="stored" if is_stored else "log")
+        keep_levels = is_grey and sweep.frames.dtype == "uint8"
+        images = grey_images(sweep, levels="stored" if keep_levels else "log")
         return images, images.grid, True
     if sweep.grid.fan is not None:
         raise InvalidInputError(f"{sweep.name}: expected parallel vectors to send, got a fan's: --as bmode")
