@@ -59,11 +59,11 @@ def predict_bias(solution: Solution, width_mm: float) -> BeamBias:
     too_shallow = width_mm / 2.0 * np.abs(normal[:, 2] / normal[:, 1])
     rows = (exact - too_shallow) / chain.pixel_mm[1]
     thick = replace(points, pixels=np.column_stack([points.pixels[:, 0], rows]))
-    probe = tuple(name for name in solution.free if name not in solution.phantom.determined)
-    seen = Problem(solution.phantom, probe, np.inf).solve(thick, chain)
+    probe = tuple(name for name in solution.free if name not in solution.phantom.unknowns)
+    refit = Problem(solution.phantom, probe, np.inf).solve(thick, chain)
     middle = points.pixels.mean(axis=0)
     before, after = (
-        one.sensor_from_image.apply(np.append(middle * one.pixel_mm, 0.0)) for one in (chain, seen.chain)
+        c.sensor_from_image.apply(np.append(middle * c.pixel_mm, 0.0)) for c in (chain, refit.chain)
     )
-    moved = chain.sensor_from_image.rotation.inv().apply(after - before)
-    return BeamBias(width_mm, moved, seen.rms)
+    shift = chain.sensor_from_image.rotation.inv().apply(after - before)
+    return BeamBias(width_mm, shift, refit.rms)

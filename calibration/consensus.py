@@ -37,7 +37,7 @@ _MOST_FRAMES = 120
 _BATCHES = (300, *[3000] * 10)
 """Samples drawn at a time. With the right candidate drawn in three frames of ten, one sample in 120 is right;
 in one of ten, one in 10,000. All take some two seconds."""
-_KEPT = 25
+_BEST_SAMPLES = 25
 """Best samples of a batch that are refined and judged."""
 _SURE = -0.5
 """Logarithm of the false alarms, over the number of frames, at which the search ends: a third of the frames
@@ -76,21 +76,21 @@ class Consensus:
     false_alarms: float
 
     @property
-    def agreed(self) -> BoolArray:
+    def inliers(self) -> BoolArray:
         """Frames whose candidate is within `gate_mm`, shape (f,)."""
         return np.asarray(self.away_mm <= self.gate_mm)
 
     @property
-    def believed(self) -> bool:
+    def is_significant(self) -> bool:
         """Whether chance would not agree as well."""
         return self.false_alarms <= FALSE_ALARMS
 
     def require(self) -> Consensus:
-        """Raise `InsufficientDataError` unless it is believed."""
-        if not self.believed:
+        """Raise `InsufficientDataError` unless it is significant."""
+        if not self.is_significant:
             raise InsufficientDataError(
-                f"expected one point that the frames agree on beyond chance, got {self.agreed.sum()} "
-                f"of {len(self.agreed)} frames within {self.gate_mm:g} mm, which chance gives "
+                f"expected one point that the frames agree on beyond chance, got {self.inliers.sum()} "
+                f"of {len(self.inliers)} frames within {self.gate_mm:g} mm, which chance gives "
                 f"{self.false_alarms:.2g} times a recording (limit {FALSE_ALARMS:g}): do the images and the "
                 "sensor readings belong together, and do they show a crossing? Points picked by hand, or a "
                 "region to look in, would help"
@@ -117,8 +117,8 @@ def find_consensus(points: ImagePoints, pixel_mm: FloatArray | None = None) -> C
     voters = _Candidates(points.of_some_frames(_MOST_FRAMES), pixel_mm)
     for count in _BATCHES:
         for model in voters.best(voters.samples(rng, count)):
-            refined = voters.refined(model)
-            best = min(best, (*voters.false_alarms(refined), refined), key=lambda one: one[0])
+            refit = voters.refine(model)
+            best = min(best, (*voters.false_alarms(refit), refit), key=lambda fit: fit[0])
         if best[0] < _SURE * len(voters.frames):
             break
     log_alarms, gate, model = best
@@ -149,10 +149,10 @@ class _Candidates:
         self.start = np.cumsum(self.count) - self.count
         self.centre, self.spread = points.pixels.mean(axis=0), float(points.pixels.std()) or 1.0
         self.middle = points.shifts_mm.mean(axis=0)
-        self.seen = (points.pixels - self.centre) / self.spread
+        self.places = (points.pixels - self.centre) / self.spread
         minus = np.broadcast_to(-np.eye(3), (len(points), 3, 3))
-        self.rows = np.concatenate([affine_equations(self.seen, points.turns), minus], axis=2)
-        self.wanted = self.middle - points.shifts_mm
+        self.rows = np.concatenate([affine_equations(self.places, points.turns), minus], axis=2)
+        self.target = self.middle - points.shifts_mm
         sizes = _PIXEL_MM[:, None] * np.ones(2)
         if pixel_mm is not None:
             sizes = np.outer([1.0 / _PLAUSIBLE_PIXEL, _PLAUSIBLE_PIXEL], pixel_mm)
@@ -166,40 +166,41 @@ class _Candidates:
         rank = np.arange(len(self.of_frame)) - self.start[self.of_frame]
         weight = np.append(0.0, np.cumsum(1.0 / (1.0 + rank)))
         before, after = weight[self.start], weight[self.start + self.count]
-        drawn = before[frames] + rng.random(frames.shape) * (after - before)[frames]
-        chosen = np.minimum(np.searchsorted(weight[1:], drawn, side="right"), len(rank) - 1)
-        return self._solved(self.rows[chosen].reshape(count, -1, 12), self.wanted[chosen].reshape(count, -1))
+        draw = before[frames] + rng.random(frames.shape) * (after - before)[frames]
+        sample = np.minimum(np.searchsorted(weight[1:], draw, side="right"), len(rank) - 1)
+        return self._solve(self.rows[sample].reshape(count, -1, 12), self.target[sample].reshape(count, -1))
 
-    def _solved(self, matrix: FloatArray, wanted: FloatArray) -> FloatArray:
-        turned = np.swapaxes(matrix, -1, -2)
-        return np.asarray(np.linalg.solve(turned @ matrix + self.prior, turned @ wanted[..., None])[..., 0])
+    def _solve(self, matrix: FloatArray, target: FloatArray) -> FloatArray:
+        transpose = np.swapaxes(matrix, -1, -2)
+        normal = transpose @ matrix + self.prior
+        return np.asarray(np.linalg.solve(normal, transpose @ target[..., None])[..., 0])
 
     def best(self, models: FloatArray) -> FloatArray:
         """The plausible models with the least sum of the frames' squared distances, each bounded."""
         axes = models[:, 3:9].reshape(-1, 2, 3)
         length = np.linalg.norm(axes, axis=2)
         cosine = np.abs(np.sum(axes[:, 0] * axes[:, 1], axis=1)) / np.prod(np.maximum(length, 1e-9), axis=1)
-        sized = np.all((length > self.shortest) & (length < self.longest), axis=1)
-        models = models[sized & (cosine < _SQUARE)]
+        plausible = np.all((length > self.shortest) & (length < self.longest), axis=1)
+        models = models[plausible & (cosine < _SQUARE)]
         cost = np.minimum(self._nearest(models), _LOOSE_MM**2).sum(axis=1)
-        return np.asarray(models[np.argsort(cost, kind="stable")[:_KEPT]])
+        return np.asarray(models[np.argsort(cost, kind="stable")[:_BEST_SAMPLES]])
 
     def _nearest(self, models: FloatArray) -> FloatArray:
         """Squared distance of each frame's nearest candidate from the point, shape (models, frames)."""
         rows = self.rows.reshape(-1, 12).astype(np.float32)
-        left = models.astype(np.float32) @ rows.T - self.wanted.ravel().astype(np.float32)
-        squares = np.sum(left.reshape(len(models), len(self.of_frame), 3) ** 2, axis=2)
+        residuals = models.astype(np.float32) @ rows.T - self.target.ravel().astype(np.float32)
+        squares = np.sum(residuals.reshape(len(models), len(self.of_frame), 3) ** 2, axis=2)
         return np.asarray(np.minimum.reduceat(squares, self.start, axis=1))
 
-    def refined(self, model: FloatArray) -> FloatArray:
+    def refine(self, model: FloatArray) -> FloatArray:
         """The model of the candidates that agree with it, within less and less."""
         for gate in _TIGHTER_MM:
-            squares = np.sum((self.rows @ model - self.wanted) ** 2, axis=1)
+            squares = np.sum((self.rows @ model - self.target) ** 2, axis=1)
             first = nearest_of_frames(self.of_frame, squares)
             agreeing = first[squares[first] < gate**2]
             if len(agreeing) <= _SAMPLE:
                 break
-            model = self._solved(self.rows[agreeing].reshape(-1, 12), self.wanted[agreeing].ravel())
+            model = self._solve(self.rows[agreeing].reshape(-1, 12), self.target[agreeing].ravel())
         return model
 
     def false_alarms(self, model: FloatArray) -> tuple[float, float]:
@@ -208,23 +209,24 @@ class _Candidates:
         (n - 4) C(n, k) C(k, 4) m^4 p^(k - 4): sizes of the agreeing set, sets, samples in a set with m
         candidates in each frame, and the chance that the rest of the set agrees (reference 2, equation 2).
         """
-        n, each = len(self.frames), float(self.count.mean())
+        n, per_frame = len(self.frames), float(self.count.mean())
         if n <= _SAMPLE:
             return np.inf, GATES_MM[-1]
         away, axes = np.sqrt(self._nearest(model[None])[0]), model[3:9].reshape(2, 3)
         # The nearest candidate of each other frame, had it each frame's pose.
-        place, turns = model[:3] + self.seen @ axes, self.points.turns[self.start]
-        apart = np.einsum("fij,nj->fni", turns, place) - self.wanted[self.start][:, None] - model[9:]
-        exchanged = np.minimum.reduceat(np.linalg.norm(apart, axis=2), self.start, axis=1)
-        exchanged = exchanged[~np.eye(n, dtype=bool)]
-        area = float(np.prod(np.maximum(np.ptp(self.seen, axis=0), 0.1) * np.linalg.norm(axes, axis=1)))
-        tried = []
+        place, turns = model[:3] + self.places @ axes, self.points.turns[self.start]
+        offset = np.einsum("fij,nj->fni", turns, place) - self.target[self.start][:, None] - model[9:]
+        by_chance = np.minimum.reduceat(np.linalg.norm(offset, axis=2), self.start, axis=1)
+        by_chance = by_chance[~np.eye(n, dtype=bool)]
+        area = float(np.prod(np.maximum(np.ptp(self.places, axis=0), 0.1) * np.linalg.norm(axes, axis=1)))
+        logarithms = []
         for gate in GATES_MM:
             # Few frames have few pairs to count: at least what candidates all over the image would give.
-            least = np.pi * gate**2 * each / max(area, np.pi * gate**2)
-            chance = min(max(float(np.mean(exchanged < gate)), least), 1.0)
+            least = np.pi * gate**2 * per_frame / max(area, np.pi * gate**2)
+            chance = min(max(float(np.mean(by_chance < gate)), least), 1.0)
             agreeing = max(int(np.sum(away < gate)), _SAMPLE)
             sets = (n - _SAMPLE) * binom(n, agreeing) * binom(agreeing, _SAMPLE)
-            tried.append(np.log10(sets * each**_SAMPLE) + (agreeing - _SAMPLE) * np.log10(chance))
-        best = int(np.argmin(tried))
-        return tried[best] + np.log10(len(GATES_MM)), GATES_MM[best]
+            tail = (agreeing - _SAMPLE) * np.log10(chance)
+            logarithms.append(np.log10(sets * per_frame**_SAMPLE) + tail)
+        best = int(np.argmin(logarithms))
+        return logarithms[best] + np.log10(len(GATES_MM)), GATES_MM[best]

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from calibration.points import CHAIN, columns_of
+from calibration.points import ANGLES, CHAIN, PROBE, SCALES, columns_of
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError
 
@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 
 MAX_CONDITION = 1000.0
 """Robot calibration asks for 100 (TR 303, section 4.2); its bare-wall trials were at 211 and 448."""
-_TWO_SIDED = 1.96
-REFUSED = np.array([5.0, np.deg2rad(5.0)]) / _TWO_SIDED
+_HALF_WIDTH = 1.96
+LIMITS = np.array([5.0, np.deg2rad(5.0)]) / _HALF_WIDTH
 """Standard error of the image's worst corner, and about its worst axis, above which a solution is refused:
 95 % intervals of 5 mm and 5 degrees, which a ruler and a protractor on the probe achieve."""
 WEAK = np.array([1.0, np.deg2rad(1.0)])
@@ -38,11 +38,11 @@ TIE = 25.0
 
 _LEAST_SIGMA = np.array([0.1, np.deg2rad(0.1)])
 """Lines are not found more exactly; residuals of exact data would make every motion look sufficient."""
-_ALLOWED_LACKING = 0.65
-"""Share of what is allowed where a motion is absent: the standard error is itself uncertain, and three of
-it are to stay below 5 mm and 5 degrees."""
+_LIMIT_LACKING = 0.65
+"""Share of `LIMITS` that counts where a motion is absent: the standard error is itself uncertain, and three
+of it are to stay below 5 mm and 5 degrees."""
 _LET_PASS = 2.0
-"""Share of what is allowed that errors may reach, were residuals those of a phantom that fits, for a misfit
+"""Share of `LIMITS` that errors may reach, were residuals those of a phantom that fits, for a misfit
 to be the phantom's."""
 _UNKNOWN, _UNKNOWN_RAD, _UNKNOWN_MM = 0.3, 1.0, 300.0
 """Standard deviations before anything is measured: of a pixel size as a share of it, of angles and places."""
@@ -63,15 +63,12 @@ SIDEWAYS = "shift the probe sideways (the phantom then appears elsewhere across 
 UP_AND_DOWN = "move the probe up and down (the phantom then appears at other depths)"
 MOTIONS = (TILT, YAW, ROLL, SIDEWAYS, UP_AND_DOWN)
 
-_WORDS = {
-    "s_x": "the column pitch", "s_y": "the row spacing",
-    "x": "a shift across the image", "y": "a shift along the beam", "z": "a shift out of the image's plane",
-    "alpha": "roll", "beta": "yaw", "gamma": "tilt",
-    "x_c": "the phantom's x", "y_c": "the phantom's y", "z_c": "the phantom's z",
-    "alpha_c": "the phantom's turn about z", "beta_c": "its turn about y", "gamma_c": "its turn about x",
-}  # fmt: skip
-_TAKES_PART = 0.5
-"""Share of the largest component of an eigenvector from which a parameter is named."""
+_WORDS = (
+    "the distance between columns", "the distance between rows",
+    "the image's place across the beam", "the image's place along the beam", "the image's place out of plane",
+    "roll", "yaw", "tilt",
+)  # fmt: skip
+"""The parameters of `PROBE` in messages."""
 
 
 @dataclass(frozen=True)
@@ -123,56 +120,68 @@ def require_adequate(solution: Solution) -> Solution:
 def judge(solution: Solution) -> Adequacy:
     """Judge the motion of a solution, and whether the phantom explains the images at all."""
     angular, condition = solution.angular, solution.condition_number
-    white = _errors(solution, _bounded(solution))
+    independent = _independent_covariance(solution)
+    white = _errors(solution, independent)
     errors = np.maximum(white, _errors(solution, solution.full_covariance))
-    excess, weak = float((errors / REFUSED).max()), bool((errors > WEAK).any())
+    excess, weak = float((errors / LIMITS).max()), bool((errors > WEAK).any())
     error = float(errors[int(angular)])
     share = MISFIT[int(angular)] / max(solution.rms, np.finfo(float).tiny)
     # Where even a phantom that fits would not determine the answer, the misfit comes from the motion: the
     # solver runs away in the direction left open.
-    if share < 1 and share * float((white / REFUSED).max()) <= _LET_PASS:
+    if share < 1 and share * float((white / LIMITS).max()) <= _LET_PASS:
         misfit = (
             f"the phantom does not explain the images (they miss it by {_size(solution.rms, angular)}): do "
             "the images and the sensor readings belong together, and are the phantom, its wires and their "
             "numbers the ones named?"
         )
         return Adequacy(error, (), True, misfit)
-    tied = solution.evidence < TIE
+    ambiguous = solution.evidence < TIE
     extent_of = extents(solution)
     lacking = [motion for motion, extent in extent_of.items() if extent < _ABSENT]
     dots = solution.phantom.seen_as == "dot"
     # Dots of wires tell the image's place from a few frames; what they lack is in their errors.
-    allowed = _ALLOWED_LACKING if lacking and not dots else 1.0
+    limit = _LIMIT_LACKING if lacking and not dots else 1.0
     # Of a plane always equally deep, errors in the poses shrink free pixels, more than any error claimed.
-    unsized = solution.phantom.seen_as == "line" and solution.prior is None and "s_x" in solution.free
-    unsized &= UP_AND_DOWN in lacking
-    refused = bool(excess > allowed or not condition <= MAX_CONDITION or tied or unsized)
-    # If none is absent, the one that was there and not far enough.
-    missing = tuple(lacking or [min(extent_of, key=lambda one: extent_of[one])]) if weak or refused else ()
+    no_size = solution.phantom.seen_as == "line" and solution.prior is None and "s_x" in solution.free
+    no_size &= UP_AND_DOWN in lacking
+    inadequate = bool(excess > limit or not condition <= MAX_CONDITION or ambiguous or no_size)
+    # If none is absent, the least of them.
+    missing = tuple(lacking or [min(extent_of, key=extent_of.__getitem__)]) if weak or inadequate else ()
     state = f"standard error {_size(error, angular)}" + ("" if angular else " at the image's corners")
-    if not angular and np.argmax(errors / REFUSED) == 1:
+    if not angular and np.argmax(errors / LIMITS) == 1:
         state += f" and {_size(errors[1], True)}"
     state += f", condition number {condition:.3g}"
     verdict = "the motion was sufficient"
-    if tied and excess <= allowed:
+    if ambiguous and excess <= limit:
         verdict = "two answers explain the images equally well, one of them mirrored"
-    elif refused:
+    elif inadequate:
         verdict = "the motion does not determine the calibration"
     elif weak:
         verdict = "the motion weakly determines the calibration"
-    advice = f": {'; and '.join(missing)}; weakest is {weakest_of(solution)}" if missing else ""
-    verdict += f" ({state}){advice}"
+    verdict += f" ({state})"
+    if missing:
+        deviations = np.sqrt(np.maximum(np.diag(independent), np.diag(solution.full_covariance)))
+        least = least_certain(solution, deviations)
+        verdict += f": {'; and '.join(missing)}. Least certain without that is {least}"
     verdict += f"; {solution.assumed}" if solution.assumed else ""
-    return Adequacy(error, missing, refused, verdict)
+    return Adequacy(error, missing, inadequate, verdict)
 
 
-def weakest_of(solution: Solution) -> str:
-    """What a motion determines least, in words: the last eigenvector of the scaled normal matrix."""
-    jacobian, free = solution.jacobian, solution.free
-    scaled = jacobian / np.maximum(np.linalg.norm(jacobian, axis=0), np.finfo(float).tiny)
-    part = np.abs(np.linalg.eigh(scaled.T @ scaled)[1][:, 0])
-    named = (name for name, share in zip(free, part, strict=True) if share > _TAKES_PART * part.max())
-    return " with ".join(_WORDS[name] for name in named)
+def least_certain(solution: Solution, deviations: FloatArray) -> str:
+    """The parameter of the image known least, with its 95 % interval, in words.
+
+    Parameters
+    ----------
+    deviations : ndarray, shape (14,)
+        Standard errors of `CHAIN`; a pixel size counts by how far it moves the image's far side.
+    """
+    halves, reach = _HALF_WIDTH * deviations[: len(PROBE)], solution.points_used.pixels.max(axis=0)
+    worst = int(np.argmax(halves * np.concatenate([reach, np.ones(3), np.full(3, WEAK[0] / WEAK[1])])))
+    if worst < len(SCALES):
+        size = f"{100 * halves[worst] / solution.chain.pixel_mm[worst]:.2g} %"
+    else:
+        size = _size(halves[worst], PROBE[worst] in ANGLES)
+    return f"{_WORDS[worst]}, +- {size} (95 %)"
 
 
 def extents(solution: Solution) -> dict[str, float]:
@@ -200,7 +209,7 @@ def extents(solution: Solution) -> dict[str, float]:
     slope = np.arctan(along[:, 1] / along[:, 0])
     # The slope depends on the pixels' shape, which may be wrong; the normal swings as far at least.
     spread_of = {TILT: np.sqrt(max(swing - slope.var(), 0.0)), ROLL: min(slope.std(), np.sqrt(swing))}
-    if solution.angular and solution.phantom.determined:
+    if solution.angular and solution.phantom.unknowns:
         # A plane that is not known to be level has a slope, which turning about its normal tells apart.
         turns = points.world_from_sensor.rotation
         spread_of[YAW] = ((turns.mean().inv() * turns).as_rotvec() @ middle).std()
@@ -211,12 +220,12 @@ def extents(solution: Solution) -> dict[str, float]:
         depth = centre[:, 1] + (column - centre[:, 0]) * along[:, 1] / along[:, 0]
         # About the column at which the lines cross: turning the probe there does not change the depth.
         steps = np.column_stack([np.ones(len(slope)), np.tan(slope)])
-        left = depth - steps @ np.linalg.lstsq(steps, depth, rcond=None)[0]
-        spread_of[UP_AND_DOWN] = float(left.std() / steps_mm[1])
+        travel = depth - steps @ np.linalg.lstsq(steps, depth, rcond=None)[0]
+        spread_of[UP_AND_DOWN] = float(travel.std() / steps_mm[1])
     return spread_of
 
 
-def _bounded(solution: Solution) -> FloatArray:
+def _independent_covariance(solution: Solution) -> FloatArray:
     """Covariance of `CHAIN` if errors are independent, as large as detection's, and answers plausible."""
     size = solution.chain.pixel_mm * _UNKNOWN
     if solution.prior is not None:
@@ -236,8 +245,8 @@ def _errors(solution: Solution, covariance: FloatArray) -> FloatArray:
     angle = float(np.sqrt(np.linalg.eigvalsh(covariance[5:8, 5:8])[-1]))
     if solution.angular:
         return np.array([0.0, angle])
-    moved = solution.corners_moved
-    corners = np.einsum("kip,pq,kiq->k", moved, covariance, moved)
+    slopes = solution.corner_slopes
+    corners = np.einsum("kip,pq,kiq->k", slopes, covariance, slopes)
     return np.array([float(np.sqrt(corners.max())), angle])
 
 

@@ -1,7 +1,7 @@
 """Errors that wander: the answer and the covariance of a calibration whose sensor drifts over seconds.
 
 Plain least squares takes all errors for white and the sensor's poses for exact. But a sensor's error wanders
-(Ornstein and Uhlenbeck), so that neighbouring frames say the same: residuals are whitened for a grid of sizes
+(Ornstein and Uhlenbeck), so that neighbouring frames say the same: residuals are whiten for a grid of sizes
 and times of the wandering, and the answers of the grid are averaged by their restricted likelihood [2]_. And
 the derivatives contain the poses' errors, which are in the residuals too, so that pixel sizes come out too
 small: derivatives are taken at poses and points corrected by what the residuals say [1]_.
@@ -53,11 +53,11 @@ _SINGULAR = 1e-15
 """Ratio of eigenvalues below which a direction counts as not determined."""
 _SMALLEST = 1e-12
 """Residuals below are rounding: nothing wanders in them."""
-_FELT = 1e-9
+_LEAST_EFFECT = 1e-9
 """Share of the largest squared effect below which an error along an axis moves no residual."""
 _STEPS = 3
 """The first finds the answer, the second takes the errors out of the derivatives, the third the rest."""
-_SETTLED = 0.05
+_SMALL_STEP = 0.05
 """Standard errors of a second step below which there is no third."""
 
 
@@ -100,12 +100,12 @@ def make_grid(
     span = max(float(np.ptp(frame_time_s)), _SMALLEST)
     spacing = float(np.median(np.diff(frame_time_s))) if len(frame_time_s) > 1 else span
     times = np.geomspace(min(max(_SHORTEST * spacing, _SMALLEST), span), _LONGEST * span, _TIMES)
-    squares = [one**2 for one in proportions]
-    units = [one / max(float(np.sum(np.mean(effects**2, axis=0) * one)), _SMALLEST**2) for one in squares]
+    energy = np.mean(effects**2, axis=0)
+    units = [shape**2 / max(float(energy @ shape**2), _SMALLEST**2) for shape in proportions]
     still = [(0.0, shake, times[0], unit) for shake in jitter for unit in (units if shake else units[:1])]
     wandering = product(WANDER, jitter, times, units)
     parts = [(STEADY, still), (1.0 - STEADY, list(wandering))]
-    return np.array([(*one, share / len(part), *unit) for share, part in parts for *one, unit in part])
+    return np.array([(*sizes, share / len(part), *unit) for share, part in parts for *sizes, unit in part])
 
 
 def fit_wandering(
@@ -141,30 +141,34 @@ def fit_wandering(
     scale = np.where(scale > 0, scale, 1.0)
     information = np.broadcast_to(certainty / scale**2, scale.shape)
     columns = np.ascontiguousarray(np.column_stack([jacobian / scale, residuals]))
-    wandering, jitter, constant_s, before, units = *grid.T[:4], grid[:, 4:]
     pauses_s = np.maximum(np.diff(frame_time_s, prepend=frame_time_s[0]), 0.0)
     effects = np.ascontiguousarray(effects)
 
-    def whitened(g: int) -> tuple[FloatArray, float]:
-        kept, white = np.exp(-pauses_s / constant_s[g]), np.empty_like(columns)
-        wander, shake = units[g] * wandering[g] ** 2, units[g] * jitter[g] ** 2
-        volume = float(innovations(columns, effects, starts, kept, wander, shake, white))
+    def whiten(g: int) -> tuple[FloatArray, float]:
+        wandering, jitter, constant_s, _, *unit = grid[g]
+        variance, white = np.array(unit), np.empty_like(columns)
+        decay = np.exp(-pauses_s / constant_s)
+        sizes = variance * wandering**2, variance * jitter**2
+        volume = float(innovations(columns, effects, starts, decay, *sizes, white))
         return white.T @ white, volume
 
-    normal, log_determinant = map(np.array, zip(*ahead(whitened, range(len(grid))), strict=True))
-    matrix, pull, energy = normal[:, :-1, :-1], normal[:, :-1, -1], normal[:, -1, -1]
+    normal, log_determinant = map(np.array, zip(*ahead(whiten, range(len(grid))), strict=True))
     free = max(len(residuals) - len(scale), 1)
-    sizes, axes = np.linalg.eigh(matrix)
-    along = np.einsum("gij,gi->gj", axes, pull)
+    sizes, axes = np.linalg.eigh(normal[:, :-1, :-1])
+    along = np.einsum("gij,gi->gj", axes, normal[:, :-1, -1])
     firm = np.where(sizes > _SINGULAR * sizes[:, -1:], sizes, np.inf)
-    variance = np.maximum(np.maximum(energy - (along**2 / firm).sum(axis=1), 0.0) / free, _SMALLEST**2)
+    energy = np.maximum(normal[:, -1, -1] - (along**2 / firm).sum(axis=1), 0.0)
+    variance = np.maximum(energy / free, _SMALLEST**2)
     volume = np.log(np.maximum(sizes, _SINGULAR * sizes[:, -1:] + _SMALLEST)).sum(axis=1)
-    likelihood = -0.5 * (free * np.log(variance) + log_determinant + volume)
-    weight = before * np.exp(likelihood - likelihood.max())
-    weight /= weight.sum()
-    known = matrix / variance[:, None, None] + np.diag(information)
-    spread = np.linalg.pinv(known, rcond=_SINGULAR, hermitian=True)
-    steps = -np.einsum("gij,gj->gi", spread, pull / variance[:, None] + information * excess * scale)
+    likelihood = np.log(grid[:, 3]) - 0.5 * (free * np.log(variance) + log_determinant + volume)
+    weight = np.exp(likelihood - likelihood.max())
+    likely = weight > _NEGLIGIBLE
+    grid, normal, variance = grid[likely], normal[likely], variance[likely]
+    weight = weight[likely] / weight[likely].sum()
+    inverse = normal[:, :-1, :-1] / variance[:, None, None] + np.diag(information)
+    spread = np.linalg.pinv(inverse, rcond=_SINGULAR, hermitian=True)
+    pull = normal[:, :-1, -1] / variance[:, None] + information * excess * scale
+    steps = -np.einsum("gij,gj->gi", spread, pull)
     step = weight @ steps
     away = steps - step
     covariance = np.einsum("g,gij->ij", weight, spread) + (weight * away.T) @ away
@@ -172,9 +176,9 @@ def fit_wandering(
         step / scale,
         covariance / np.outer(scale, scale),
         float(np.sqrt(weight @ variance)),
-        (weight * variance * (wandering**2 + jitter**2)) @ units,
+        (weight * variance * np.sum(grid[:, :2] ** 2, axis=1)) @ grid[:, 4:],
     )
-    return noise, grid[weight > _NEGLIGIBLE * weight.max()]
+    return noise, grid
 
 
 def sensor_effects(equations: Equations, chain: Chain) -> FloatArray:
@@ -185,8 +189,8 @@ def sensor_effects(equations: Equations, chain: Chain) -> FloatArray:
     return np.concatenate([np.cross(arm[:, None], in_world), in_world], axis=2)
 
 
-def _felt(effects: FloatArray, directions: bool) -> tuple[FloatArray, FloatArray]:
-    """Turns and shifts that the residuals feel at all, as axes, shape (k, 6), and which are shifts, (k,).
+def _error_axes(effects: FloatArray, directions: bool) -> tuple[FloatArray, FloatArray]:
+    """Axes of turns and shifts that change residuals, shape (k, 6), and which are shifts, (k,).
 
     An error is as likely along any axis, so that axes may be chosen: of a plane, two turns and one shift.
     """
@@ -194,8 +198,8 @@ def _felt(effects: FloatArray, directions: bool) -> tuple[FloatArray, FloatArray
     for first in (0,) if directions else (0, 3):
         block = effects[:, first : first + 3]
         sizes, along = np.linalg.eigh(block.T @ block)
-        axes.append(np.pad(along.T[sizes > _FELT * sizes[-1]], ((0, 0), (first, 3 - first))))
-    return np.concatenate(axes), np.repeat([False, True][: len(axes)], [len(one) for one in axes])
+        axes.append(np.pad(along.T[sizes > _LEAST_EFFECT * sizes[-1]], ((0, 0), (first, 3 - first))))
+    return np.concatenate(axes), np.repeat([False, True][: len(axes)], [len(block) for block in axes])
 
 
 def fit_noise(
@@ -204,7 +208,7 @@ def fit_noise(
     free: Sequence[str],
     seen_as: SeenAs,
     prior: PixelPrior | None = None,
-    more: FloatArray | None = None,
+    slopes: FloatArray | None = None,
 ) -> tuple[Chain, FloatArray, FloatArray]:
     """Go from a least-squares solution to the one that knows that the sensor's errors wander.
 
@@ -214,7 +218,7 @@ def fit_noise(
         Without outliers, frames ascending.
     free : sequence of str, length p
         The parameters estimated; `SCALES` first where the prior says something of them.
-    more : ndarray, shape (n r, k), optional
+    slopes : ndarray, shape (n r, k), optional
         Derivatives of the residuals by further parameters, which are zero so far.
 
     Returns
@@ -229,38 +233,38 @@ def fit_noise(
     first = np.flatnonzero(np.diff(points.frame, prepend=points.frame[0] - 1))
     starts = several * np.append(first, len(points))
     frame_time_s = points.times[starts[:-1] // several]
-    beside = np.zeros((equations.offsets.size, 0)) if more is None else more
+    beside = np.zeros((equations.offsets.size, 0)) if slopes is None else slopes
     further, count = np.zeros(beside.shape[1]), len(free)
-    corrected, expected = equations, np.zeros(len(beside))
+    exact, expected = equations, np.zeros(len(beside))
     effects = sensor_effects(equations, chain).reshape(len(beside), 6)
-    axes, shifts = _felt(effects, seen_as == "direction")
+    axes, shifts = _error_axes(effects, seen_as == "direction")
     in_mm = PROPORTIONS_MM if shifts.any() else PROPORTIONS_MM[:1]
     proportions = [np.where(shifts, np.rad2deg(mm), 1.0) for mm in in_mm]
     lonely = len(starts) - 1 == len(beside)
     grid = make_grid(effects @ axes.T, frame_time_s, proportions, (0.0,) if lonely else JITTER)
     for number in range(_STEPS):
-        values, slopes = corrected.at(chain)
+        values, derivatives = exact.at(chain)
         # What was taken out of the points, put back as the small thing that it is.
         residuals = values.ravel() + expected + beside @ further
-        jacobian = np.hstack([slopes.reshape(len(beside), -1)[:, columns], beside])
-        effects = sensor_effects(corrected, chain).reshape(len(beside), 6) @ axes.T
+        jacobian = np.hstack([derivatives.reshape(len(beside), -1)[:, columns], beside])
+        effects = sensor_effects(exact, chain).reshape(len(beside), 6) @ axes.T
         certainty, excess = np.zeros((2, count + len(further)))
         if prior is not None:
             certainty[:2] = (prior.pixel_mm * prior.error) ** -2.0
             excess[:2] = chain.pixel_mm - prior.pixel_mm
-        known = certainty, excess
-        noise, grid = fit_wandering(jacobian, residuals, effects, starts, frame_time_s, grid, *known)
+        frames = starts, frame_time_s
+        noise, grid = fit_wandering(jacobian, residuals, effects, *frames, grid, certainty, excess)
         residuals += jacobian @ noise.step
-        step = np.zeros(slopes.shape[-1])
+        step = np.zeros(derivatives.shape[-1])
         step[columns] = noise.step[:count]
-        chain, further = chain.displaced(step), further + noise.step[count:]
-        corrected, expected = _corrected(equations, chain, residuals, effects, axes, starts, noise)
-        if number > 0 and (np.abs(noise.step) <= _SETTLED * np.sqrt(np.diag(noise.covariance))).all():
+        chain, further = chain.displace(step), further + noise.step[count:]
+        exact, expected = _denoise(equations, chain, residuals, effects, axes, starts, noise)
+        if number > 0 and (np.abs(noise.step) <= _SMALL_STEP * np.sqrt(np.diag(noise.covariance))).all():
             break
     return chain, further, noise.covariance
 
 
-def _corrected(
+def _denoise(
     equations: Equations,
     chain: Chain,
     residuals: FloatArray,
@@ -278,12 +282,12 @@ def _corrected(
     size = np.diff(starts)
     frame = np.repeat(np.arange(len(size)), size)
     place = np.arange(len(residuals)) - starts[frame]
-    moved, left = np.zeros((len(size), size.max(), effects.shape[1])), np.zeros((len(size), size.max()))
-    moved[frame, place], left[frame, place] = effects, residuals
+    slopes, values = np.zeros((len(size), size.max(), effects.shape[1])), np.zeros((len(size), size.max()))
+    slopes[frame, place], values[frame, place] = effects, residuals
     white = max(noise.white, _SMALLEST) ** 2
-    covariance = (moved * noise.spread) @ np.swapaxes(moved, 1, 2) + white * np.eye(size.max())
-    pull = np.linalg.solve(covariance, left[..., None])[..., 0]
-    sensor = ((noise.spread * np.einsum("fa,fak->fk", pull, moved)) @ axes)[frame]
+    covariance = (slopes * noise.spread) @ np.swapaxes(slopes, 1, 2) + white * np.eye(size.max())
+    pull = np.linalg.solve(covariance, values[..., None])[..., 0]
+    sensor = ((noise.spread * np.einsum("fa,fak->fk", pull, slopes)) @ axes)[frame]
     error = sensor[::several]
     poses = points.world_from_sensor.as_matrix()
     poses[:, :3, :3] = Rotation.from_rotvec(-error[:, :3]).as_matrix() @ points.turns
@@ -292,12 +296,12 @@ def _corrected(
     # The smallest displacement in the image, mm, that explains what is left to it.
     square = in_image @ np.swapaxes(in_image, 1, 2) + 1e-9 * np.eye(several)
     image = (white * pull[frame, place]).reshape(n, several, 1)
-    moved_mm = np.einsum("nr,nri->ni", np.linalg.solve(square, image)[..., 0], in_image)
-    shown = replace(
+    shift_mm = np.einsum("nr,nri->ni", np.linalg.solve(square, image)[..., 0], in_image)
+    places = replace(
         points,
         world_from_sensor=RigidTransform(poses, normalize=False),
-        pixels=points.pixels - moved_mm / chain.pixel_mm,
+        pixels=points.pixels - shift_mm / chain.pixel_mm,
     )
-    corrected = replace(equations, points=shown)
-    by_sensor = np.sum(sensor_effects(corrected, chain).reshape(-1, 6) * sensor, axis=1)
-    return corrected, by_sensor + np.einsum("nri,ni->nr", in_image, moved_mm).ravel()
+    exact = replace(equations, points=places)
+    by_sensor = np.sum(sensor_effects(exact, chain).reshape(-1, 6) * sensor, axis=1)
+    return exact, by_sensor + np.einsum("nri,ni->nr", in_image, shift_mm).ravel()

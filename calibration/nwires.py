@@ -17,7 +17,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform
 
 from calibration.detection.labelling import label_by_calibration, label_dots
-from calibration.points import ImagePoints, Seen
+from calibration.points import Detections, ImagePoints
 from calibration.wires import Wires, solve_wires
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
@@ -35,10 +35,10 @@ def trimmed_mean_mm(errors_mm: FloatArray) -> tuple[float, float]:
     InsufficientDataError
         If there are none.
     """
-    kept = np.sort(errors_mm)[: round(_PLUS_SHARE * len(errors_mm))]
-    if kept.size == 0:
+    least = np.sort(errors_mm)[: round(_PLUS_SHARE * len(errors_mm))]
+    if least.size == 0:
         raise InsufficientDataError("expected an N with all three dots, got none")
-    return float(kept.mean()), float(kept.std())
+    return float(least.mean()), float(least.std())
 
 
 def middle_wires(points: ImagePoints, phantom: WirePhantom) -> tuple[ImagePoints, FloatArray]:
@@ -64,11 +64,11 @@ def middle_wires(points: ImagePoints, phantom: WirePhantom) -> tuple[ImagePoints
     if points.wire is None:
         raise InvalidInputError("points: expected the wire of each, got none")
     # Number of the point that shows each wire in each frame; none is -1.
-    shown = np.full((points.frame.max(initial=0) + 1, len(phantom)), -1)
-    shown[points.frame, points.wire] = np.arange(len(points))
+    point_of = np.full((points.frame.max(initial=0) + 1, len(phantom)), -1)
+    point_of[points.frame, points.wire] = np.arange(len(points))
     middles, places = [np.zeros(0, dtype=np.int64)], [np.zeros((0, 3))]
     for shape, crossings in zip(phantom.n_shapes, phantom.crossings_mm(), strict=True):
-        together = shown[:, list(shape)]
+        together = point_of[:, list(shape)]
         first, middle, last = together[(together >= 0).all(axis=1)].T
         to_middle, between = (points.pixels[k] - points.pixels[first] for k in (middle, last))
         share = np.linalg.norm(to_middle, axis=1) / np.linalg.norm(between, axis=1)
@@ -105,14 +105,14 @@ def nwire_errors_mm(
         If the points have no wires.
     """
     middle, phantom_mm = middle_wires(points, phantom)
-    seen = middle.pixels @ sensor_from_pixels[:3, :2].T + sensor_from_pixels[:3, 3]
+    dots = middle.pixels @ sensor_from_pixels[:3, :2].T + sensor_from_pixels[:3, 3]
     expected = (middle.world_from_sensor.inv() * world_from_phantom).apply(phantom_mm)
-    return np.asarray(np.linalg.norm(seen - expected, axis=1))
+    return np.asarray(np.linalg.norm(dots - expected, axis=1))
 
 
 def label_by_wires(
-    dots: Seen, phantom: WirePhantom, world_from_sensor: RigidTransform, pixel_mm: npt.ArrayLike
-) -> Seen:
+    dots: Detections, phantom: WirePhantom, world_from_sensor: RigidTransform, pixel_mm: npt.ArrayLike
+) -> Detections:
     """Assign dots to wires, first by themselves, then by the calibration that follows from most frames.
 
     Parameters
@@ -129,8 +129,8 @@ def label_by_wires(
     """
     alone = label_dots(dots, phantom, pixel_mm)
     if len(alone) == 0:
-        reasons = sorted(set(alone.dropped.values())) or ["no frames"]
-        raise InsufficientDataError(f"expected frames that show all wires, got none: {reasons[0]}")
+        reason = min(alone.dropped.values(), default="no frames")
+        raise InsufficientDataError(f"expected frames that show all wires, got none: {reason}")
     solution = solve_wires(alone.points(world_from_sensor[alone.frame]), phantom)
     assert isinstance(solution.phantom, Wires)
     return label_by_calibration(dots, solution.phantom.geometry, solution.chain, world_from_sensor)

@@ -60,8 +60,8 @@ def calibrate_orientation(
     starts = angle_starts(directions.of_some_frames(SOME_FRAMES), size, normals, s.level)
     problem = Problem(line_directions(s.level), ANGLES, s.outlier_sigma)
     side = "down (plane seen from above)" if s.viewed_from == "above" else "up (plane seen from below)"
-    assumed = f"assumed, as no image tells it: the beam points {side}"
-    solution = require_adequate(replace(problem.best(directions, starts), assumed=assumed))
+    assumption = f"assumed, as no image tells it: the beam points {side}"
+    solution = require_adequate(replace(problem.best(directions, starts), assumed=assumption))
     certain = np.diag(solution.image_covariance(("beta_c", "gamma_c"))).max() < _CERTAIN_RAD**2
     slope = float(np.arccos(min(abs(solution.chain.target[2, 2]), 1.0)))
     if certain and slope > STEEPEST_PLANE:
@@ -93,7 +93,7 @@ def _upright(solution: Solution, viewed_from: str) -> Solution:
     signs = np.array([-1.0 if name in ("beta", "gamma") else 1.0 for name in solution.free])
     return replace(
         solution,
-        chain=solution.chain.mirrored(),
+        chain=solution.chain.mirror(),
         covariance=solution.covariance * np.outer(signs, signs),
         residuals=-solution.residuals,
     )

@@ -27,7 +27,7 @@ from calibration.motion import OBLONG, require_adequate
 from calibration.points import ANGLES, CHAIN, SOME_FRAMES, ImagePoints, SeenAs, as_directions, columns_of
 from calibration.robust import absolute_weights, robust_linear
 from calibration.settings import PlaneFit
-from calibration.solution import Problem, Solution, apart
+from calibration.solution import Problem, Solution, are_distinct
 from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.geometry import nearest_rotation, roll_yaw_tilt
@@ -38,7 +38,7 @@ _MOST_STEPS = 100
 _TOLERANCE, _ROUGHLY = 1e-9, 1e-3
 """Relative decrease of the sum of squares that a last step promises; of a sum that is weighted anew."""
 _REWEIGHTINGS = 8
-_REFINED, _KEPT, _ANGLE_FRAMES, _ROUNDS = 6, 3, 30, 4
+_REFINEMENTS, _MOST_STARTS, _ANGLE_FRAMES, _ROUNDS = 6, 3, 30, 4
 """Normals whose angles are refined, from so many frames with so many reweightings, and those that go on."""
 _HOPELESS = 3.0
 """Ends whose mean absolute residual is as many times the least are not looked at again."""
@@ -46,7 +46,7 @@ _TINY = 1e-12
 """Of a normal matrix's diagonal, where residuals do not depend on a parameter at all."""
 _CONTRADICTS = 3.0
 """Standard errors by which lines must move a pixel size given for it to be doubted."""
-_TURNED, _OVER = np.diag([-1.0, -1.0, 1.0, 1.0]), np.diag([1.0, -1.0, -1.0, 1.0])
+_HALF_TURN_Z, _HALF_TURN_X = np.diag([-1.0, -1.0, 1.0, 1.0]), np.diag([1.0, -1.0, -1.0, 1.0])
 """Half a turn about the z axis, and about the x axis."""
 
 
@@ -96,7 +96,7 @@ class Chain:
         parts = [part for pose in poses for part in (pose.translation, roll_yaw_tilt(pose.rotation))]
         return np.concatenate([self.pixel_mm, *parts])
 
-    def displaced(self, step: FloatArray) -> Chain:
+    def displace(self, step: FloatArray) -> Chain:
         """Displace the image in its frame and the world in the phantom's, `step` in the order of `CHAIN`.
 
         A pixel size that becomes negative is made positive by turning the image by half about its other axis,
@@ -105,14 +105,14 @@ class Chain:
         size = self.pixel_mm + step[:2]
         sign = np.where(size < 0, -1.0, 1.0)
         turns = Rotation.from_rotvec([step[7:4:-1], step[13:10:-1]]).as_matrix()
-        moved, shifted = np.eye(4), np.eye(4)
-        moved[:3, :3], moved[:3, 3] = turns[0] * [*sign, sign.prod()], step[2:5]
-        shifted[:3, :3], shifted[:3, 3] = turns[1], step[8:11]
-        return Chain(np.abs(size), self.probe @ moved, shifted @ self.target)
+        of_image, of_target = np.eye(4), np.eye(4)
+        of_image[:3, :3], of_image[:3, 3] = turns[0] * [*sign, sign.prod()], step[2:5]
+        of_target[:3, :3], of_target[:3, 3] = turns[1], step[8:11]
+        return Chain(np.abs(size), self.probe @ of_image, of_target @ self.target)
 
-    def mirrored(self) -> Chain:
+    def mirror(self) -> Chain:
         """The image turned by half in its plane: lines of a plane have the same directions."""
-        return replace(self, probe=self.probe @ _TURNED)
+        return replace(self, probe=self.probe @ _HALF_TURN_Z)
 
 
 class Phantom(ABC):
@@ -120,13 +120,13 @@ class Phantom(ABC):
 
     Attributes
     ----------
-    determined : tuple of str
+    unknowns : tuple of str
         Those of `TARGET` that images of the phantom determine.
     seen_as : str
         What the points are.
     """
 
-    determined: tuple[str, ...]
+    unknowns: tuple[str, ...]
     seen_as: SeenAs
 
     @abstractmethod
@@ -142,7 +142,7 @@ class Phantom(ABC):
 class Plane(Phantom):
     """A plane at z = 0 of its own frame: one equation for each point (TR 303, equation 8)."""
 
-    determined: tuple[str, ...] = ("z_c", "beta_c", "gamma_c")
+    unknowns: tuple[str, ...] = ("z_c", "beta_c", "gamma_c")
     seen_as: SeenAs = "line"
 
     def vanishing(self, points: ImagePoints) -> tuple[FloatArray, FloatArray]:
@@ -192,15 +192,15 @@ class Equations:
     offsets: FloatArray
     weights: FloatArray | None = None
 
-    def __getitem__(self, chosen: BoolArray) -> Equations:
-        return Equations(self.points[chosen], self.rows[chosen], self.offsets[chosen])
+    def __getitem__(self, index: BoolArray) -> Equations:
+        return Equations(self.points[index], self.rows[index], self.offsets[index])
 
     def residuals(self, chain: Chain) -> FloatArray:
         """What does not vanish, shape (n, r)."""
         return np.asarray(np.einsum("nri,ni->nr", self.rows, self._places(chain)[1]) - self.offsets)
 
     def at(self, chain: Chain) -> tuple[FloatArray, FloatArray]:
-        """Residuals, (n, r), and derivatives by the small displacements of `Chain.displaced`, (n, r, 14)."""
+        """Residuals, (n, r), and derivatives by the small displacements of `Chain.displace`, (n, r, 14)."""
         rows, (flat, place) = self.rows, self._places(chain)
         in_sensor = np.einsum("nri,nij->nrj", rows @ chain.target[:3, :3], self.points.turns)
         in_image = in_sensor @ chain.probe[:3, :3]
@@ -256,8 +256,8 @@ class Equations:
             r, j = values.ravel(), slopes.reshape(values.size, -1)[:, columns]
             if prior is not None:
                 slope = sigma / (prior.error * prior.pixel_mm[:, None])
-                more = (np.array(columns) == np.arange(2)[:, None]) * slope
-                r, j = np.append(r, sigma * prior.deviation(chain.pixel_mm)), np.vstack([j, more])
+                of_prior = (np.array(columns) == np.arange(2)[:, None]) * slope
+                r, j = np.append(r, sigma * prior.deviation(chain.pixel_mm)), np.vstack([j, of_prior])
             return j.T @ j, j.T @ r, float(r @ r)
 
         chain, (normal, pull, cost) = start, at(start)
@@ -270,16 +270,15 @@ class Equations:
             raise InvalidInputError("expected finite residuals at the starting point, got some that are not")
         damping, step = 1e-6, np.zeros(len(CHAIN))
         for _ in range(_MOST_STEPS):
-            moved = np.linalg.solve(normal + damping * np.diag(np.maximum(np.diag(normal), _TINY)), pull)
-            step[columns] = -moved
-            moved_chain = chain.displaced(step)
-            trial = at(moved_chain)
-            promised = float(moved @ pull)
-            if trial[2] <= cost:
-                chain, (normal, pull, cost), damping = moved_chain, trial, max(damping / 10.0, 1e-12)
+            descent = np.linalg.solve(normal + damping * np.diag(np.maximum(np.diag(normal), _TINY)), pull)
+            step[columns] = -descent
+            trial = chain.displace(step)
+            system, decrease = at(trial), float(descent @ pull)
+            if system[2] <= cost:
+                chain, (normal, pull, cost), damping = trial, system, max(damping / 10.0, 1e-12)
             else:
                 damping = max(10.0 * damping, 1e-6)
-            if promised <= tolerance * cost + count * np.finfo(float).eps ** 2 or damping > 1e6:
+            if decrease <= tolerance * cost + count * np.finfo(float).eps ** 2 or damping > 1e6:
                 break
         return chain
 
@@ -295,10 +294,10 @@ class Equations:
         return chain
 
 
-def _cross_zyx(one: FloatArray, other: FloatArray) -> FloatArray:
+def _cross_zyx(a: FloatArray, b: FloatArray) -> FloatArray:
     """Cross product, its z component first; NumPy's own takes five times as long."""
     first, second = [0, 2, 1], [1, 0, 2]
-    return np.asarray(one[..., first] * other[..., second] - one[..., second] * other[..., first])
+    return np.asarray(a[..., first] * b[..., second] - a[..., second] * b[..., first])
 
 
 # 3. The plane in three stages (TR 303, appendix A)
@@ -339,7 +338,7 @@ def _from_stages(lines: ImagePoints, problem: Problem) -> Solution:
     pixel_mm = problem.held_mm if problem.prior is None else problem.prior.pixel_mm
     directions = as_directions(few, np.ones(2) if pixel_mm is None else pixel_mm)
     angles = angle_starts(directions, pixel_mm, hemisphere())
-    return problem.best(lines, [_with_distances(few, one, pixel_mm) for one in angles])
+    return problem.best(lines, [_with_distances(few, start, pixel_mm) for start in angles])
 
 
 def hemisphere() -> FloatArray:
@@ -382,35 +381,35 @@ def angle_starts(
     rows = (up[..., None] * along[:, None]).reshape(len(normals), -1, 6)
     sines = np.ones(rows.shape[:2])
     for _ in range(_ROUNDS):
-        weighted = rows * absolute_weights(sines, axis=1)[..., None]
-        axes = np.linalg.eigh(np.swapaxes(weighted, 1, 2) @ rows)[1][..., :1]
+        weights = absolute_weights(sines, axis=1)[..., None]
+        axes = np.linalg.eigh(np.swapaxes(weights * rows, 1, 2) @ rows)[1][..., :1]
         sines = np.abs(rows @ axes)[..., 0]
     across = axes.reshape(-1, 3, 2)
     lengths = np.linalg.norm(across, axis=1)
     turns = nearest_rotation(across / lengths[:, None])
     if pixel_mm is None:
         sizes[:, 0] = np.clip(lengths[:, 0] / lengths[:, 1], 1.0 / OBLONG, OBLONG)
-    seen = directions.pixels * sizes[:, None]
-    seen /= np.linalg.norm(seen, axis=2, keepdims=True)
-    costs = np.abs(np.einsum("knb,kbc,knc->kn", up, turns[..., :2], seen)).mean(axis=1)
+    units = directions.pixels * sizes[:, None]
+    units /= np.linalg.norm(units, axis=2, keepdims=True)
+    costs = np.abs(np.einsum("knb,kbc,knc->kn", up, turns[..., :2], units)).mean(axis=1)
     phantom = line_directions(level)
     equations = phantom.equations(directions.of_some_frames(_ANGLE_FRAMES))
     ends = list[tuple[float, Chain]]()
-    for number in np.argsort(costs)[:_REFINED]:
+    for number in np.argsort(costs)[:_REFINEMENTS]:
         pose = Rotation.from_matrix(turns[number]), rotation_to_z(normals[number])
         start = Chain.of(sizes[number], *map(RigidTransform.from_rotation, pose))
-        end = equations.least_absolute(start, (*ANGLES, *phantom.determined), _ROUNDS)
+        end = equations.least_absolute(start, (*ANGLES, *phantom.unknowns), _ROUNDS)
         # The world is turned as little as puts the plane's normal upright.
         upright = RigidTransform.from_rotation(rotation_to_z(end.target[2, :3]))
         end = replace(end, target=upright.as_matrix())
         ends.append((float(np.abs(equations.residuals(end)).mean()), end))
-    ends.sort(key=lambda one: one[0])
-    kept = list[Chain]()
+    ends.sort(key=lambda end: end[0])
+    starts = list[Chain]()
     for cost, end in ends:
-        likely = cost < _HOPELESS * ends[0][0] + _TINY
-        if likely and all(apart(end, one, directions, phantom) for one in kept):
-            kept.append(end)
-    return kept[:_KEPT]
+        hopeful = cost < _HOPELESS * ends[0][0] + _TINY
+        if hopeful and all(are_distinct(end, start, directions, phantom) for start in starts):
+            starts.append(end)
+    return starts[:_MOST_STARTS]
 
 
 def rotation_to_z(normal: FloatArray) -> Rotation:
@@ -425,7 +424,7 @@ def _with_distances(lines: ImagePoints, angles: Chain, pixel_mm: FloatArray | No
     height = np.sum(up * (flat @ angles.probe[:3, :2].T), axis=1)
     unknown = np.column_stack([up, np.ones(len(lines)), height])
     answer, _ = robust_linear(unknown, -lines.shifts_mm @ normal)
-    near = angles if answer[4] > 0 else angles.mirrored()
+    near = angles if answer[4] > 0 else angles.mirror()
     size = abs(answer[4]) * angles.pixel_mm if pixel_mm is None else pixel_mm
     chain = Chain(size, near.probe.copy(), near.target.copy())
     chain.probe[:3, 3], chain.target[2, 3] = answer[:3], answer[3]
@@ -434,8 +433,9 @@ def _with_distances(lines: ImagePoints, angles: Chain, pixel_mm: FloatArray | No
 
 def _facing_up(solution: Solution) -> Solution:
     """The same solution with the plane's normal on the probe's side: heights of images are positive."""
-    heights = solution.chain.target_from_image(solution.points).translation[:, 2]
-    if np.median(heights) >= 0:
+    chain, points = solution.chain, solution.points
+    origins = points.turns @ chain.probe[:3, 3] + points.shifts_mm
+    if np.median(origins @ chain.target[2, :3]) + chain.target[2, 3] >= 0:
         return solution
-    chain = replace(solution.chain, target=_OVER @ solution.chain.target)
+    chain = replace(chain, target=_HALF_TURN_X @ chain.target)
     return replace(solution, chain=chain, residuals=-solution.residuals)

@@ -121,7 +121,7 @@ class ImagePoints:
             raise InvalidInputError(f"pixels: expected shape (n, 2), got {self.pixels.shape}")
         require_finite(self.pixels, "pixels")
         counts = {len(self.pixels), len(self.frame), len(self.world_from_sensor)}
-        counts |= {len(one) for one in (self.wire, self.time_s) if one is not None}
+        counts |= {len(values) for values in (self.wire, self.time_s) if values is not None}
         if len(counts) > 1:
             raise MismatchError(
                 f"expected as many points as frames, poses, wires and times, got {sorted(counts)}"
@@ -130,12 +130,10 @@ class ImagePoints:
     def __len__(self) -> int:
         return len(self.pixels)
 
-    def __getitem__(self, chosen: BoolArray | IntArray | slice) -> ImagePoints:
-        wire = None if self.wire is None else self.wire[chosen]
-        time_s = None if self.time_s is None else self.time_s[chosen]
-        return ImagePoints(
-            self.pixels[chosen], self.frame[chosen], self.world_from_sensor[chosen], wire, time_s
-        )
+    def __getitem__(self, index: BoolArray | IntArray | slice) -> ImagePoints:
+        wire = None if self.wire is None else self.wire[index]
+        time_s = None if self.time_s is None else self.time_s[index]
+        return ImagePoints(self.pixels[index], self.frame[index], self.world_from_sensor[index], wire, time_s)
 
     @cached_property
     def turns(self) -> FloatArray:
@@ -186,8 +184,8 @@ class ImagePoints:
 
 
 @dataclass(frozen=True)
-class Seen:
-    """What was found in the images of a sequence.
+class Detections:
+    """Lines or dots found in the images of a recording.
 
     Attributes
     ----------
@@ -212,17 +210,17 @@ class Seen:
     def __len__(self) -> int:
         return len(self.frame)
 
-    def __getitem__(self, chosen: BoolArray | IntArray) -> Seen:
-        wire = None if self.wire is None else self.wire[chosen]
-        score = None if self.score is None else self.score[chosen]
-        return Seen(self.frame[chosen], self.pixels[chosen], wire, self.dropped, score)
+    def __getitem__(self, index: BoolArray | IntArray) -> Detections:
+        wire = None if self.wire is None else self.wire[index]
+        score = None if self.score is None else self.score[index]
+        return Detections(self.frame[index], self.pixels[index], wire, self.dropped, score)
 
-    def without(self, frames: Collection[int], reason: str) -> Seen:
+    def without(self, frames: Collection[int], reason: str) -> Detections:
         """Leave out frames, for the same reason each, whether anything was found in them or not."""
         if not frames:
             return self
-        kept = self[~np.isin(self.frame, list(frames))]
-        return replace(kept, dropped={**self.dropped, **dict.fromkeys(frames, reason)})
+        selection = self[~np.isin(self.frame, list(frames))]
+        return replace(selection, dropped={**self.dropped, **dict.fromkeys(frames, reason)})
 
     @property
     def are_lines(self) -> bool:
@@ -254,5 +252,5 @@ def affine_equations(places: FloatArray, rows: FloatArray) -> FloatArray:
     rows : ndarray, shape (..., r, 3)
         Of each point's equations for its position.
     """
-    lifted = np.concatenate([np.ones((*places.shape[:-1], 1)), places], axis=-1)
-    return np.asarray(np.einsum("...k,...ri->...rki", lifted, rows).reshape(*rows.shape[:-1], 9))
+    homogeneous = np.concatenate([np.ones((*places.shape[:-1], 1)), places], axis=-1)
+    return np.asarray(np.einsum("...k,...ri->...rki", homogeneous, rows).reshape(*rows.shape[:-1], 9))

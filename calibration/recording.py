@@ -12,8 +12,8 @@ from calibration.beam import BeamBias
 from calibration.clock.fitted import estimate_offset, with_uncertain_offset
 from calibration.clock.offset import ClockOffset, covered
 from calibration.consensus import GATES_MM, Consensus, find_consensus
-from calibration.points import ImagePoints, Recording, Seen
-from calibration.report import Shot, as_calibration
+from calibration.points import Detections, ImagePoints, Recording
+from calibration.report import Snapshot, as_calibration
 from calibration.solution import Solution
 from speckle3d.core.calibration import Calibration, FramesUsed
 from speckle3d.core.errors import InsufficientDataError
@@ -23,7 +23,7 @@ SEARCH_S = 0.4
 are below 0.2 s."""
 CHOICE_STEP_S = 0.1
 """Clock offsets at which crossings are chosen; a hand moves by a few millimetres in that time."""
-_FEWEST_COVERED = 0.3
+_LEAST_COVERAGE = 0.3
 """Least share of the frames with a detection that must have a reading; below it, the recordings do not belong
 together."""
 _UNREAD = "no sensor reading at its time"
@@ -35,27 +35,27 @@ class Outcome:
 
     Attributes
     ----------
-    seen : Seen
-        What it is made from; of several candidates, those chosen.
+    detections : Detections
+        What it is made from; of several candidates in a frame, the one that agrees with the other frames.
     """
 
     solution: Solution
     calibration: Calibration
-    seen: Seen
-    shots: tuple[Shot, ...]
+    detections: Detections
+    snapshots: tuple[Snapshot, ...]
     beam: tuple[BeamBias, ...] = ()
     offset: ClockOffset | None = None
 
 
 def calibrate_recording(
     recording: Recording,
-    seen: Seen,
+    detections: Detections,
     method: str,
     calibrate: Callable[[ImagePoints], Solution],
     time_offset_s: float | Literal["estimate"] | None = None,
     with_clock: Callable[[ImagePoints], Solution] | None = None,
 ) -> Outcome:
-    """Calibrate with what was seen in a recording.
+    """Calibrate with what was detected in a recording.
 
     Parameters
     ----------
@@ -69,62 +69,66 @@ def calibrate_recording(
     Raises
     ------
     InsufficientDataError
-        If nothing was seen, few frames have a reading, or `calibrate` refuses.
+        If nothing was detected, few frames have a reading, or `calibrate` refuses.
     """
-    if len(seen.frame) == 0:
-        reasons = sorted(set(seen.dropped.values())) or ["no frames"]
-        raise InsufficientDataError(f"expected the phantom in the images, got it in none: {reasons[0]}")
+    if len(detections.frame) == 0:
+        reason = min(detections.dropped.values(), default="no frames")
+        raise InsufficientDataError(f"expected the phantom in the images, got it in none: {reason}")
     offset_s = time_offset_s if isinstance(time_offset_s, float) else recording.time_offset_s
-    offset, (points, dropped) = None, paired(recording, seen, offset_s)
+    offset, (points, reasons) = None, with_poses(recording, detections, offset_s)
     if time_offset_s == "estimate":
         offset = estimate_offset(calibrate, points, recording.readings, offset_s, SEARCH_S)
         offset_s = offset.seconds
-        points, dropped = paired(recording, seen, offset_s)
+        points, reasons = with_poses(recording, detections, offset_s)
     solution = (with_clock or calibrate)(points)
     if offset is not None:
         solution = with_uncertain_offset(solution, points, recording.readings, offset_s)
-    frames = FramesUsed(recording.images.shape[0], (), dropped)
-    stated = time_offset_s is not None or offset_s != 0.0
-    calibration = as_calibration(solution, method, frames, offset_s if stated else None)
-    return Outcome(solution, calibration, seen, _shots(recording, seen, calibration), offset=offset)
+    frames = FramesUsed(recording.images.shape[0], (), reasons)
+    has_offset = time_offset_s is not None or offset_s != 0.0
+    calibration = as_calibration(solution, method, frames, offset_s if has_offset else None)
+    return Outcome(
+        solution, calibration, detections, _snapshots(recording, detections, calibration), offset=offset
+    )
 
 
-def paired(recording: Recording, seen: Seen, offset_s: float) -> tuple[ImagePoints, dict[int, str]]:
-    """Join what was seen with the readings at the same time, by a clock that is off by `offset_s`.
+def with_poses(
+    recording: Recording, detections: Detections, offset_s: float
+) -> tuple[ImagePoints, dict[int, str]]:
+    """Join detections with the sensor's poses at the same time, by a clock that is off by `offset_s`.
 
     Returns
     -------
     points : ImagePoints
         Of the frames with a reading.
-    dropped : dict of int to str
-        Why other frames have none: `Seen.dropped`, and those without a reading.
+    reasons : dict of int to str
+        Why other frames have none: `Detections.dropped`, and those without a reading.
 
     Raises
     ------
     InsufficientDataError
         If few frames have one.
     """
-    times = recording.frame_time_s[seen.frame]
+    times = recording.frame_time_s[detections.frame]
     with_reading = covered(recording.readings, times, offset_s)
-    if with_reading.sum() < max(1.0, _FEWEST_COVERED * len(times)):
+    if with_reading.sum() < max(1.0, _LEAST_COVERAGE * len(times)):
         first, last = recording.readings.time_s[[0, -1]] + offset_s
         raise InsufficientDataError(
             f"expected sensor readings at the times of the frames, got them for {with_reading.sum()} of "
             f"{len(times)} in which something was found: readings span {first:.3f} to {last:.3f} s, frames "
             f"{recording.frame_time_s[0]:.3f} to {recording.frame_time_s[-1]:.3f} s"
         )
-    missing = dict.fromkeys((int(n) for n in np.unique(seen.frame[~with_reading])), _UNREAD)
-    poses = recording.world_from_sensor(seen.frame[with_reading], offset_s)
-    below_origin = replace(seen, pixels=seen.pixels + recording.first_px)
-    return below_origin[with_reading].points(poses, times[with_reading]), {**seen.dropped, **missing}
+    missing = dict.fromkeys((int(n) for n in np.unique(detections.frame[~with_reading])), _UNREAD)
+    poses = recording.world_from_sensor(detections.frame[with_reading], offset_s)
+    below_origin = replace(detections, pixels=detections.pixels + recording.first_px)
+    return below_origin[with_reading].points(poses, times[with_reading]), {**detections.dropped, **missing}
 
 
-def choose_crossings(recording: Recording, seen: Seen, offsets_s: Sequence[float]) -> Seen:
+def choose_crossings(recording: Recording, detections: Detections, offsets_s: Sequence[float]) -> Detections:
     """Choose the candidate of each frame that is where the other frames put the crossing.
 
     Parameters
     ----------
-    seen : Seen
+    detections : Detections
         One or several candidates in each frame; what has one only is returned as it is.
     offsets_s : sequence of float
         Clock offsets tried, at least one; the one with which most frames agree counts.
@@ -134,33 +138,35 @@ def choose_crossings(recording: Recording, seen: Seen, offsets_s: Sequence[float
     InsufficientDataError
         If no more frames agree than chance candidates would, or few have a sensor reading.
     """
-    if len(seen) == len(np.unique(seen.frame)):
-        return seen
-    tried: list[tuple[Consensus, Seen]] = []
+    if len(detections) == len(np.unique(detections.frame)):
+        return detections
+    trials: list[tuple[Consensus, Detections]] = []
     for offset_s in offsets_s:
-        with_reading = covered(recording.readings, recording.frame_time_s[seen.frame], offset_s)
-        consensus = find_consensus(paired(recording, seen, offset_s)[0], recording.pixel_mm)
-        tried.append((consensus, seen[with_reading]))
-    consensus, candidates = min(tried, key=lambda one: one[0].false_alarms)
+        with_reading = covered(recording.readings, recording.frame_time_s[detections.frame], offset_s)
+        consensus = find_consensus(with_poses(recording, detections, offset_s)[0], recording.pixel_mm)
+        trials.append((consensus, detections[with_reading]))
+    consensus, candidates = min(trials, key=lambda trial: trial[0].false_alarms)
     near = consensus.require().away_mm <= GATES_MM[-1]
     elsewhere = f"nothing within {GATES_MM[-1]:g} mm of the other frames' crossing"
     reasons = dict.fromkeys((int(n) for n in candidates.frame[consensus.nearest[~near]]), elsewhere)
-    unread = np.setdiff1d(seen.frame, candidates.frame)
+    unread = np.setdiff1d(detections.frame, candidates.frame)
     reasons |= dict.fromkeys((int(n) for n in unread), _UNREAD)
-    return replace(candidates[consensus.nearest[near]], dropped={**seen.dropped, **reasons})
+    return replace(candidates[consensus.nearest[near]], dropped={**detections.dropped, **reasons})
 
 
-def _shots(recording: Recording, seen: Seen, calibration: Calibration) -> tuple[Shot, ...]:
+def _snapshots(
+    recording: Recording, detections: Detections, calibration: Calibration
+) -> tuple[Snapshot, ...]:
     """A used frame from the middle, one from the end, and the first that was dropped."""
-    used, dropped = calibration.frames.used, calibration.frames.dropped
-    chosen = [used[len(used) // 2], used[-1], *sorted(dropped)[:1]]
+    frames, reasons = calibration.frames.used, calibration.frames.dropped
+    numbers = [frames[len(frames) // 2], frames[-1], *sorted(reasons)[:1]]
     return tuple(
-        Shot(
+        Snapshot(
             number,
             recording.images[number],
-            seen.pixels[seen.frame == number].reshape(-1, 2),
-            seen.are_lines,
-            dropped.get(number, ""),
+            detections.pixels[detections.frame == number].reshape(-1, 2),
+            detections.are_lines,
+            reasons.get(number, ""),
         )
-        for number in dict.fromkeys(chosen)
+        for number in dict.fromkeys(numbers)
     )

@@ -68,20 +68,20 @@ def repeatability(
         raise InvalidInputError(f"size_px: expected columns and rows above zero, got {size_px}")
     if len(calibrations) < 2:
         raise InsufficientDataError(f"expected at least two calibrations to compare, got {len(calibrations)}")
-    sensors = sorted({one.sensor for one in calibrations})
+    sensors = sorted({c.sensor for c in calibrations})
     if len(sensors) > 1:
         raise MismatchError(f"expected calibrations of one sensor, got {' and '.join(sensors)}")
-    turns = Rotation.concatenate([one.rotation for one in calibrations])
+    turns = Rotation.concatenate([c.rotation for c in calibrations])
     angles = (turns.mean().inv() * turns).as_rotvec()[:, ::-1]
     sd = np.sqrt(np.sum(angles**2, axis=0) / (len(calibrations) - 1))
-    if size_px is None or any(one.translation_mm is None for one in calibrations):
+    if size_px is None or any(c.translation_mm is None for c in calibrations):
         return Repeatability(len(calibrations), sd, None, None, None)
     # The image's centre and its corners in the sensor's frame.
     shares = np.array([[0.5, 0.5], [0, 0], [1, 0], [1, 1], [0, 1]])
     flat = np.column_stack([shares * (np.array(size_px) - 1), np.zeros(5), np.ones(5)])
-    places = np.stack([(flat @ one.pixel_matrix().T)[:, :3] for one in calibrations])
-    apart = np.linalg.norm(places - places.mean(axis=0), axis=2)
-    scatter = np.sqrt(np.sum(apart**2, axis=0) / (len(calibrations) - 1))
+    places = np.stack([(flat @ c.pixel_matrix().T)[:, :3] for c in calibrations])
+    distance = np.linalg.norm(places - places.mean(axis=0), axis=2)
+    scatter = np.sqrt(np.sum(distance**2, axis=0) / (len(calibrations) - 1))
     shift = np.linalg.norm(places[1:, 0] - places[0, 0], axis=1)
     corners = float(np.sqrt(np.mean(scatter[1:] ** 2)))
     return Repeatability(len(calibrations), sd, float(scatter[0]), corners, shift)
@@ -110,6 +110,6 @@ def validate(solution: Solution, points: ImagePoints) -> FloatArray:
     """
     chain, phantom = solution.chain, solution.phantom
     points = as_directions(points, chain.pixel_mm) if solution.angular else points
-    if phantom.seen_as != "dot" and phantom.determined:
+    if phantom.seen_as != "dot" and phantom.unknowns:
         return Problem(phantom, (), np.inf).solve(points, chain).residuals
     return phantom.equations(points).residuals(chain)

@@ -20,17 +20,17 @@ from speckle3d.core.calibration import Calibration, FramesUsed, Parameter
 from speckle3d.core.geometry import skew
 from speckle3d.core.tables import text_rows
 
-USED, DROPPED = "#0072B2", "#D55E00"
+USED_COLOUR, DROPPED_COLOUR = "#0072B2", "#D55E00"
 """Colours of Okabe and Ito's palette, distinguishable with any colour vision."""
 
 IMAGE_POSE = ("gamma", "beta", "alpha", "x", "y", "z")
 """Tilt, yaw, roll and displacements: small angles in frames that lie on the image."""
 
-_MOST_NAMED = 20
+_MOST_ROWS = 20
 
 
 @dataclass(frozen=True)
-class Shot:
+class Snapshot:
     """An image to show, with what was found in it.
 
     Attributes
@@ -60,11 +60,11 @@ def as_calibration(
         With the frames in which nothing was found or that no sensor reading covers. Those that the solver
         left out are added.
     """
-    angular, dropped = solution.angular, dict(frames.dropped)
+    angular, reasons = solution.angular, dict(frames.dropped)
     for number in np.unique(solution.points.frame[~solution.used]):
         worst = float(np.abs(solution.residuals[solution.points.frame == number]).max())
         size = f"{np.rad2deg(worst):.1f} degrees" if angular else f"{worst:.1f} mm"
-        dropped[int(number)] = f"contradicts the other frames by {size}"
+        reasons[int(number)] = f"contradicts the other frames by {size}"
     chain, pose = solution.chain, IMAGE_POSE[:3] if angular else IMAGE_POSE
     return Calibration(
         method=method,
@@ -77,7 +77,7 @@ def as_calibration(
         rms=solution.rms,
         rms_unit="rad" if angular else "mm",
         condition_number=solution.condition_number,
-        frames=FramesUsed(frames.given, tuple(solution.points_used.frames.tolist()), dropped),
+        frames=FramesUsed(frames.given, tuple(solution.points_used.frames.tolist()), reasons),
         time_offset_s=time_offset_s,
         verdict=solution.adequacy.verdict,
     )
@@ -105,18 +105,20 @@ def _parameters(solution: Solution) -> tuple[Parameter, ...]:
 def text_report(calibration: Calibration, beam: Sequence[BeamBias] = (), notes: Sequence[str] = ()) -> str:
     """Aligned table, the matrix in PLUS's form, and what a thick beam would do."""
     lines = text_rows(calibration.rows()).splitlines()
-    if dropped := sorted(calibration.frames.dropped.items()):
-        named = [f"  {number}: {reason}" for number, reason in dropped[:_MOST_NAMED]]
-        lines += ["", f"Frames left out (the first {_MOST_NAMED}; the calibration file names all):", *named]
+    if outliers := sorted(calibration.frames.dropped.items()):
+        lines += ["", "Frames left out:"]
+        lines += [f"  {number}: {reason}" for number, reason in outliers[:_MOST_ROWS]]
+        if len(outliers) > _MOST_ROWS:
+            lines.append(f"  and {len(outliers) - _MOST_ROWS} more, which the calibration file names")
     if calibration.translation_mm is not None and calibration.pixel_mm is not None:
         lines += ["", "ImageToProbe (pixels to mm, as PLUS and 3D Slicer have it):"]
         lines += ["  " + " ".join(f"{value:12.6f}" for value in row) for row in calibration.pixel_matrix()]
     if beam:
         lines += ["", "On a bare wall, lines at the first echo put the image too near to the probe, by"]
         lines += [
-            f"  {abs(one.simulated_mm[1]):.2f} mm if the beam is {one.width_mm:g} mm thick "
-            f"(it leaves an RMS of {one.rms_mm:.3f} mm)"
-            for one in beam
+            f"  {abs(bias.simulated_mm[1]):.2f} mm if the beam is {bias.width_mm:g} mm thick "
+            f"(with an RMS residual of {bias.rms_mm:.3f} mm)"
+            for bias in beam
         ]
         lines += [
             "Lines at the brightest part of an echo (--place peak) have little of this bias;",
@@ -128,7 +130,7 @@ def text_report(calibration: Calibration, beam: Sequence[BeamBias] = (), notes: 
 def json_report(calibration: Calibration, beam: Sequence[BeamBias] = ()) -> dict[str, Any]:
     """Numbers of the report, angles in radians."""
     lengths = calibration.translation_mm, calibration.pixel_mm
-    translation, pixel = (None if one is None else one.tolist() for one in lengths)
+    translation, pixel = (None if values is None else values.tolist() for values in lengths)
     plain = ("method", "sensor", "rms", "rms_unit", "condition_number", "time_offset_s", "verdict")
     return {
         **{name: getattr(calibration, name) for name in plain},
@@ -141,13 +143,13 @@ def json_report(calibration: Calibration, beam: Sequence[BeamBias] = ()) -> dict
         "frames_used": list(calibration.frames.used),
         "frames_dropped": {str(frame): why for frame, why in calibration.frames.dropped.items()},
         "beam": [
-            {"width_mm": one.width_mm, "shift_mm": one.simulated_mm.tolist(), "rms_mm": one.rms_mm}
-            for one in beam
+            {"width_mm": bias.width_mm, "shift_mm": bias.simulated_mm.tolist(), "rms_mm": bias.rms_mm}
+            for bias in beam
         ],
     }
 
 
-def figure_report(solution: Solution, calibration: Calibration, shots: Sequence[Shot]) -> Figure:
+def figure_report(solution: Solution, calibration: Calibration, snapshots: Sequence[Snapshot]) -> Figure:
     """One page: images with what was found in them, residuals, and the motion."""
     figure = Figure(figsize=(12.0, 7.5), layout="constrained")
     FigureCanvasAgg(figure)
@@ -156,33 +158,35 @@ def figure_report(solution: Solution, calibration: Calibration, shots: Sequence[
         axes.set_axis_off()
     # For an orientation sensor, only the ratio of the pixel sizes is known; no more is needed.
     aspect = float(solution.chain.pixel_mm[1] / solution.chain.pixel_mm[0])
-    for axes, shot in zip(panels[0], shots, strict=False):
-        axes.imshow(np.asarray(shot.image).T, cmap="gray", aspect=aspect)
-        colour = DROPPED if shot.note else USED
-        if shot.as_line and len(shot.marks_px):
-            axes.axline(shot.marks_px[0], shot.marks_px[-1], color=colour, lw=1.0)
+    for axes, snapshot in zip(panels[0], snapshots, strict=False):
+        axes.imshow(np.asarray(snapshot.image).T, cmap="gray", aspect=aspect)
+        colour = DROPPED_COLOUR if snapshot.note else USED_COLOUR
+        if snapshot.as_line and len(snapshot.marks_px):
+            axes.axline(snapshot.marks_px[0], snapshot.marks_px[-1], color=colour, lw=1.0)
         else:
-            axes.plot(*shot.marks_px.T, "o", mfc="none", color=colour, ms=8)
-        axes.set(xlim=(0, shot.image.shape[0] - 1), ylim=(shot.image.shape[1] - 1, 0))
-        axes.set_title(f"frame {shot.frame}" + (f"\n{shot.note[:60]}" if shot.note else ""), fontsize=8)
+            axes.plot(*snapshot.marks_px.T, "o", mfc="none", color=colour, ms=8)
+        axes.set(xlim=(0, snapshot.image.shape[0] - 1), ylim=(snapshot.image.shape[1] - 1, 0))
+        axes.set_title(
+            f"frame {snapshot.frame}" + (f"\n{snapshot.note[:60]}" if snapshot.note else ""), fontsize=8
+        )
     worst = np.abs(solution.residuals).argmax(axis=1)
     values = solution.residuals[np.arange(len(worst)), worst]
     values, unit = (np.rad2deg(values), "deg") if solution.angular else (values, "mm")
     turns = solution.chain.target_from_image(solution.points).rotation
     tilt, yaw, roll = np.rad2deg((turns.mean().inv() * turns).as_rotvec()).T
-    used, (by_frame, by_tilt, motion) = solution.used, panels[1]
-    by_frame.plot(solution.points.frame[used], values[used], ".", color=USED, ms=3)
-    by_frame.plot(solution.points.frame[~used], values[~used], "x", color=DROPPED, ms=4)
-    size = float(np.abs(values[used]).std() + 1e-12)
+    inliers, (by_frame, by_tilt, motion) = solution.used, panels[1]
+    by_frame.plot(solution.points.frame[inliers], values[inliers], ".", color=USED_COLOUR, ms=3)
+    by_frame.plot(solution.points.frame[~inliers], values[~inliers], "x", color=DROPPED_COLOUR, ms=4)
+    size = float(np.abs(values[inliers]).std() + 1e-12)
     reach = np.clip(1.1 * float(np.abs(values).max()), 8.0 * size, 30.0 * size)
     by_frame.set(xlabel="frame", ylabel=f"largest residual of a point / {unit}", ylim=(-reach, reach))
     # Here a thick beam shows as a V.
-    by_tilt.plot(tilt[used], values[used], ".", color=USED, ms=3)
+    by_tilt.plot(tilt[inliers], values[inliers], ".", color=USED_COLOUR, ms=3)
     by_tilt.set(xlabel="tilt / deg", ylabel=f"largest residual / {unit}")
-    drawn = motion.scatter(tilt[used], roll[used], c=yaw[used], s=6)
-    figure.colorbar(drawn, ax=motion, label="yaw / deg")
+    dots = motion.scatter(tilt[inliers], roll[inliers], c=yaw[inliers], s=6)
+    figure.colorbar(dots, ax=motion, label="yaw / deg")
     motion.set(xlabel="tilt / deg", ylabel="roll / deg")
-    motion.set_title(f"how the probe was turned\n{fill(solution.assumed, 60)}".strip(), fontsize=9)
+    motion.set_title("how the probe was turned", fontsize=9)
     for axes in panels[1]:
         axes.grid(alpha=0.3)
     figure.suptitle(fill(calibration.verdict, 150), fontsize=9)

@@ -11,35 +11,35 @@ _NEARLY, _TINY = 0.1, 1e-12
 """Residuals above this share of the median count by their absolute value."""
 
 
-def robust_linear(matrix: FloatArray, wanted: FloatArray) -> tuple[FloatArray, FloatArray]:
+def robust_linear(matrix: FloatArray, target: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Solve linear equations, some of which may be wrong, by iteratively reweighted least squares.
 
     Parameters
     ----------
     matrix : ndarray, shape (n, p) or (n, r, p)
         A group of r rows gets one weight, from the norm of its residuals.
-    wanted : ndarray, shape (n,) or (n, r)
+    target : ndarray, shape (n,) or (n, r)
 
     Returns
     -------
     parameters : ndarray, shape (p,)
         The smallest, where the equations leave some open.
-    residuals : ndarray, as `wanted`
+    residuals : ndarray, as `target`
 
     References
     ----------
     .. [1] P. W. Holland and R. E. Welsch, "Robust regression using iteratively reweighted least-squares",
        Commun. Stat. Theory Methods, 1977.
     """
-    rows, values = matrix.reshape(-1, matrix.shape[-1]), wanted.ravel()
-    group = values.size // len(wanted)
+    rows, values = matrix.reshape(-1, matrix.shape[-1]), target.ravel()
+    group = values.size // len(target)
     root = np.ones(values.size)
     for _ in range(_SOLUTIONS):
         parameters = np.linalg.lstsq(rows * root[:, None], values * root)[0]
         residuals = rows @ parameters - values
         size = np.linalg.norm(residuals.reshape(-1, group), axis=1)
         root = np.repeat(np.sqrt(absolute_weights(size)), group)
-    return np.asarray(parameters), np.asarray(residuals).reshape(wanted.shape)
+    return np.asarray(parameters), np.asarray(residuals).reshape(target.shape)
 
 
 def absolute_weights(sizes: FloatArray, axis: int | None = None) -> FloatArray:

@@ -10,7 +10,7 @@ from typing import Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 Place = Literal["front", "slope", "peak"]
-Viewed = Literal["above", "below"]
+Viewpoint = Literal["above", "below"]
 
 OUTLIER_SIGMA = 4.0
 """One in 16,000 Gaussian residuals is farther out."""
@@ -50,7 +50,7 @@ class OrientationFit(FitSettings):
     """How an orientation sensor is calibrated with a plane."""
 
     level: bool = Field(False, description="The plane is level: three unknowns, not five.")
-    viewed_from: Viewed = Field("above", description="Whether the beam points down on average, or up.")
+    viewed_from: Viewpoint = Field("above", description="Whether the beam points down on average, or up.")
 
 
 class WireFit(PixelSettings):

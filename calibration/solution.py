@@ -31,7 +31,7 @@ _ROUNDS = 12
 """Most rounds of leaving out frames: they may come and go without an end."""
 _FEWEST_FRAMES = 6
 """Of lines, two equations each: the fewest for eleven unknowns."""
-_RUNAWAY, _RESIZED = 2.0, 0.1
+_RUNAWAY, _SIZE_CHANGE = 2.0, 0.1
 """A fit with wandering errors that doubles the residuals or changes pixel sizes by a tenth has run away along
 what the motion leaves open."""
 _CUT = 3.0
@@ -94,14 +94,14 @@ class Solution:
         return condition_number(self.jacobian)
 
     @property
-    def corners_moved(self) -> FloatArray:
+    def corner_slopes(self) -> FloatArray:
         """Derivatives of the image's corners, mm, by the displacements of `CHAIN`, shape (4, 3, 14)."""
         corners = _corners(self.points_used)
-        moved = np.zeros((4, 3, len(CHAIN)))
-        moved[:, 0, 0], moved[:, 1, 1] = corners.T
-        moved[:, :, 2:5] = np.eye(3)
-        moved[:, :, 7:4:-1] = -skew(np.column_stack([corners * self.chain.pixel_mm, np.zeros(4)]))
-        return moved
+        slopes = np.zeros((4, 3, len(CHAIN)))
+        slopes[:, 0, 0], slopes[:, 1, 1] = corners.T
+        slopes[:, :, 2:5] = np.eye(3)
+        slopes[:, :, 7:4:-1] = -skew(np.column_stack([corners * self.chain.pixel_mm, np.zeros(4)]))
+        return slopes
 
     @cached_property
     def adequacy(self) -> Adequacy:
@@ -174,7 +174,7 @@ class Problem:
     @property
     def free(self) -> tuple[str, ...]:
         """Names of the parameters estimated."""
-        return (*self.probe, *self.phantom.determined)
+        return (*self.probe, *self.phantom.unknowns)
 
     def solve(self, points: ImagePoints, start: Chain) -> Solution:
         """Refine a start until residuals are least, leaving out frames that contradict the others.
@@ -184,44 +184,44 @@ class Problem:
         InsufficientDataError
             If there are too few points, or fewer than half of the frames agree.
         """
-        chain, used = self.agreed(points, start)
-        equations, free = self.phantom.equations(points), self.free
-        counting = equations[used]
-        settled, _, covariance = fit_noise(counting, chain, free, self.phantom.seen_as, self.prior)
-        resized = np.abs(np.log(settled.pixel_mm / chain.pixel_mm)).max()
-        grown = sigma_of(counting.residuals(settled)) / sigma_of(counting.residuals(chain))
-        if grown < _RUNAWAY and resized < _RESIZED:
-            chain = settled
-        if self.phantom.determined:
+        chain, inliers = self.fit(points, start)
+        phantom, free = self.phantom, self.free
+        equations = phantom.equations(points)
+        agreeing = equations[inliers]
+        refit, _, covariance = fit_noise(agreeing, chain, free, phantom.seen_as, self.prior)
+        size_change = np.abs(np.log(refit.pixel_mm / chain.pixel_mm)).max()
+        growth = sigma_of(agreeing.residuals(refit)) / sigma_of(agreeing.residuals(chain))
+        if growth < _RUNAWAY and size_change < _SIZE_CHANGE:
+            chain = refit
+        if phantom.unknowns:
             # Where the phantom is, as the readings say on average: what wanders is not in its place.
-            chain = counting.least_squares(chain, self.phantom.determined)
+            chain = agreeing.least_squares(chain, phantom.unknowns)
         residuals = equations.residuals(chain)
-        sigma = sigma_of(residuals[used])
-        return Solution(chain, self.phantom, free, covariance, points, used, residuals, sigma, self.prior)
+        sigma = sigma_of(residuals[inliers])
+        return Solution(chain, phantom, free, covariance, points, inliers, residuals, sigma, self.prior)
 
-    def agreed(self, points: ImagePoints, start: Chain) -> tuple[Chain, BoolArray]:
+    def fit(self, points: ImagePoints, start: Chain) -> tuple[Chain, BoolArray]:
         """Least squares of the frames that do not contradict the others, and which points those are."""
         equations = self.phantom.equations(points)
         # Pixel sizes that are known somewhat are held while wrong frames still pull.
         first = [name for name in self.free if self.prior is None or name not in SCALES]
         chain = equations.least_absolute(start, first)
         residuals = equations.residuals(chain)
-        used = _within(residuals, points.frame, self.outlier_sigma * sigma_of(residuals))
+        inliers = _within(residuals, points.frame, self.outlier_sigma * sigma_of(residuals))
         for _ in range(_ROUNDS):
-            frames, agreeing = len(points.frames), len(np.unique(points.frame[used]))
+            frames, agreeing = len(points.frames), len(np.unique(points.frame[inliers]))
             if 2 * agreeing <= frames:
                 raise InsufficientDataError(
                     f"expected most frames to agree on one calibration, got {agreeing} of {frames}: do the "
                     "images and the sensor readings belong together, and is the phantom the one named?"
                 )
-            sigma = sigma_of(residuals[used])
-            chain = equations[used].least_squares(chain, self.free, self.prior, sigma)
+            sigma, before = sigma_of(residuals[inliers]), inliers
+            chain = equations[inliers].least_squares(chain, self.free, self.prior, sigma)
             residuals = equations.residuals(chain)
-            now = _within(residuals, points.frame, self.outlier_sigma * sigma_of(residuals[used]))
-            if (now == used).all():
+            inliers = _within(residuals, points.frame, self.outlier_sigma * sigma_of(residuals[before]))
+            if (inliers == before).all():
                 break
-            used = now
-        return chain, used
+        return chain, inliers
 
     def best(self, points: ImagePoints, starts: Sequence[Chain]) -> Solution:
         """Solve from several starts and their discrete alternatives; the best solution, with its rival.
@@ -243,15 +243,15 @@ class Problem:
         if not chains:
             return self.solve(points, starts[0])
         chains += self._ends(few, half_turns(self._sorted(few, chains)[0], few, self.phantom))
-        best, *others = self._sorted(few, chains)
+        best, *rivals = self._sorted(few, chains)
         solution = self.solve(points, best)
-        nearest = [chain for chain in others if apart(best, chain, few, self.phantom)][:1]
+        nearest = [chain for chain in rivals if are_distinct(best, chain, few, self.phantom)][:1]
         for rival in self._ends(points, nearest):
-            if apart(solution.chain, rival, points, self.phantom):
-                ours, theirs = self._costs(solution.points_used, [solution.chain, rival])
-                if theirs < ours:
+            if are_distinct(solution.chain, rival, points, self.phantom):
+                cost, rival_cost = self._costs(solution.points_used, [solution.chain, rival])
+                if rival_cost < cost:
                     solution = self.solve(points, rival)
-                return replace(solution, evidence=abs(float(theirs - ours)))
+                return replace(solution, evidence=abs(float(rival_cost - cost)))
         return solution
 
     def _ends(self, points: ImagePoints, starts: Sequence[Chain]) -> list[Chain]:
@@ -259,7 +259,7 @@ class Problem:
         ends = []
         for start in starts:
             with suppress(InsufficientDataError):
-                ends.append(self.agreed(points, start)[0])
+                ends.append(self.fit(points, start)[0])
         return ends
 
     def _sorted(self, points: ImagePoints, chains: Sequence[Chain]) -> list[Chain]:
@@ -269,14 +269,14 @@ class Problem:
     def _costs(self, points: ImagePoints, chains: Sequence[Chain]) -> FloatArray:
         """Sums of squared residuals, each cut off, in the variance of an independent one at the least sum."""
         equations, lines = self.phantom.equations(points), self.phantom.seen_as == "line"
-        residuals = [equations.residuals(one) / (one.pixel_mm[1] if lines else 1.0) for one in chains]
-        cut = _CUT * min(sigma_of(one) for one in residuals)
-        sums = np.array([float(np.sum(np.minimum(one**2, cut**2))) for one in residuals])
+        residuals = [equations.residuals(c) / (c.pixel_mm[1] if lines else 1.0) for c in chains]
+        cut = _CUT * min(sigma_of(r) for r in residuals)
+        sums = np.array([float(np.sum(np.minimum(r**2, cut**2))) for r in residuals])
         best = np.clip(residuals[int(np.argmin(sums))], -cut, cut)
         independent = best.size / together(best, points.frame)
         sums *= independent / max(float(sums.min()), _SMALLEST_SIGMA**2)
         if self.prior is not None:
-            sums += [np.sum(self.prior.deviation(one.pixel_mm) ** 2) for one in chains]
+            sums += [np.sum(self.prior.deviation(chain.pixel_mm) ** 2) for chain in chains]
         return sums
 
 
@@ -294,9 +294,9 @@ def together(residuals: FloatArray, frame: IntArray) -> float:
     """How many residuals, shape (n, r), count as one: a sensor's error moves all of a frame, and wanders."""
     index = np.unique(frame, return_inverse=True)[1]
     sums = np.stack([np.bincount(index, column) for column in residuals.T])
-    whole = float(np.sum(residuals**2))
-    times = [autocorrelation_time(one) * float(one @ one) for one in sums]
-    return max(1.0, sum(times) / whole) if whole > 0 else 1.0
+    energy = float(np.sum(residuals**2))
+    times = [autocorrelation_time(s) * float(s @ s) for s in sums]
+    return max(1.0, sum(times) / energy) if energy > 0 else 1.0
 
 
 def half_turns(chain: Chain, points: ImagePoints, phantom: Phantom) -> list[Chain]:
@@ -311,22 +311,20 @@ def half_turns(chain: Chain, points: ImagePoints, phantom: Phantom) -> list[Chai
     return [replace(chain, probe=chain.probe @ step.as_matrix()) for step in steps]
 
 
-def apart(one: Chain, other: Chain, points: ImagePoints, phantom: Phantom) -> bool:
+def are_distinct(first: Chain, second: Chain, points: ImagePoints, phantom: Phantom) -> bool:
     """Whether two chains are two answers, not one."""
 
     def angle(chain: Chain) -> float:
         # Of matrices: SciPy's rotations check themselves, which takes as long as a step of the solver.
-        cosine = (np.sum(one.probe[:3, :3] * chain.probe[:3, :3]) - 1.0) / 2.0
+        cosine = (np.sum(first.probe[:3, :3] * chain.probe[:3, :3]) - 1.0) / 2.0
         return float(np.arccos(np.clip(cosine, -1.0, 1.0)))
 
     if phantom.seen_as == "direction":
-        return bool(min(angle(other), angle(other.mirrored())) > _APART_RAD)
+        return bool(min(angle(second), angle(second.mirror())) > _APART_RAD)
     corners = _corners(points)
-    places = [
-        chain.probe[:3, :2] @ (corners * chain.pixel_mm).T + chain.probe[:3, 3:] for chain in (one, other)
-    ]
+    places = [c.probe[:3, :2] @ (corners * c.pixel_mm).T + c.probe[:3, 3:] for c in (first, second)]
     far = float(np.linalg.norm(places[0] - places[1], axis=0).max())
-    return bool(angle(other) > _APART_RAD or far > _APART * np.linalg.norm(corners[2] * one.pixel_mm))
+    return bool(angle(second) > _APART_RAD or far > _APART * np.linalg.norm(corners[2] * first.pixel_mm))
 
 
 def _corners(points: ImagePoints) -> FloatArray:

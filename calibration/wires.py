@@ -35,8 +35,12 @@ from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.geometry import nearest_rotation
 from speckle3d.core.wires import WirePhantom
 
-_ESTIMATED: dict[str, tuple[str, ...]] = {"held": (), "turned": TARGET[3:], "free": TARGET}
-"""What is estimated of a stated place, simplest first."""
+_REGISTRATIONS: dict[str, tuple[tuple[str, ...], str]] = {
+    "held": ((), "held"),
+    "turned": (TARGET[3:], "held at the wires' middle and turned about it"),
+    "free": (TARGET, "estimated anew"),
+}
+"""What is estimated of a stated place, simplest first, and its words in messages."""
 _FOLDS = 8
 """Blocks of successive frames, each left out once: a tracker's error wanders over seconds, and frames beside
 each other would vouch for each other."""
@@ -50,7 +54,7 @@ _AS_IT_IS = Rotation.identity()
 class CrossWire(Phantom):
     """Two wires that cross, or a bead: one point, three equations (TR 303, equation 3)."""
 
-    determined: tuple[str, ...] = TARGET[:3]
+    unknowns: tuple[str, ...] = TARGET[:3]
     seen_as: SeenAs = "dot"
 
     def vanishing(self, points: ImagePoints) -> tuple[FloatArray, FloatArray]:
@@ -66,12 +70,12 @@ class Wires(Phantom):
     Parameters
     ----------
     geometry : WirePhantom
-    determined : tuple of str
+    unknowns : tuple of str
         Parameters of the phantom's place in the tracker's world that are estimated; the others are held.
     """
 
     geometry: WirePhantom
-    determined: tuple[str, ...] = TARGET
+    unknowns: tuple[str, ...] = TARGET
     seen_as: SeenAs = "dot"
 
     def vanishing(self, points: ImagePoints) -> tuple[FloatArray, FloatArray]:
@@ -103,21 +107,20 @@ def calibrate_cross_wire(
     s, phantom = settings or WireFit(), CrossWire()
     problem = Problem.of(phantom, pixel_mm, s)
     consensus = find_consensus(points, pixel_mm)
-    if not consensus.believed and len(points) == len(points.frames):
+    if not consensus.is_significant and len(points) == len(points.frames):
         # Poor motion, too, can leave no consensus; then that is said.
         require_adequate(problem.best(points, [wire_start(points, phantom, _AS_IT_IS, problem.held_mm)[0]]))
     consensus.require()
-    agreeing = points[consensus.nearest[consensus.agreed]]
+    agreeing = points[consensus.nearest[consensus.inliers]]
     first = problem.solve(agreeing, wire_start(agreeing, phantom, _AS_IT_IS, problem.held_mm)[0])
     # The rigid chain, from all that agree, tells candidates better than the sample did.
     away_mm = np.linalg.norm(phantom.equations(points).residuals(first.chain), axis=1)
     nearest = nearest_of_frames(points.frame, away_mm)
-    near, chosen = away_mm[nearest] <= GATES_MM[-1], points[nearest]
-    solution = _beside(problem.best(chosen[near], [first.chain]), s.beside_mm)
-    used = near.copy()
-    used[near] = solution.used
-    residuals = phantom.equations(chosen).residuals(solution.chain)
-    return require_adequate(replace(solution, points=chosen, used=used, residuals=residuals))
+    inliers, crossings = away_mm[nearest] <= GATES_MM[-1], points[nearest]
+    solution = _beside(problem.best(crossings[inliers], [first.chain]), s.beside_mm)
+    inliers[inliers] = solution.used
+    residuals = phantom.equations(crossings).residuals(solution.chain)
+    return require_adequate(replace(solution, points=crossings, used=inliers, residuals=residuals))
 
 
 def _beside(solution: Solution, beside_mm: float) -> Solution:
@@ -129,10 +132,10 @@ def _beside(solution: Solution, beside_mm: float) -> Solution:
     points, free, jacobian = solution.points_used, solution.free, solution.jacobian
     out_of_plane = solution.chain.target_from_image(points).rotation.as_matrix()[:, :, 2]
     pull = np.einsum("nip,ni->pn", jacobian.reshape(len(points), 3, -1), out_of_plane)
-    moved = np.linalg.pinv(jacobian.T @ jacobian, hermitian=True) @ pull
-    posed = moved[[free.index(name) for name in POSE]]
-    alike = sum(np.correlate(row, row, "full")[len(row) - 1 :] / max(row @ row, _TINY) for row in posed)
-    covariance = beside_mm**2 * moved @ toeplitz(alike / max(alike[0], _TINY)) @ moved.T
+    motion = np.linalg.pinv(jacobian.T @ jacobian, hermitian=True) @ pull
+    of_pose = motion[[free.index(name) for name in POSE]]
+    correlation = sum(np.correlate(p, p, "full")[len(p) - 1 :] / max(p @ p, _TINY) for p in of_pose)
+    covariance = beside_mm**2 * motion @ toeplitz(correlation / max(correlation[0], _TINY)) @ motion.T
     return replace(solution, covariance=solution.covariance + covariance)
 
 
@@ -165,32 +168,31 @@ def calibrate_wires(
     s = settings or WireFit()
     if geometry.world_from_phantom is None or s.registration != "auto":
         return require_adequate(solve_wires(points, geometry, pixel_mm, s))
-    solutions, missed = dict[str, Solution](), dict[str, FloatArray]()
-    for name in _ESTIMATED:
-        chosen = s.model_copy(update={"registration": name})
+    solutions, misses_mm = dict[str, Solution](), dict[str, FloatArray]()
+    for name in _REGISTRATIONS:
+        registration = s.model_copy(update={"registration": name})
         try:
-            solutions[name] = require_adequate(solve_wires(points, geometry, pixel_mm, chosen))
-            missed[name] = _missed_mm(solutions[name])
+            solutions[name] = require_adequate(solve_wires(points, geometry, pixel_mm, registration))
+            misses_mm[name] = _cross_validate(solutions[name])
         except InsufficientDataError:
             if name == "free" and not solutions:
                 raise
-    best = min(missed.values(), key=lambda one: float(one.mean()))
-    worse = {name: one - best for name, one in missed.items()}
-    simplest = next(n for n, one in worse.items() if one.mean() <= np.std(one, ddof=1) / np.sqrt(len(one)))
-    sizes = ", ".join(f"{name} {one.mean():.3f} mm" for name, one in missed.items())
-    said = f"phantom's place {simplest}: frames left out miss their wires by {sizes}"
-    return replace(solutions[simplest], assumed=said)
+    least_mm = min(misses_mm.values(), key=lambda miss: float(miss.mean()))
+    excess_mm = {name: miss - least_mm for name, miss in misses_mm.items()}
+    simplest = next(n for n, e in excess_mm.items() if e.mean() <= np.std(e, ddof=1) / np.sqrt(len(e)))
+    sizes = ", ".join(f"{miss.mean():.3f} mm if {name}" for name, miss in misses_mm.items())
+    choice = f"the phantom's stated place is {_REGISTRATIONS[simplest][1]}: left-out frames miss their wires"
+    return replace(solutions[simplest], assumed=f"{choice} by {sizes}")
 
 
-def _missed_mm(solution: Solution) -> FloatArray:
-    """Mean distance of the dots of each block of frames from their wires, by what the others say."""
-    points, phantom, missed = solution.points, solution.phantom, []
-    for frames in np.array_split(points.frames, _FOLDS):
-        out = np.isin(points.frame, frames)
-        chain = phantom.equations(points[solution.used & ~out]).least_squares(solution.chain, solution.free)
-        left = phantom.equations(points[out]).residuals(chain)
-        missed.append(float(np.linalg.norm(left, axis=1).mean()))
-    return np.array(missed)
+def _cross_validate(solution: Solution) -> FloatArray:
+    """Mean distance from the wires, mm, of the dots of each block of frames, by a fit to the other blocks."""
+    equations, misses_mm = solution.phantom.equations(solution.points), []
+    for frames in np.array_split(solution.points.frames, _FOLDS):
+        test = np.isin(solution.points.frame, frames)
+        chain = equations[solution.used & ~test].least_squares(solution.chain, solution.free)
+        misses_mm.append(float(np.linalg.norm(equations[test].residuals(chain), axis=1).mean()))
+    return np.array(misses_mm)
 
 
 def solve_wires(
@@ -205,13 +207,14 @@ def solve_wires(
     if place is not None:
         place = place * RigidTransform.from_translation(middle)
     # In a frame whose origin is the wires' middle, about which the phantom may be turned.
-    centred = replace(geometry, ends_mm=geometry.ends_mm - middle, world_from_phantom=place)
-    phantom = Wires(centred, TARGET if place is None else _ESTIMATED[registration])
+    about_middle = replace(geometry, ends_mm=geometry.ends_mm - middle, world_from_phantom=place)
+    phantom = Wires(about_middle, TARGET if place is None else _REGISTRATIONS[registration][0])
     problem = Problem.of(phantom, pixel_mm, s)
     few = points.of_some_frames(SOME_FRAMES)
     # Without a place, the rotations of an icosahedron, 36 degrees apart.
-    tried = Rotation.create_group("I") if place is None else [place.inv()]
-    starts = sorted((wire_start(few, phantom, one, problem.held_mm) for one in tried), key=lambda one: one[1])
+    poses = Rotation.create_group("I") if place is None else [place.inv()]
+    starts = [wire_start(few, phantom, pose, problem.held_mm) for pose in poses]
+    starts.sort(key=lambda start: start[1])
     return problem.best(points, [chain for chain, _ in starts[:_STARTS]])
 
 

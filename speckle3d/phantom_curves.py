@@ -74,7 +74,7 @@ def calibrate_curves(
     return replace(
         curves,
         speckle=_mean_speckle(curves.depth_mm, sizes),
-        spectrum=mean_spectra([each for each in spectra if each is not None]),
+        spectrum=mean_spectra([spectrum for spectrum in spectra if spectrum is not None]),
     )
 
 
@@ -120,8 +120,8 @@ def phantom_pairs(sweep: Sweep, poses: RigidTransform, settings: CurveSettings) 
             f"{sweep.name}: expected phantom frames closer than {settings.largest_mm:g} mm, got none"
         )
     # Thinned evenly over separation.
-    kept = order[np.linspace(0, order.size - 1, min(order.size, settings.pairs)).astype(int)]
-    return np.asarray(np.column_stack([first, second])[np.sort(kept)])
+    thin = order[np.linspace(0, order.size - 1, min(order.size, settings.pairs)).astype(int)]
+    return np.asarray(np.column_stack([first, second])[np.sort(thin)])
 
 
 def phantom_samples(
@@ -135,10 +135,10 @@ def phantom_samples(
     pairs : ndarray, shape (m, 2)
         Those of the table that count.
     """
-    counted = np.isin(table.first * len(poses) + table.second, pairs @ [len(poses), 1])
-    first, second, correlation = table.first[counted], table.second[counted], table.correlation[counted]
+    rows = np.isin(table.first * len(poses) + table.second, pairs @ [len(poses), 1])
+    first, second, correlation = table.first[rows], table.second[rows], table.correlation[rows]
     normal = (poses[first].inv() * poses[second]).as_matrix()[:, 2]
-    at = patches.centre_mm - table.inplane[counted, None, :2]
+    at = patches.centre_mm - table.inplane[rows, None, :2]
     offset = (at * normal[:, None, :2]).sum(axis=2) + normal[:, 3:]
     tilt = normal[:, :1] * np.sin(patches.angle_rad) + normal[:, 1:2] * np.cos(patches.angle_rad)
     depth = np.broadcast_to(patches.depth_mm, tilt.shape)
@@ -153,9 +153,9 @@ def _mean_speckle(
     """Mean speckle size of phantom sweeps at the depths of the curves; None if unknown."""
     means = []
     for name in ("lateral_mm", "axial_mm"):
-        known = [(depths, getattr(size, name)) for depths, size in sizes]
-        known = [(depths[fair], size[fair]) for depths, size in known if (fair := np.isfinite(size)).any()]
-        if not known:
+        by_depth = [(depths, getattr(size, name)) for depths, size in sizes]
+        finite = [(depths[f], size[f]) for depths, size in by_depth if (f := np.isfinite(size)).any()]
+        if not finite:
             return None
-        means.append(np.mean([np.interp(depth_mm, *sweep) for sweep in known], axis=0))
+        means.append(np.mean([np.interp(depth_mm, *sweep) for sweep in finite], axis=0))
     return SpeckleSize(*means)

@@ -80,7 +80,7 @@ class ProbeSheet(BaseModel):
 
     @field_validator("band_mhz")
     @classmethod
-    def _ordered(cls, value: tuple[float, float]) -> tuple[float, float]:
+    def _check_band(cls, value: tuple[float, float]) -> tuple[float, float]:
         if not 0.1 < value[0] < value[1] < 100:
             raise ValueError("expected 0.1 < low < high < 100")
         return value
@@ -120,7 +120,7 @@ def data_sheet_curves(
         If the sheet lacks what no sweep tells.
     """
     settings, probe, speed = config or Config(), sheet.nominal, sheet.speed_of_sound_m_s
-    seen, area, band = None, np.full(1, np.nan), (probe.low_hz, probe.high_hz)
+    spectra, area, band = None, np.full(1, np.nan), (probe.low_hz, probe.high_hz)
     if like is None:
         key, patches = _key(sheet, settings), settings.patches
         first = patches.top_mm + patches.height_mm / 2.0
@@ -130,19 +130,19 @@ def data_sheet_curves(
     else:
         matcher = FrameMatcher(like, settings)
         key, rows, texture = matcher.key, matcher.patches.row_depth_mm, measured_texture(like, matcher)
-        size, seen = texture.speckle_size(), texture.spectra()
-        area = 2.0 * np.pi * _filled(rows, size.lateral_mm) * _filled(rows, size.axial_mm)
+        size, spectra = texture.speckle_size(), texture.spectra()
+        area = 2.0 * np.pi * _interpolate(rows, size.lateral_mm) * _interpolate(rows, size.axial_mm)
     if isinstance(key.signal, RFSettings):
         band = key.signal.bandwidth_hz
     frequency = band_nodes(band, key.edge_fraction)
     inside = key.patch_height_mm * ((np.arange(SUB_DEPTHS) + 0.5) / SUB_DEPTHS - 0.5)
     depths = np.maximum(rows[:, None] + inside, 1.0)
-    if seen is None:
+    if spectra is None:
         exponents = sheet.attenuation_db_cm_mhz, sheet.backscatter_exponent
-        sent = sheet_spectrum(frequency, (probe.low_hz, probe.high_hz), *exponents, depths)
+        spectrum = sheet_spectrum(frequency, (probe.low_hz, probe.high_hz), *exponents, depths)
     else:
-        sent = seen.at(depths, frequency)
-    weight = sent * band_weights(frequency, *band, key.edge_fraction * (band[1] - band[0])) ** 2
+        spectrum = spectra.at(depths, frequency)
+    weight = spectrum * band_weights(frequency, *band, key.edge_fraction * (band[1] - band[0])) ** 2
     area = area if np.isfinite(area).all() else _speckle_area(sheet, frequency, weight.mean(axis=1))
     cells = key.patch_width_mm * key.patch_height_mm / area
     grid = GRID_MM * np.arange(round(settings.curves.largest_mm / GRID_MM) + 1, dtype=float)
@@ -153,7 +153,7 @@ def data_sheet_curves(
     if isinstance(key.signal, RFSettings):
         pivot = tilt_pivot(probe, rows, frequency, weight.mean(axis=1), speed)
         tilt = TiltResponse(pivot, two_way_wavenumber(key.signal) * curve_widths(grid, rho) ** 2)
-    sigma = sheet_sigma(sheet, rows, seen is not None)
+    sigma = sheet_sigma(sheet, rows, spectra is not None)
     return DecorrelationCurves(
         key, rows, grid, rho, cells, tilt=tilt, scale_sigma=sigma, origin="data sheet", nominal=probe
     )
@@ -178,13 +178,13 @@ def _key(sheet: ProbeSheet, settings: Config) -> CurveKey:
     )
 
 
-def _filled(depth_mm: FloatArray, values: FloatArray) -> FloatArray:
+def _interpolate(depth_mm: FloatArray, values: FloatArray) -> FloatArray:
     """Values by depth, those not known from their neighbours; all NaN if none is known."""
-    known = np.isfinite(values)
-    return np.interp(depth_mm, depth_mm[known], values[known]) if known.any() else values
+    finite = np.isfinite(values)
+    return np.interp(depth_mm, depth_mm[finite], values[finite]) if finite.any() else values
 
 
-def sheet_sigma(sheet: ProbeSheet, depth_mm: FloatArray, spectrum_known: bool) -> float:
+def sheet_sigma(sheet: ProbeSheet, depth_mm: FloatArray, has_spectrum: bool) -> float:
     """Relative standard deviation that the sheet's tolerances and the model leave in all distances.
 
     Tissue is within the attenuation's tolerance. With the echo's spectrum known, neither attenuation nor
@@ -196,14 +196,14 @@ def sheet_sigma(sheet: ProbeSheet, depth_mm: FloatArray, spectrum_known: bool) -
         """Mean logarithm of the curves' widths with one number at a time at the end of its tolerance."""
         pitch = 1.0 + side * sheet.frequency_tolerance
         attenuation = max(probe.attenuation_db_cm_mhz + side * sheet.attenuation_tolerance, 0.0)
-        varied = [
+        variants = [
             replace(probe, focus_mm=probe.focus_mm * (1.0 + side * sheet.focus_tolerance)),
             replace(probe, aperture_mm=probe.aperture_mm * (1.0 + side * sheet.aperture_tolerance)),
             replace(probe, attenuation_db_cm_mhz=attenuation),
             replace(probe, low_hz=pitch * probe.low_hz, high_hz=pitch * probe.high_hz),
         ]
-        some = varied[:2] if spectrum_known else varied
-        return np.array([log_width(one, depth_mm, sheet.backscatter_exponent).mean() for one in some])
+        variants = variants[:2] if has_spectrum else variants
+        return np.array([log_width(v, depth_mm, sheet.backscatter_exponent).mean() for v in variants])
 
     sigma = UNIFORM * (widths(1.0) - widths(-1.0)) / 2.0
     return float(np.sqrt((sigma**2).sum() + MODEL_SIGMA**2))

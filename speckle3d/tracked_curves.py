@@ -64,26 +64,26 @@ def tracked_curves(
     settings = config or Config()
     bare = [replace(sweep, truth=None) for sweep in sweeps]
     if start is None:
-        return _corrected(bare, calibrate_curves(bare, settings, progress), settings, progress)
+        return _fit_length(bare, calibrate_curves(bare, settings, progress), settings, progress)
     if start.key.correlation_of == "echo":
-        return _corrected(bare, start, settings, progress)
+        return _fit_length(bare, start, settings, progress)
     # Of images without phase structure cannot be told from speckle: it goes into the curves. A path that is
     # read without adapting to it may fold back, one that is adapted to what is no speckle bends depths.
     candidates: list[DecorrelationCurves] = []
     reason: Speckle3DError = InsufficientDataError("expected sweeps, got none")
-    for is_adapted in (True, False):
+    for adapt in (True, False):
         try:
-            curves = _corrected(bare, start, settings, progress, 1) if is_adapted else start
+            curves = _fit_length(bare, start, settings, progress, 1) if adapt else start
             tissue = replace(curves, of_tissue=True)
-            candidates.append(_corrected(bare, tissue, settings, progress))
+            candidates.append(_fit_length(bare, tissue, settings, progress))
         except (InsufficientDataError, MismatchError) as error:
             reason = error
     if not candidates:
         raise reason
-    return min(candidates, key=lambda each: each.scale_sigma)
+    return min(candidates, key=lambda curves: curves.scale_sigma)
 
 
-def _corrected(
+def _fit_length(
     sweeps: Sequence[Sweep],
     curves: DecorrelationCurves,
     config: Config,
@@ -92,9 +92,9 @@ def _corrected(
 ) -> DecorrelationCurves:
     """Curves with which the images of some sweeps have the length that the tracker has."""
     for _ in range(rounds):
-        tracked = [track(sweep, curves, config, progress) for sweep in sweeps]
-        lengths = [tracker_scale(sweep, found) for sweep, found in zip(sweeps, tracked, strict=True)]
-        curves = corrected_curves(curves, [found.curves for found in tracked], lengths)
+        results = [track(sweep, curves, config, progress) for sweep in sweeps]
+        lengths = [tracker_scale(sweep, result) for sweep, result in zip(sweeps, results, strict=True)]
+        curves = corrected_curves(curves, [result.curves for result in results], lengths)
     return replace(curves, origin="tracked")
 
 
@@ -108,7 +108,7 @@ def jitters(sweep: Sweep) -> bool:
     return bool(robust_sigma(z[2:] - 2.0 * z[1:-1] + z[:-2]) > np.sqrt(6.0) * STEADY_MM)
 
 
-def tracker_scale(sweep: Sweep, tracked: Tracked) -> Length:
+def tracker_scale(sweep: Sweep, result: Tracked) -> Length:
     """Tracker's elevational length over the images'.
 
     Raises
@@ -122,21 +122,22 @@ def tracker_scale(sweep: Sweep, tracked: Tracked) -> Length:
             f"{sweep.name}: expected a tracker that is calibrated to the image, got none: "
             "speckle3d calibrate images or plane tells how it sits on the probe"
         )
-    known = tracker.covers(sweep.frame_time_s) & (tracked.flags == 0)
-    if known.sum() < LEAST_FRAMES:
+    valid = tracker.covers(sweep.frame_time_s) & (result.flags == 0)
+    if valid.sum() < LEAST_FRAMES:
         raise InsufficientDataError(
-            f"{sweep.name}: expected {LEAST_FRAMES} frames with tracker readings, got {known.sum()}"
+            f"{sweep.name}: expected {LEAST_FRAMES} frames with tracker readings, got {valid.sum()}"
         )
-    poses = tracker.world_from_image(sweep.frame_time_s[known])
+    poses = tracker.world_from_image(sweep.frame_time_s[valid])
     middle = len(poses) // 2
     z = (poses[middle].inv() * poses).apply(sweep.grid.centre_mm)[:, 2]
-    seen = (tracked.image[known][middle].inv() * tracked.image[known]).apply(sweep.grid.centre_mm)[:, 2]
-    z, seen = z - z.mean(), seen - seen.mean()
-    scale = abs(float(z @ seen)) / float(seen @ seen)
-    left = z - np.sign(z @ seen) * scale * seen
-    variance = float(left @ left) / (left.size - 2)
-    alike = float(np.clip(ALIKE_MM * left.size / np.ptp(z), 1.0, min(ALIKE_FRAMES, left.size)))
-    sigma = float(np.sqrt(alike * variance / (seen @ seen))) / scale
+    images = result.image[valid]
+    x = (images[middle].inv() * images).apply(sweep.grid.centre_mm)[:, 2]
+    z, x = z - z.mean(), x - x.mean()
+    scale = abs(float(z @ x)) / float(x @ x)
+    residuals = z - np.sign(z @ x) * scale * x
+    variance = float(residuals @ residuals) / (z.size - 2)
+    alike = float(np.clip(ALIKE_MM * z.size / np.ptp(z), 1.0, min(ALIKE_FRAMES, z.size)))
+    sigma = float(np.sqrt(alike * variance / (x @ x))) / scale
     sigma = float(np.hypot(sigma, LENGTH_SIGMA))
     if not sigma < LEAST_SURE:
         raise InsufficientDataError(
@@ -181,7 +182,9 @@ def corrected_curves(
     InsufficientDataError
         If there is no sweep, or none whose length is known.
     """
-    scale, sigma = (np.array([getattr(each, name) for each in lengths]) for name in ("log_scale", "sigma"))
+    scale, sigma = (
+        np.array([getattr(length, name) for length in lengths]) for name in ("log_scale", "sigma")
+    )
     if not read_with or scale.size != len(read_with) or not (np.isfinite(scale) & (sigma > 0)).all():
         raise InsufficientDataError(
             "corrected curves: expected for every sweep a finite log scale with a deviation above zero, got "
@@ -189,10 +192,10 @@ def corrected_curves(
         )
     information = sigma**-2.0
     weight = information / information.sum()
-    widths = [np.log(curve_widths(own.distance_mm, own.correlation)) for own in (curves, *read_with)]
+    widths = [np.log(curve_widths(c.distance_mm, c.correlation)) for c in (curves, *read_with)]
     lens = np.mean(widths[1:], axis=0) - widths[0]
     scatter = (weight * (scale - weight @ scale) ** 2).sum() / scale.size
-    left = float(np.sqrt(scatter + 1.0 / information.sum() + ATTENUATION_SIGMA**2))
+    error = float(np.sqrt(scatter + 1.0 / information.sum() + ATTENUATION_SIGMA**2))
     # Widened for the attenuation of these sweeps, the curves go with a spectrum that has it.
     better = replace(stretched(curves, lens + weight @ scale), spectrum=read_with[0].spectrum)
-    return replace(better, scale_sigma=left, origin="crossing")
+    return replace(better, scale_sigma=error, origin="crossing")

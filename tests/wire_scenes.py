@@ -6,7 +6,7 @@ from xml.etree import ElementTree
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from calibration.points import Seen
+from calibration.points import Detections
 from speckle3d.core.wires import WirePhantom
 
 PIXEL_MM = np.array([0.16, 0.15])
@@ -126,4 +126,4 @@ def candidates(sequence, seed, noise_mm=0.1, missing=()):
         order = np.argsort(-score)
         dots.append((np.full(len(score), i), pixels[order], score[order]))
     frame, pixels, score = (np.concatenate(column) for column in zip(*dots, strict=True))
-    return Seen(frame, pixels, score=score)
+    return Detections(frame, pixels, score=score)

@@ -66,18 +66,18 @@ def estimate_offset(
             "clock, got none"
         )
     points_at = _reader(points[covered_points], readings)
-    tried = delays_around(around_s, search_s, STEP_S)
-    misfit = np.full(len(tried), np.nan)
-    for number, offset in enumerate(tried):
+    delays = delays_around(around_s, search_s, STEP_S)
+    misfit = np.full(len(delays), np.nan)
+    for number, offset in enumerate(delays):
         with suppress(InsufficientDataError):
-            some = points_at(float(offset)).of_some_frames(SOME_FRAMES)
-            misfit[number] = sigma_of(_adequate_or_not(calibrate, some).residuals) ** 2
+            few = points_at(float(offset)).of_some_frames(SOME_FRAMES)
+            misfit[number] = sigma_of(_adequate_or_not(calibrate, few).residuals) ** 2
     if not np.isfinite(misfit).any():
         raise InsufficientDataError(
-            f"expected a clock offset that gives a calibration, got none of {len(tried)}"
+            f"expected a clock offset that gives a calibration, got none of {len(delays)}"
         )
     misfit = np.nan_to_num(misfit, nan=np.nanmax(misfit))
-    seconds = float(tried[peak_of(tried, misfit, "the motion repeats itself; move irregularly")])
+    seconds = float(delays[peak_of(delays, misfit, "the motion repeats itself; move irregularly")])
     for _ in range(_MOST_STEPS):
         # Anew, for the frames that contradict the others depend on the offset.
         step, covariance = _joint_fit(_adequate_or_not(calibrate, points_at(seconds)), points_at, seconds)
@@ -122,11 +122,11 @@ def _joint_fit(
     for step in (-_DERIVATIVE_S, 0.0, _DERIVATIVE_S):
         points = points_at(seconds + step)
         points = points[np.isin(points.frame, frames)]
-        seen = as_directions(points, chain.pixel_mm) if solution.angular else points
-        equations.append(phantom.equations(seen))
-    sooner, now, later = equations
+        points = as_directions(points, chain.pixel_mm) if solution.angular else points
+        equations.append(phantom.equations(points))
+    sooner, middle, later = equations
     column = (later.residuals(chain) - sooner.residuals(chain)).reshape(-1, 1) / (2.0 * _DERIVATIVE_S)
-    _, further, joint = fit_noise(now, chain, solution.free, phantom.seen_as, solution.prior, column)
+    _, further, joint = fit_noise(middle, chain, solution.free, phantom.seen_as, solution.prior, column)
     return float(further[-1]), joint
 
 

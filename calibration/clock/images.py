@@ -97,8 +97,8 @@ def delay_from_images(
     def correlations(number: int, delay_s: float) -> FloatArray:
         """Of so many images of each way with cuts of the other; NaN without support."""
         first, second = (
-            replace(one, world_from_sensor=steady.at(times[way] - delay_s))
-            for one, way in zip(stacks, ways, strict=True)
+            replace(stack, world_from_sensor=steady.at(times[way] - delay_s))
+            for stack, way in zip(stacks, ways, strict=True)
         )
         patches = (
             spread_patches(first, _middle(share[ways[0]], number), PIXEL_MM),
@@ -107,11 +107,11 @@ def delay_from_images(
         comparison = Comparison((first, second), patches, gap_mm, LEAST_OVERLAP)
         return comparison.at(sensor_from_image).alike
 
-    tried, rows = delays_around(around_s, search_s, STEP_S), []
-    for number, delay in enumerate(tried):
+    delays, rows = delays_around(around_s, search_s, STEP_S), []
+    for number, delay in enumerate(delays):
         rows.append(correlations(COARSE, float(delay)))
         if progress is not None:
-            progress(number + 1, len(tried))
+            progress(number + 1, len(delays))
     curves = np.array(rows)
     count = np.isfinite(curves).sum(axis=1)
     if not 2 * count.max() >= max(curves.shape[1], 1):
@@ -119,23 +119,23 @@ def delay_from_images(
     # Where fewer than half of the images meet the other way, nothing is alike.
     alike = np.where(2 * count >= curves.shape[1], np.nansum(curves, axis=1) / np.maximum(count, 1), 0.0)
     misfit = 1.0 - alike
-    best = peak_of(tried, misfit, f"the motion repeats itself, or {doubts}")
-    width = _half_width(tried, misfit, best)
-    near = np.abs(tried - tried[best]) < width + 0.5 * STEP_S
+    best = peak_of(delays, misfit, f"the motion repeats itself, or {doubts}")
+    width = _half_width(delays, misfit, best)
+    near = np.abs(delays - delays[best]) < width + 0.5 * STEP_S
     votes = near[np.nanargmax(curves[:, np.isfinite(curves[best])], axis=0)]
     if votes.mean() < LEAST_AGREEING:
         raise InsufficientDataError(
             "expected images that show where they were taken, got only "
-            f"{votes.sum()} of {len(votes)} that fit best near {tried[best]:+.3f} s, the best: {doubts}"
+            f"{votes.sum()} of {len(votes)} that fit best near {delays[best]:+.3f} s, the best: {doubts}"
         )
-    low, high = max(tried[best] - width, tried[0]), min(tried[best] + width, tried[-1])
+    low, high = max(delays[best] - width, delays[0]), min(delays[best] + width, delays[-1])
     places = np.linspace(low, high, _PLACES)
-    fine = np.array([correlations(FINE, float(one)) for one in places])
-    seconds, scatter = _placed(places, fine)
+    fine = np.array([correlations(FINE, float(place)) for place in places])
+    seconds, scatter = _vertex(places, fine)
     # A peak must be located to well within its own width.
     if not (SIGMAS * scatter < width and low <= seconds <= high):
         raise InsufficientDataError(
-            f"expected correlations with a top, got none near the best delay, {tried[best]:+.3f} s: {doubts}"
+            f"expected correlations with a top, got none near the best delay, {delays[best]:+.3f} s: {doubts}"
         )
     error = float(np.hypot(scatter, _from_jitter(steady, times - seconds, sensor_from_image, centre_mm)))
     return ClockOffset(seconds, error, float(np.nanmean(fine, axis=1).max()))
@@ -167,8 +167,8 @@ def _direction(path_mm: FloatArray) -> FloatArray:
 def _middle(share: FloatArray, number: int) -> IntArray:
     """Frames spread over the middle of a way; at its ends the probe is too slow to show a delay."""
     inner = np.flatnonzero((share > 0.1) & (share < 0.9))
-    chosen = np.linspace(0, inner.size - 1, min(number, inner.size)).round().astype(np.int64)
-    return np.asarray(inner[np.unique(chosen)])
+    index = np.linspace(0, inner.size - 1, min(number, inner.size)).round().astype(np.int64)
+    return np.asarray(inner[np.unique(index)])
 
 
 def _from_jitter(
@@ -180,24 +180,24 @@ def _from_jitter(
     the speed.
     """
     read_s = steady.time_s
-    used = (read_s >= times_s[0]) & (read_s <= times_s[-1])
+    during = (read_s >= times_s[0]) & (read_s <= times_s[-1])
     raw, smooth = (
         (poses * sensor_from_image).apply(centre_mm)
-        for poses in (steady.poses[used], steady.at(read_s[used]))
+        for poses in (steady.poses[during], steady.at(read_s[during]))
     )
     along = _direction(smooth)
     path = float(np.abs(np.diff(smooth @ along)).sum())
-    sigma = float(np.std((raw - smooth) @ along) / np.sqrt(used.sum()))
+    sigma = float(np.std((raw - smooth) @ along) / np.sqrt(during.sum()))
     return sigma * float(times_s[-1] - times_s[0]) / path if path > 0.0 else np.inf
 
 
-def _half_width(tried_s: FloatArray, misfit: FloatArray, best: int) -> float:
+def _half_width(delays_s: FloatArray, misfit: FloatArray, best: int) -> float:
     """Distance from the best delay at which half of its gain over the median is lost."""
-    above = np.abs(tried_s - tried_s[best])[misfit > 0.5 * (misfit[best] + float(np.median(misfit)))]
+    above = np.abs(delays_s - delays_s[best])[misfit > 0.5 * (misfit[best] + float(np.median(misfit)))]
     return float(np.clip(above.min(initial=_WIDEST_S), 2.0 * STEP_S, _WIDEST_S))
 
 
-def _placed(near_s: FloatArray, curves: FloatArray) -> tuple[float, float]:
+def _vertex(near_s: FloatArray, curves: FloatArray) -> tuple[float, float]:
     """Vertex of a parabola through the mean correlations near the peak, and its jackknife standard error.
 
     A parabola, since the maximum itself ripples with the frames that happen to be there. Runs of images are

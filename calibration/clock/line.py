@@ -1,7 +1,7 @@
 """Clock offset between images and a sensor, from a plane's echo line: its depth and slope follow the sensor.
 
 The line's depth is a linear function of a tracker's position and, for small turns, of its rotation; its slope
-is one of an orientation sensor's rotation. The function is fitted anew for every delay that is tried; the
+is one of an orientation sensor's rotation. The function is fitted anew for every delay that is delays; the
 best delay leaves the least residual.
 
 References
@@ -25,7 +25,7 @@ from speckle3d.core.streams import TimedPoses, TimedRotations
 
 STEP_S = 0.005
 
-LEAST_FOLLOWED = 0.8
+LEAST_SHARE = 0.8
 """Share of the line's variance that the sensor must explain. Readings with a quarter of noise, or turns that
 are not small, fit best at wrong delays."""
 
@@ -67,7 +67,7 @@ def delay_from_lines(
         orientation sensor the slope.
     frame_time_s : ndarray, shape (m,)
     around_s, search_s : float
-        Delays from `around_s` - `search_s` to `around_s` + `search_s` are tried.
+        Delays from `around_s` - `search_s` to `around_s` + `search_s` are delays.
 
     Raises
     ------
@@ -81,9 +81,9 @@ def delay_from_lines(
             f"expected readings from {search_s:g} s before to {search_s:g} s after at least {FEWEST_FRAMES} "
             f"frames with a line, got them for {inside.sum()} of {len(frame_time_s)} such frames"
         )
-    times, wanted = frame_time_s[inside], signal[inside, 0 if isinstance(readings, TimedPoses) else 1]
-    wanted = wanted - wanted.mean()
-    if float(np.ptp(wanted)) < _STILL:
+    times, target = frame_time_s[inside], signal[inside, 0 if isinstance(readings, TimedPoses) else 1]
+    target = target - target.mean()
+    if float(np.ptp(target)) < _STILL:
         raise InsufficientDataError("expected a line that moves, got one that stands still")
     steady = SmoothReadings(readings)
 
@@ -92,31 +92,31 @@ def delay_from_lines(
         turns, places = (pose := steady.at(times - delay_s)).rotation, pose.translation
         motion = [(turns.mean().inv() * turns).as_rotvec(), places - places.mean(axis=0)]
         matrix = np.column_stack([np.ones(len(times)), *motion])
-        answer, _, rank, _ = np.linalg.lstsq(matrix, wanted, rcond=1e-9)
-        return wanted - matrix @ answer, int(rank)
+        answer, _, rank, _ = np.linalg.lstsq(matrix, target, rcond=1e-9)
+        return target - matrix @ answer, int(rank)
 
     def misfit(delay_s: float) -> float:
         left = fit(delay_s)[0]
-        return float(left @ left / (wanted @ wanted))
+        return float(left @ left / (target @ target))
 
-    tried = delays_around(around_s, search_s, STEP_S)
-    misfits = np.array([misfit(float(delay)) for delay in tried])
-    if (followed := 1.0 - misfits.min()) < LEAST_FOLLOWED:
+    delays = delays_around(around_s, search_s, STEP_S)
+    misfits = np.array([misfit(float(delay)) for delay in delays])
+    if (share := 1.0 - misfits.min()) < LEAST_SHARE:
         raise InsufficientDataError(
-            f"expected a line that follows the sensor, got {100 * followed:.0f} % of its motion explained at "
-            f"the best delay, {tried[misfits.argmin()]:+.3f} s: move the probe up and down, faster; or the "
+            f"expected a line that follows the sensor, got {100 * share:.0f} % of its motion explained at "
+            f"the best delay, {delays[misfits.argmin()]:+.3f} s: move the probe up and down, faster; or the "
             "delay lies outside the range searched: --search-s"
         )
-    best = peak_of(tried, misfits, f"the motion repeats itself, or does not return: {_IRREGULARLY}")
-    seconds, least, curvature = least_between(misfit, tried, best)
+    best = peak_of(delays, misfits, f"the motion repeats itself, or does not return: {_IRREGULARLY}")
+    seconds, least, curvature = least_between(misfit, delays, best)
     left, rank = fit(seconds)
     # Of few independent values any slow motion explains a line at some delay, which is fitted too: the share
     # explained is adjusted for the numbers fitted [2]_.
-    told, fitted = len(wanted) / autocorrelation_time(wanted), rank + 1
-    if least * (told - 1.0) > (1.0 - LEAST_FOLLOWED) * (told - fitted):
+    count, unknowns = len(target) / autocorrelation_time(target), rank + 1
+    if least * (count - 1.0) > (1.0 - LEAST_SHARE) * (count - unknowns):
         raise InsufficientDataError(
-            f"expected a line whose motion tells much more than the {fitted} numbers fitted to it, got one "
-            f"that turns so seldom that it tells {told:.1f}: record for longer, and {_IRREGULARLY}"
+            f"expected a line whose motion has many more independent values than the {unknowns} numbers "
+            f"fitted to it, got {count:.1f}: record for longer, and {_IRREGULARLY}"
         )
     free = max(1.0, len(left) / autocorrelation_time(left) - rank)
     error = float(np.sqrt(2.0 * least / free / curvature)) if curvature > 0 else np.inf

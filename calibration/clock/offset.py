@@ -41,11 +41,11 @@ def covered(
     readings: TimedPoses | TimedRotations, frame_time_s: FloatArray, offset_s: float, slack_s: float = 0.0
 ) -> BoolArray:
     """Which frames have a reading, for any offset within `slack_s` of `offset_s`."""
-    asked, sampled = np.asarray(frame_time_s) - offset_s, readings.time_s
-    inside = (asked - slack_s >= sampled[0]) & (asked + slack_s <= sampled[-1])
-    gaps = np.flatnonzero(np.diff(sampled) > readings.max_gap_s)
-    first, last = asked[:, None] - slack_s, asked[:, None] + slack_s
-    in_gap = (last > sampled[gaps]) & (first < sampled[gaps + 1])
+    times, sample_s = np.asarray(frame_time_s) - offset_s, readings.time_s
+    inside = (times - slack_s >= sample_s[0]) & (times + slack_s <= sample_s[-1])
+    gaps = np.flatnonzero(np.diff(sample_s) > readings.max_gap_s)
+    first, last = times[:, None] - slack_s, times[:, None] + slack_s
+    in_gap = (last > sample_s[gaps]) & (first < sample_s[gaps + 1])
     return np.asarray(inside & ~in_gap.any(axis=1))
 
 

@@ -24,7 +24,7 @@ _FEWEST = 6
 """Samples of a smoothing spline; fewer are joined by straight lines."""
 _STIFFNESS = 10.0 ** np.arange(-3.0, 4.0)
 """Tried, in samples to the fourth power: from the samples themselves to waves of 35 samples."""
-_MOST_COMPARED = 600
+_MOST_SAMPLES = 600
 """Samples among which stiffness is chosen."""
 
 
@@ -52,14 +52,14 @@ class SmoothReadings:
         stretch = np.searchsorted(self._begins[1:], at, side="right")
         turns, places = np.empty((len(at), 4)), np.empty((len(at), 3))
         for number in np.unique(stretch):
-            there = stretch == number
-            turns[there], places[there] = (curve(at[there]) for curve in self._curves[number])
+            inside = stretch == number
+            turns[inside], places[inside] = (curve(at[inside]) for curve in self._curves[number])
         return RigidTransform.from_components(places, Rotation.from_quat(turns))
 
 
 def _stiffness(at: FloatArray, columns: FloatArray) -> float:
     """Stiffness with which every other sample predicts those between them best."""
-    at, columns = at[:_MOST_COMPARED], columns[:_MOST_COMPARED]
+    at, columns = at[:_MOST_SAMPLES], columns[:_MOST_SAMPLES]
     if len(at) < 2 * _FEWEST:
         return float(_STIFFNESS[0])
     between = slice(1, (len(at) - 1) // 2 * 2, 2)

@@ -22,10 +22,10 @@ import numpy as np
 import numpy.typing as npt
 from scipy import fft, ndimage
 
-from calibration.detection.dots import centred
+from calibration.detection.dots import bright_centre
 from calibration.detection.lines import peak_between
-from calibration.detection.region import checked_pixel, finite_grey, region_mask, seen_in_frames
-from calibration.points import Seen
+from calibration.detection.region import checked_pixel, detect_in_frames, finite_grey, region_mask
+from calibration.points import Detections
 from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.extras import extra_module
@@ -65,7 +65,7 @@ def crossings_in_frames(
     pixel_mm: npt.ArrayLike,
     region_px: npt.ArrayLike | None = None,
     progress: Callable[[int, int], None] | None = None,
-) -> Seen:
+) -> Detections:
     """Find candidates for a crossing in every frame, read one at a time, the likeliest of each first.
 
     Parameters
@@ -85,7 +85,7 @@ def crossings_in_frames(
     """
     size, standing = checked_pixel(pixel_mm), standing_still(frames)
     inside = None if region_px is None else region_mask(frames.shape[1:], region_px)
-    return seen_in_frames(frames, lambda image: _crossings(image, size, inside, standing), progress)
+    return detect_in_frames(frames, lambda image: _crossings(image, size, inside, standing), progress)
 
 
 def standing_still(frames: Frames) -> Float32Array | None:
@@ -94,10 +94,10 @@ def standing_still(frames: Frames) -> Float32Array | None:
     if count < _FEWEST_GLANCES:
         return None
     glances = np.unique(np.linspace(0, count - 1, _GLANCES).astype(int))
-    seen = np.stack([np.asarray(frames[int(index)]) for index in glances])
+    levels = np.stack([np.asarray(frames[int(index)]) for index in glances])
     place = int(_STANDING * (len(glances) - 1))
-    seen.partition(place, axis=0)
-    return np.asarray(seen[place], dtype=np.float32)
+    levels.partition(place, axis=0)
+    return np.asarray(levels[place], dtype=np.float32)
 
 
 def _crossings(
@@ -128,22 +128,21 @@ def _crossings(
     if inside is not None:
         column, row = np.minimum(np.rint(pixels).astype(int), np.array(grey.shape) - 1).T
         pixels, score = pixels[inside[column, row]], score[inside[column, row]]
-    kept: list[int] = []
-    for one in np.argsort(-score, kind="stable"):
-        away = np.linalg.norm((pixels[kept] - pixels[one]) * pixel_mm, axis=1)
-        if score[one] > 0 and (away >= _APART_MM).all() and len(kept) < _MOST_CANDIDATES:
-            kept.append(int(one))
-    if not kept:
+    best: list[int] = []
+    for k in np.argsort(-score, kind="stable"):
+        away = np.linalg.norm((pixels[best] - pixels[k]) * pixel_mm, axis=1)
+        if score[k] > 0 and (away >= _APART_MM).all() and len(best) < _MOST_CANDIDATES:
+            best.append(int(k))
+    if not best:
         raise InsufficientDataError("no lines that cross")
-    return np.array([centred(grey, one, pixel_mm) for one in pixels[kept]]), score[kept].astype(float)
+    return np.array([bright_centre(grey, p, pixel_mm) for p in pixels[best]]), score[best].astype(float)
 
 
 def _two_lines(grey: Float32Array, step_mm: FloatArray, width_mm: float) -> Float32Array:
     """Geometric mean of the contrasts of the best line and of the best that is well apart from it."""
     pad = np.ceil(3.0 * _LENGTH * width_mm / step_mm).astype(int)
-    padded = np.pad(grey, [(n, n) for n in pad], mode="edge")
-    shape = [fft.next_fast_len(n, real=True) for n in padded.shape]
-    spectrum = fft.rfft2(padded, shape)
+    shape = [fft.next_fast_len(n + 2 * margin, real=True) for n, margin in zip(grey.shape, pad, strict=True)]
+    spectrum = fft.rfft2(np.pad(grey, [(n, n) for n in pad], mode="edge"), shape)
     along = np.pi * np.arange(_ORIENTATIONS) / _ORIENTATIONS
     frequency = [
         fft.fftfreq(shape[0], step_mm[0]).astype(np.float32)[:, None],
@@ -156,11 +155,11 @@ def _two_lines(grey: Float32Array, step_mm: FloatArray, width_mm: float) -> Floa
         across = 2.0 * (np.pi * width_mm * (frequency[1] * cosine - frequency[0] * sine)) ** 2
         mean = fft.irfft2(spectrum * np.exp(-length - across), shape)
         shift = np.rint(_SIDE * width_mm * np.array([-sine, cosine]) / step_mm).astype(int)
-        here, left, right = (
+        middle, left, right = (
             mean[p[0] : p[0] + grey.shape[0], p[1] : p[1] + grey.shape[1]]
             for p in (pad, pad + shift, pad - shift)
         )
-        lines[number] = here - np.maximum(left, right)
+        lines[number] = middle - np.maximum(left, right)
     best = lines.argmax(axis=0)
     second = np.zeros(grey.shape, np.float32)
     for number in range(_ORIENTATIONS):

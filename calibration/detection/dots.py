@@ -14,8 +14,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
-from calibration.detection.region import checked_pixel, finite_grey, region_mask, seen_in_frames
-from calibration.points import Seen
+from calibration.detection.region import checked_pixel, detect_in_frames, finite_grey, region_mask
+from calibration.points import Detections
 from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.extras import extra_module
@@ -47,7 +47,7 @@ def dots_in_frames(
     pixel_mm: npt.ArrayLike,
     region_px: npt.ArrayLike | None = None,
     progress: Callable[[int, int], None] | None = None,
-) -> Seen:
+) -> Detections:
     """Find the bright dots of every frame, read one at a time.
 
     Parameters
@@ -67,7 +67,7 @@ def dots_in_frames(
     """
     size = checked_pixel(pixel_mm)
     inside = None if region_px is None else region_mask(frames.shape[1:], region_px)
-    return seen_in_frames(frames, lambda image: _dots(image, size, inside), progress)
+    return detect_in_frames(frames, lambda image: _dots(image, size, inside), progress)
 
 
 def _dots(
@@ -88,7 +88,7 @@ def _dots(
     best = best[score[best] > limit][:_MOST_DOTS]
     if not best.size:
         raise InsufficientDataError("no dot")
-    places = [centred(grey, peak.astype(float), pixel_mm) for peak in peaks[best]]
+    places = [bright_centre(grey, peak.astype(float), pixel_mm) for peak in peaks[best]]
     return np.array(places), score[best].astype(float)
 
 
@@ -102,14 +102,14 @@ def _along_lines(contrast: Float32Array, peaks: IntArray, pixel_mm: FloatArray) 
     sides = []
     for step in (away, -away):
         places = np.rint(peaks[:, None] + step).astype(int)
-        held = np.all((places >= 0) & (places < contrast.shape), axis=2)
-        column, row = np.moveaxis(np.where(held[..., None], places, 0), 2, 0)
-        sides.append(np.where(held, contrast[column, row], np.float32(0.0)))
+        inside = np.all((places >= 0) & (places < contrast.shape), axis=2)
+        column, row = np.moveaxis(np.where(inside[..., None], places, 0), 2, 0)
+        sides.append(np.where(inside, contrast[column, row], np.float32(0.0)))
     return np.asarray(np.minimum(*sides).max(axis=1, initial=0.0), dtype=np.float32)
 
 
-def centred(grey: Float32Array, pixel: FloatArray, pixel_mm: FloatArray) -> FloatArray:
-    """Move a place to the centre of what is bright around it, by mean shift.
+def bright_centre(grey: Float32Array, pixel: FloatArray, pixel_mm: FloatArray) -> FloatArray:
+    """Centre of what is bright around a place, by mean shift.
 
     Filters see the tail of ringing under a wire as part of it: 0.4 mm, where the centre is 0.15 mm too deep.
     """

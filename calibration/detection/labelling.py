@@ -21,7 +21,7 @@ from scipy.optimize import linear_sum_assignment
 from scipy.spatial.transform import RigidTransform
 
 from calibration.plane import Chain
-from calibration.points import Seen, affine_equations
+from calibration.points import Detections, affine_equations
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.wires import WirePhantom
@@ -47,7 +47,7 @@ _WIDTHS, _GAPS = (0.9, 1.1 * _STEEPEST), (0.85, 1.1 * _STEEPEST)
 """Distances in the image over the phantom's: of a layer's outer wires, and between layers."""
 
 
-def label_dots(dots: Seen, phantom: WirePhantom, pixel_mm: npt.ArrayLike) -> Seen:
+def label_dots(dots: Detections, phantom: WirePhantom, pixel_mm: npt.ArrayLike) -> Detections:
     """Assign dots to the wires of an N-wire phantom, each frame by itself.
 
     Parameters
@@ -57,7 +57,7 @@ def label_dots(dots: Seen, phantom: WirePhantom, pixel_mm: npt.ArrayLike) -> See
 
     Returns
     -------
-    Seen
+    Detections
         All wires of all N in each frame, or none. Where a phantom's symmetry leaves a choice, its first
         pattern is taken to be uppermost and its first wire on the side of the last column.
 
@@ -69,45 +69,47 @@ def label_dots(dots: Seen, phantom: WirePhantom, pixel_mm: npt.ArrayLike) -> See
     layers, size, score = _layers(phantom), np.asarray(pixel_mm, dtype=float), dots.score
     assert score is not None
     wires = np.concatenate([layer.wires for layer in layers])
-    found: dict[int, FloatArray] = {}
-    dropped = dict(dots.dropped)
+    pixels: dict[int, FloatArray] = {}
+    reasons = dict(dots.dropped)
     for frame in np.unique(dots.frame):
-        here = dots.frame == frame
-        seen_mm, strength = dots.pixels[here] * size, score[here]
+        in_frame = dots.frame == frame
+        dots_mm, strength = dots.pixels[in_frame] * size, score[in_frame]
         try:
-            triples = [_triples(seen_mm, layer, phantom) for layer in layers]
-            chosen = _combined(triples, seen_mm, strength, layers)
-            rms_mm = misfits_mm(seen_mm[chosen], wires, phantom)
+            triples = [_triples(dots_mm, layer, phantom) for layer in layers]
+            hypotheses = _combine(triples, dots_mm, strength, layers)
+            rms_mm = misfits_mm(dots_mm[hypotheses], wires, phantom)
             best = float(rms_mm.min())
             if best > _RESIDUAL_MM:
                 raise InsufficientDataError(
                     f"no dots fit the wires: the nearest miss by {best:.2f} mm RMS, {_RESIDUAL_MM} allowed"
                 )
-            chosen = chosen[rms_mm <= best + _LIKE_MM]
-            # Rounded, so that where the same dots fit either way round, the usual one is chosen: the first
+            hypotheses = hypotheses[rms_mm <= best + _LIKE_MM]
+            # Rounded, so that where the same dots fit either way round, the usual one counts: the first
             # wire on the side of the last columns, the first layer uppermost.
-            together = np.round(strength[chosen].sum(axis=1) / strength.max(), 6)
-            first, last = (seen_mm[chosen].reshape(len(chosen), -1, 3, 2)[:, k] for k in (0, -1))
+            total = np.round(strength[hypotheses].sum(axis=1) / strength.max(), 6)
+            first, last = (dots_mm[hypotheses].reshape(len(hypotheses), -1, 3, 2)[:, k] for k in (0, -1))
             usual = (first[:, 0, 0] >= first[:, 2, 0]) * 1
             usual += first[..., 1].mean(axis=1) <= last[..., 1].mean(axis=1)
-            found[int(frame)] = dots.pixels[here][chosen[np.lexsort((usual, together))[-1]]]
+            pixels[int(frame)] = dots.pixels[in_frame][hypotheses[np.lexsort((usual, total))[-1]]]
         except InsufficientDataError as error:
-            few = here.sum() < wires.size
-            dropped[int(frame)] = f"{error}" + (f" ({here.sum()} dots for {wires.size} wires)" if few else "")
-    return Seen(
-        frame=np.repeat(np.array(list(found), dtype=np.int64), wires.size),
-        pixels=np.concatenate([np.zeros((0, 2)), *found.values()]),
-        wire=np.tile(wires, len(found)),
-        dropped=dropped,
+            few = len(dots_mm) < wires.size
+            reasons[int(frame)] = f"{error}" + (
+                f" ({len(dots_mm)} dots for {wires.size} wires)" if few else ""
+            )
+    return Detections(
+        frame=np.repeat(np.array(list(pixels), dtype=np.int64), wires.size),
+        pixels=np.concatenate([np.zeros((0, 2)), *pixels.values()]),
+        wire=np.tile(wires, len(pixels)),
+        dropped=reasons,
     )
 
 
 def label_by_calibration(
-    dots: Seen,
+    dots: Detections,
     phantom: WirePhantom,
     chain: Chain,
     world_from_sensor: RigidTransform,
-) -> Seen:
+) -> Detections:
     """Assign to each wire the dot nearest to where a calibration predicts it.
 
     Parameters
@@ -119,30 +121,30 @@ def label_by_calibration(
 
     Returns
     -------
-    Seen
+    Detections
         The wires found in each frame.
     """
     image_from_phantom = (chain.target_from_world * world_from_sensor * chain.sensor_from_image).inv()
-    kept: list[tuple[int, int, int]] = []
-    dropped, score = dict(dots.dropped), dots.score
+    labels: list[tuple[int, int, int]] = []
+    reasons, score = dict(dots.dropped), dots.score
     assert score is not None
     for frame in np.unique(dots.frame):
-        here = np.flatnonzero(dots.frame == frame)
-        into = image_from_phantom[int(frame)]
-        place, along = into.apply(phantom.points_mm), into.rotation.apply(phantom.directions)
+        in_frame, pose = np.flatnonzero(dots.frame == frame), image_from_phantom[int(frame)]
+        place, along = pose.apply(phantom.points_mm), pose.rotation.apply(phantom.directions)
         # Where the image cuts each wire: far away, where it hardly does.
         steps = -place[:, 2] / np.where(along[:, 2] == 0, _TINY, along[:, 2])
         expected_mm = (place + steps[:, None] * along)[:, :2]
         # Each dot of one wire at most; a stronger dot may be farther away.
-        apart = np.linalg.norm((dots.pixels[here] * chain.pixel_mm)[:, None] - expected_mm, axis=2)
-        worth = np.where(apart < _GATE_MM, score[here, None] * np.exp(-2.0 * (apart / _GATE_MM) ** 2), 0.0)
+        dots_mm = dots.pixels[in_frame] * chain.pixel_mm
+        share = np.linalg.norm(dots_mm[:, None] - expected_mm, axis=2) / _GATE_MM
+        worth = np.where(share < 1.0, score[in_frame, None] * np.exp(-2.0 * share**2), 0.0)
         dot, wire = linear_sum_assignment(worth, maximize=True)
-        near = sorted((int(w), int(here[d])) for d, w in zip(dot, wire, strict=True) if worth[d, w] > 0)
-        kept += [(int(frame), number, w) for w, number in near]
+        near = sorted((int(w), int(in_frame[d])) for d, w in zip(dot, wire, strict=True) if worth[d, w] > 0)
+        labels += [(int(frame), number, w) for w, number in near]
         if not near:
-            dropped[int(frame)] = "no dot where the calibration expects a wire"
-    frames, index, wires = np.array(kept, dtype=np.int64).reshape(-1, 3).T
-    return Seen(frames, dots.pixels[index], wires, dropped)
+            reasons[int(frame)] = "no dot where the calibration expects a wire"
+    frames, index, wires = np.array(labels, dtype=np.int64).reshape(-1, 3).T
+    return Detections(frames, dots.pixels[index], wires, reasons)
 
 
 @dataclass(frozen=True)
@@ -152,7 +154,7 @@ class _Layer:
     wires: IntArray
     width_mm: float
     height_mm: float
-    turned: float
+    sign: float
 
 
 def _layers(phantom: WirePhantom) -> list[_Layer]:
@@ -164,8 +166,8 @@ def _layers(phantom: WirePhantom) -> list[_Layer]:
     across -= np.outer(across @ along, along)
     widths = np.linalg.norm(across, axis=1)
     axis = across[0] / widths[0]
-    heights, turned = (begins - begins[0]) @ np.cross(along, axis), np.sign(across @ axis)
-    return [_Layer(*one) for one in zip(shapes, widths, heights, turned, strict=True)]
+    heights, signs = (begins - begins[0]) @ np.cross(along, axis), np.sign(across @ axis)
+    return [_Layer(*values) for values in zip(shapes, widths, heights, signs, strict=True)]
 
 
 def _triples(dots_mm: FloatArray, layer: _Layer, phantom: WirePhantom) -> IntArray:
@@ -174,8 +176,8 @@ def _triples(dots_mm: FloatArray, layer: _Layer, phantom: WirePhantom) -> IntArr
     between = place[None] - place[:, None]
     length = np.abs(between)
     # Axes: first, last and middle dot.
-    seen = np.conj(between / np.where(length > 0, length, np.inf))[..., None] * between[:, None]
-    reach, off, ratio = seen.real, np.abs(seen.imag), length / layer.width_mm
+    relative = np.conj(between / np.where(length > 0, length, np.inf))[..., None] * between[:, None]
+    reach, off, ratio = relative.real, np.abs(relative.imag), length / layer.width_mm
     long = ((ratio > _WIDTHS[0]) & (ratio < _WIDTHS[1]))[..., None]
     inner, straight = (reach > _LEAST_MM) & (reach < length[..., None] - _LEAST_MM), off < _COLLINEAR_MM
     first, last, middle = np.nonzero(long & inner & straight)
@@ -198,32 +200,32 @@ def _off_by(ratio: FloatArray, limits: tuple[float, float]) -> str:
     return f"spacing {100 * abs(nearest - 1.0):.0f} % {side} than the wires'"
 
 
-def _combined(
+def _combine(
     triples: list[IntArray], dots_mm: FloatArray, score: FloatArray, layers: list[_Layer]
 ) -> IntArray:
     """Hypotheses: parallel triples at the layers' distances, shape (h, 3 layers)."""
-    chosen, place = triples[0], dots_mm @ [1.0, 1j]
+    hypotheses, place = triples[0], dots_mm @ [1.0, 1j]
     for layer, below in zip(layers[1:], triples[1:], strict=True):
-        ours, theirs = (place[one[:, 2]] - place[one[:, 0]] for one in (chosen, below))
-        away = place[below[:, [0, 2]]].mean(axis=1) - place[chosen[:, [0, 2]]].mean(axis=1)[:, None]
-        ours = np.conj(ours / np.abs(ours))[:, None]
-        cosine = np.clip((ours * theirs / np.abs(theirs)).real * layers[0].turned * layer.turned, -1.0, 1.0)
-        ratio = np.abs((ours * away).imag) / abs(layer.height_mm - layers[0].height_mm)
-        shared = (chosen[:, None, :, None] == below[None, :, None, :]).any(axis=(2, 3))
-        parallel = (cosine > _PARALLEL_COSINE) & ~shared
-        one, other = np.nonzero(parallel & (ratio > _GAPS[0]) & (ratio < _GAPS[1]))
-        if len(one) == 0:
+        upper, lower = (place[triple[:, 2]] - place[triple[:, 0]] for triple in (hypotheses, below))
+        away = place[below[:, [0, 2]]].mean(axis=1) - place[hypotheses[:, [0, 2]]].mean(axis=1)[:, None]
+        upper = np.conj(upper / np.abs(upper))[:, None]
+        cosine = np.clip((upper * lower / np.abs(lower)).real * layers[0].sign * layer.sign, -1.0, 1.0)
+        ratio = np.abs((upper * away).imag) / abs(layer.height_mm - layers[0].height_mm)
+        disjoint = (hypotheses[:, None, :, None] != below[None, :, None, :]).all(axis=(2, 3))
+        parallel = (cosine > _PARALLEL_COSINE) & disjoint
+        first, second = np.nonzero(parallel & (ratio > _GAPS[0]) & (ratio < _GAPS[1]))
+        if len(first) == 0:
             why = "the same row of dots would serve two layers"
             if parallel.any():
                 why = _off_by(ratio[parallel], _GAPS)
-            elif not shared.all():
-                turn, allowed = np.rad2deg(np.arccos([cosine[~shared].max(), _PARALLEL_COSINE]))
-                why = f"the nearest are turned by {turn:.0f} degrees, {allowed:.0f} allowed"
+            elif disjoint.any():
+                turn, limit = np.rad2deg(np.arccos([cosine[disjoint].max(), _PARALLEL_COSINE]))
+                why = f"the nearest are turned by {turn:.0f} degrees, {limit:.0f} allowed"
             raise InsufficientDataError(f"no parallel lines of dots at the layers' distances: {why}")
-        chosen = np.concatenate([chosen[one], below[other]], axis=1)
-        strongest = np.argsort(-score[chosen].sum(axis=1), kind="stable")
-        chosen = chosen[strongest[:_MOST_HYPOTHESES]]
-    return chosen
+        hypotheses = np.concatenate([hypotheses[first], below[second]], axis=1)
+        strongest = np.argsort(-score[hypotheses].sum(axis=1), kind="stable")
+        hypotheses = hypotheses[strongest[:_MOST_HYPOTHESES]]
+    return hypotheses
 
 
 def misfits_mm(dots_mm: FloatArray, wires: IntArray, phantom: WirePhantom) -> FloatArray:
@@ -241,10 +243,10 @@ def misfits_mm(dots_mm: FloatArray, wires: IntArray, phantom: WirePhantom) -> Fl
     -------
     ndarray, shape (b,)
     """
-    seen = dots_mm - dots_mm.mean(axis=1, keepdims=True)
+    places = dots_mm - dots_mm.mean(axis=1, keepdims=True)
     rows, offsets = phantom.equations(wires)
-    matrix = affine_equations(seen, np.broadcast_to(rows, (len(seen), *rows.shape)))
-    matrix, wanted = matrix.reshape(len(seen), -1, 9), offsets.ravel()
+    matrix = affine_equations(places, np.broadcast_to(rows, (len(places), *rows.shape)))
+    matrix, target = matrix.reshape(len(places), -1, 9), offsets.ravel()
     normal = np.swapaxes(matrix, 1, 2) @ matrix + _RIDGE_MM2 * np.eye(9)
-    image = np.linalg.solve(normal, (wanted @ matrix)[..., None])
-    return np.asarray(np.sqrt(np.mean(((matrix @ image)[..., 0] - wanted) ** 2, axis=1)))
+    image = np.linalg.solve(normal, (target @ matrix)[..., None])
+    return np.asarray(np.sqrt(np.mean(((matrix @ image)[..., 0] - target) ** 2, axis=1)))

@@ -22,12 +22,12 @@ from calibration.detection.region import (
     DENSELY,
     Columns,
     checked_pixel,
+    detect_in_frames,
     lay_columns,
-    seen_in_frames,
     spread,
     without_standing,
 )
-from calibration.points import Seen
+from calibration.points import Detections
 from calibration.settings import LineSettings, Place
 from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError
@@ -147,7 +147,7 @@ class LineFinder:
         if not (levels.size and 0 < np.ptp(levels) < np.inf):
             raise NoLineError("no line: the image is of one level all over, or its values are not finite")
         row_mm = float(self.pixel_mm[1])
-        tolerance, sigma, samples = s.tolerance_mm / row_mm, s.smoothing_mm / row_mm, columns.filled(samples)
+        tolerance, sigma, samples = s.tolerance_mm / row_mm, s.smoothing_mm / row_mm, columns.fill(samples)
         levels = gaussian_filter1d(samples, _FINE * sigma, truncate=_REACH, mode="nearest")
         slope = gaussian_filter1d(samples, sigma, order=1, truncate=_REACH, mode="nearest")
         slope[~inside] = 0.0
@@ -164,7 +164,7 @@ class LineFinder:
             thresholds = [part * float(np.median(score.max(axis=1))) for part in _PARTS]
         else:
             score, thresholds = np.where(peak, slope, np.float32(0.0)), [s.threshold * row_mm]
-        tried: list[EchoLine] = []
+        candidates: list[EchoLine] = []
         before = np.zeros(0, np.int64)
         for threshold in thresholds:
             above = score > threshold
@@ -173,29 +173,29 @@ class LineFinder:
                 continue  # neighbouring thresholds mostly find the same
             before = edge
             strength = score[np.arange(len(edge)), edge]
-            row = _placed(levels, slope, inside, edge, sigma, s.place)
+            row = _echo_rows(levels, slope, inside, edge, sigma, s.place)
             row[strength <= 0] = np.nan
             agree, possible, start, rise = consensus_line(
                 columns.column.astype(float), row, inside, tolerance
             )
             mean = float(strength[agree].mean()) if agree.any() else 0.0
             edges = np.stack([columns.column, row], axis=1)
-            tried.append(EchoLine(edges[agree], possible, start, rise, mean))
-        accepted = [line for line in tried if line.consensus >= self._needed(line)]
-        if not accepted:
-            best = max(tried, key=lambda line: line.consensus)
+            candidates.append(EchoLine(edges[agree], possible, start, rise, mean))
+        lines = [line for line in candidates if line.consensus >= self._least_consensus(line)]
+        if not lines:
+            best = max(candidates, key=lambda line: line.consensus)
             raise NoLineError(
                 f"no line: {best.consensus} of {best.possible} possible columns agree, "
-                f"{self._needed(best)} needed"
+                f"{self._least_consensus(best)} needed"
             )
         # The uppermost of those nearly as strong as the strongest, as most columns see it.
-        middle, least = columns.column.mean(), _WEAKER * max(line.strength for line in accepted)
-        strong = [line for line in accepted if line.strength >= least]
+        middle, least = columns.column.mean(), _WEAKER * max(line.strength for line in lines)
+        strong = [line for line in lines if line.strength >= least]
         depths = [line.start + line.slope * middle for line in strong]
         upper = [line for line, depth in zip(strong, depths, strict=True) if depth <= min(depths) + tolerance]
         return max(upper, key=lambda line: line.consensus)
 
-    def _needed(self, line: EchoLine) -> int:
+    def _least_consensus(self, line: EchoLine) -> int:
         """How many columns must agree on a line."""
         s = self.settings
         shares = s.consensus * line.possible, _LEAST_SHARE * len(self.columns.column)
@@ -208,7 +208,7 @@ def detect_lines(
     settings: LineSettings | None = None,
     region_px: npt.ArrayLike | None = None,
     progress: Callable[[int, int], None] | None = None,
-) -> Seen:
+) -> Detections:
     """Find the line of a plane's echo in every frame, read one at a time.
 
     Without a region, columns in which nothing ever changes are left out, and so is what stands still above
@@ -235,8 +235,8 @@ def detect_lines(
         line = finder.line(image)
         return line.points_px[None], np.array([line.strength])
 
-    seen = seen_in_frames(frames, find, progress)
-    return replace(seen, pixels=seen.pixels.reshape(-1, 2, 2))
+    detections = detect_in_frames(frames, find, progress)
+    return replace(detections, pixels=detections.pixels.reshape(-1, 2, 2))
 
 
 def consensus_line(
@@ -271,10 +271,10 @@ def consensus_line(
         agree = could & (np.abs(off) <= tolerance)
         return agree, could, np.where(agree, off**2, 0.0).sum(axis=-1)
 
-    there = np.flatnonzero(np.isfinite(row))
-    if there.size < 2:
+    points = np.flatnonzero(np.isfinite(row))
+    if points.size < 2:
         return np.zeros(row.size, bool), 0, 0.0, 0.0
-    j, k = there[np.stack(np.triu_indices(there.size, 1))]
+    j, k = points[np.stack(np.triu_indices(points.size, 1))]
     slopes = (row[k] - row[j]) / (column[k] - column[j])
     starts = row[j] - slopes * column[j]
     agree, _, squares = compare(starts, slopes)
@@ -292,7 +292,7 @@ def consensus_line(
     return agree, int(could.sum()), start, slope
 
 
-def _placed(
+def _echo_rows(
     levels: Float32Array, slope: Float32Array, inside: BoolArray, edge: IntArray, sigma: float, place: Place
 ) -> FloatArray:
     """Where on the echo behind each column's edge the line is put, rows; NaN without an echo."""
@@ -331,6 +331,6 @@ def _placed(
 def peak_between(values: Float32Array, column: IntArray, row: IntArray) -> FloatArray:
     """How far from a row its maximum lies, by the parabola through its neighbours; zero without one."""
     row = np.clip(row, 1, values.shape[1] - 2)
-    before, here, after = (values[column, row + step].astype(float) for step in (-1, 0, 1))
-    bend = before - 2.0 * here + after
+    before, middle, after = (values[column, row + step].astype(float) for step in (-1, 0, 1))
+    bend = before - 2.0 * middle + after
     return np.where(bend < 0.0, 0.5 * (before - after) / np.where(bend < 0.0, bend, -1.0), 0.0)

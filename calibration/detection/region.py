@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import distance_transform_edt, gaussian_filter1d
 
-from calibration.points import Seen
+from calibration.points import Detections
 from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, naming
 from speckle3d.core.geometry import require_finite
@@ -49,7 +49,7 @@ class Columns:
             distance_transform_edt(~self.inside, apart, return_distances=False, return_indices=True)[1]
         )
 
-    def filled(self, samples: Float32Array) -> Float32Array:
+    def fill(self, samples: Float32Array) -> Float32Array:
         """Samples, shape (n, r), with the nearest inside repeated beyond the region."""
         if self.inside.all():
             return samples
@@ -149,11 +149,11 @@ def finite_grey(image: npt.NDArray[Any]) -> Float32Array:
     return grey
 
 
-def seen_in_frames(
+def detect_in_frames(
     frames: Frames,
     find: Callable[[npt.NDArray[Any]], tuple[FloatArray, FloatArray]],
     progress: Callable[[int, int], None] | None = None,
-) -> Seen:
+) -> Detections:
     """Apply a detector to every frame, read one at a time; an error names the frame.
 
     Parameters
@@ -165,7 +165,7 @@ def seen_in_frames(
     progress : callable, optional
         Called with the number of frames done and their total.
     """
-    count, numbers, dropped = frames.shape[0], list[int](), dict[int, str]()
+    count, numbers, reasons = frames.shape[0], list[int](), dict[int, str]()
     detections = list[tuple[FloatArray, FloatArray]]()
     for index in range(count):
         with naming(f"frame {index}"):
@@ -173,8 +173,8 @@ def seen_in_frames(
                 detections.append(find(frames[index]))
                 numbers += [index] * len(detections[-1][1])
             except InsufficientDataError as error:
-                dropped[index] = str(error)
+                reasons[index] = str(error)
         if progress:
             progress(index + 1, count)
     pixels, scores = map(np.concatenate, zip(*detections, strict=True)) if detections else np.zeros((2, 0, 2))
-    return Seen(np.array(numbers, dtype=np.int64), pixels, None, dropped, scores)
+    return Detections(np.array(numbers, dtype=np.int64), pixels, None, reasons, scores)

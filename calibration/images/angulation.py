@@ -23,16 +23,16 @@ from speckle3d.core.geometry import skew
 PARAMETERS = ("tilt", "yaw", "roll", "x", "y", "z")
 """Small turns about the image's x, y and z, and shifts along them."""
 
-REFUSED = 0.15
+LEAST = 0.15
 """Disagreement in mm of a mm of error below which sweeps are refused: what a tracker displaces one sweep
 against the other by, 0.15 mm, would be an error of a millimetre. Along the beam, fans of 21 degrees; across,
 sweeps that cross by 9."""
 
 WEAK = 0.2
-"""As `REFUSED`: below, the verdict says "weak"; along the beam, fans of 28 degrees; across, 11 degrees."""
+"""As `LEAST`: below, the verdict says "weak"; along the beam, fans of 28 degrees; across, 11 degrees."""
 
 _AMPLE = 0.3
-"""As `REFUSED`: above, advice does not ask for more."""
+"""As `LEAST`: above, advice does not ask for more."""
 
 _FRAMES = 12
 """Images whose beams are compared."""
@@ -54,8 +54,8 @@ class Angulation:
     fan_deg: tuple[float, float]
 
     @property
-    def shown(self) -> dict[str, float]:
-        """Disagreement in mm of a mm of error across the image, and along the beam."""
+    def sensitivity(self) -> dict[str, float]:
+        """Disagreement of the sweeps, mm per mm of error, of errors across the image and along the beam."""
         across = 2.0 * np.sin(np.deg2rad(self.crossing_deg) / 2.0)
         # Of beams spread evenly over an angle the root mean square deviation is the angle over root twelve.
         along = np.linalg.norm(np.deg2rad(self.fan_deg)) / np.sqrt(12.0)
@@ -68,16 +68,16 @@ class Angulation:
             "x": "cross the sweeps: turn the probe by about 90 degrees between them",
             "y": "fan in each: tilt the probe to and fro by 40 degrees within each sweep",
         }
-        return "; ".join(motions[name] for name, share in self.shown.items() if share < _AMPLE)
+        return "; ".join(motions[name] for name, share in self.sensitivity.items() if share < _AMPLE)
 
     @property
     def verdict(self) -> str:
         """One line: sufficient, weak or insufficient, with the weakest parameter and what to do."""
-        name, share = min(self.shown.items(), key=lambda one: one[1])
+        name, share = min(self.sensitivity.items(), key=lambda item: item[1])
         if share >= WEAK:
             return "sufficient"
-        kind = "insufficient" if share < REFUSED else "weak"
-        return f"{kind}: an error in {name} shows by {share:.2f} mm per mm; {self.advice}"
+        kind = "insufficient" if share < LEAST else "weak"
+        return f"{kind}: an error of 1 mm in {name} shifts the sweeps by {share:.2f} mm only; {self.advice}"
 
     def require(self, part: float = 1.0) -> None:
         """Refuse sweeps that cannot determine every parameter.
@@ -92,7 +92,7 @@ class Angulation:
         InsufficientDataError
             Naming the parameter that cannot be found.
         """
-        if min(self.shown.values()) < part * REFUSED:
+        if min(self.sensitivity.values()) < part * LEAST:
             raise InsufficientDataError(
                 f"expected two angulated sweeps that cross, got {self.crossing_deg:.0f} degrees between them "
                 f"and fans of {self.fan_deg[0]:.0f} and {self.fan_deg[1]:.0f} degrees: {self.verdict}"
@@ -130,8 +130,8 @@ def angulation(
         for line in across
     ]
     cosine = abs(float(flat[0] @ flat[1])) / float(np.prod([np.linalg.norm(line) for line in flat]))
-    some = [beam[np.linspace(0, len(beam) - 1, _FRAMES).round().astype(int)] for beam in beams]
-    fans = [float(np.rad2deg(np.arccos(np.clip((beam @ beam.T).min(), -1.0, 1.0)))) for beam in some]
+    few = [beam[np.linspace(0, len(beam) - 1, _FRAMES).round().astype(int)] for beam in beams]
+    fans = [float(np.rad2deg(np.arccos(np.clip((beam @ beam.T).min(), -1.0, 1.0)))) for beam in few]
     return Angulation(float(np.rad2deg(np.arccos(min(cosine, 1.0)))), (fans[0], fans[1]))
 
 

@@ -14,9 +14,16 @@ from scipy.linalg import eigh
 from scipy.spatial.transform import RigidTransform
 
 from calibration.images.angulation import PARAMETERS, Angulation, point_motion
-from calibration.images.fit import Refined, refine
-from calibration.images.search import apart_mm
-from calibration.images.similarity import Comparison, CrossingSweeps, Level, Similarity, about_pivot, stepped
+from calibration.images.fit import Fit, refine
+from calibration.images.search import distance_mm
+from calibration.images.similarity import (
+    Comparison,
+    CrossingSweeps,
+    Level,
+    Similarity,
+    about_pivot,
+    step_pose,
+)
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.geometry import skew
@@ -45,7 +52,7 @@ DEEP_MM = 0.1
 between its parts show it, in units of the images' size: a thick beam displays echoes from beside the image
 plane too deep. The root mean square over six simulated pairs of sweeps."""
 
-RESTARTED = Level(1.0, images=8, overlap=0.25)
+RESTART = Level(1.0, images=8, overlap=0.25)
 """Resolution of the fits started again: at finer ones speckle holds them halfway for tens of steps."""
 _RESTART_STEPS = 14
 _BESIDE_DEG, _BESIDE_MM = 2.0, 1.5
@@ -69,23 +76,23 @@ RIVAL_MM, CLEAR_LEAD = 3.0, 0.02
 the lead in correlation that an answer must have: twice what varies between answers from different starts."""
 
 
-def curvature_of(refined: Refined, steps: FloatArray) -> tuple[FloatArray, FloatArray]:
+def curvature_of(fit: Fit, steps: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Curvature of each patch's weighted correlation, (p, 6, 6), and of all, (6, 6), over steps either way.
 
     By differences of the exact slopes; Gauss-Newton's matrix, in which the slopes of speckle count in full,
     is several times too stiff.
     """
-    pivot_mm, columns = refined.comparison.pivot_mm, []
+    pivot_mm, columns = fit.comparison.pivot_mm, []
     for parameter, step in enumerate(np.diag(steps)):
-        places = (stepped(refined.sensor_from_image, sign * step, pivot_mm) for sign in (-1.0, 1.0))
-        seen = [refined.comparison.at(place, True) for place in places]
-        columns.append(_fallen(refined, seen) / (2.0 * steps[parameter]))
+        places = (step_pose(fit.sensor_from_image, sign * step, pivot_mm) for sign in (-1.0, 1.0))
+        sides = [fit.comparison.at(place, True) for place in places]
+        columns.append(_slope_difference(fit, sides) / (2.0 * steps[parameter]))
     bends = np.stack(columns, axis=2)
-    return bends, positive(bends.sum(axis=0), refined.system[0])
+    return bends, positive(bends.sum(axis=0), fit.system[0])
 
 
-def claimed(
-    refined: Refined, crossing: CrossingSweeps, tracker: tuple[float, float]
+def covariance_of(
+    fit: Fit, crossing: CrossingSweeps, tracker: tuple[float, float]
 ) -> tuple[FloatArray, FloatArray]:
     """Covariance of an answer's turns and displacements at the image's origin, (6, 6).
 
@@ -111,25 +118,23 @@ def claimed(
     .. [1] A. C. Cameron and D. L. Miller, "A practitioner's guide to cluster-robust inference", Journal of
        Human Resources, 2015 (the jackknife over clusters).
     """
-    unit, base = crossing.unit, about_pivot(refined.comparison.pivot_mm)
+    unit, base = crossing.unit, about_pivot(fit.comparison.pivot_mm)
     # How far an error of one moves sweeps at right angles apart: a shift across or out of the image, root 2.
-    stiff, wide = np.diag(refined.system[0]), unit * WIDE_MM
+    stiff, wide = np.diag(fit.system[0]), unit * WIDE_MM
     shows = 2.0 * np.sqrt(stiff / (stiff[3] + stiff[5]))
-    bends, curvature = curvature_of(refined, np.minimum(wide / np.maximum(shows, 1e-6), _FARTHEST))
-    slopes = refined.weight[:, None] * refined.similarity.gradient
-    cells = np.floor(refined.places_mm / (BLOCK_MM * unit))
+    bends, curvature = curvature_of(fit, np.minimum(wide / np.maximum(shows, 1e-6), _FARTHEST))
+    slopes = fit.weight[:, None] * fit.similarity.gradient
+    cells = np.floor(fit.places_mm / (BLOCK_MM * unit))
     blocks = np.unique(cells, axis=0, return_inverse=True)[1].ravel()
-    left_out = _left_out(slopes, bends, blocks, curvature)
-    moved = np.linalg.inv(curvature)
-    variance = np.repeat(np.square(tracker), 3)
-    wander = moved @ _wandering(refined, _pulls(refined, wide), variance) @ moved.T
-    covariance = base @ (left_out + wander) @ base.T
+    inverse, variance = np.linalg.inv(curvature), np.repeat(np.square(tracker), 3)
+    wander = inverse @ _wandering(fit, _pulls(fit, wide), variance) @ inverse.T
+    covariance = base @ (_jackknife(slopes, bends, blocks, curvature) + wander) @ base.T
     covariance[4, 4] += (DEEP_MM * unit) ** 2
-    covariance += _scatter(refined, crossing)
+    covariance += _scatter(fit, crossing)
     return np.asarray(covariance), curvature
 
 
-def require_known(covariance: FloatArray, angulation: Angulation, centre_mm: FloatArray) -> None:
+def require_accuracy(covariance: FloatArray, angulation: Angulation, centre_mm: FloatArray) -> None:
     """Refuse an answer whose claimed errors are too large to be of use.
 
     Raises
@@ -137,8 +142,8 @@ def require_known(covariance: FloatArray, angulation: Angulation, centre_mm: Flo
     InsufficientDataError
         With what would help: other motion, or other tissue.
     """
-    moved = point_motion(centre_mm[None])[0]
-    variances = np.concatenate([np.diag(covariance)[:3], np.diag(moved @ covariance @ moved.T)])
+    motion = point_motion(centre_mm[None])[0]
+    variances = np.concatenate([np.diag(covariance)[:3], np.diag(motion @ covariance @ motion.T)])
     errors = np.sqrt(variances) * np.repeat([np.rad2deg(1.0), 1.0], 3)
     worst = int(np.argmax(errors / MOST))
     if errors[worst] <= MOST[worst]:
@@ -161,53 +166,53 @@ def require_one_answer(comparison: Comparison, answer: RigidTransform, rivals: l
     """
     score = comparison.at(answer).score
     for rival in rivals:
-        apart, other = apart_mm(rival, answer, comparison.pivot_mm), comparison.at(rival).score
-        if apart >= RIVAL_MM and other >= max(LEAST_SIMILARITY, score - CLEAR_LEAD):
+        away, rival_score = distance_mm(rival, answer, comparison.pivot_mm), comparison.at(rival).score
+        if away >= RIVAL_MM and rival_score >= max(LEAST_SIMILARITY, score - CLEAR_LEAD):
             raise InsufficientDataError(
-                f"expected one mounting that fits the sweeps best, got another {apart:.0f} mm from it that "
-                f"fits as well (correlation {other:.3f} and {score:.3f}): tissue with more structure, or a "
-                "better start with a smaller --capture-mm, would tell them apart"
+                f"expected one mounting that fits the sweeps best, got another {away:.0f} mm from it that "
+                f"fits as well (correlation {rival_score:.3f} and {score:.3f}): tissue with more structure, "
+                "or a better start with a smaller --capture-mm, would tell them apart"
             )
 
 
-def _scatter(refined: Refined, crossing: CrossingSweeps) -> FloatArray:
+def _scatter(fit: Fit, crossing: CrossingSweeps) -> FloatArray:
     """Mean square of how far fits that start beside the answer end from one that starts at it, shape (6, 6).
 
     An answer sits on a bump of speckle, and others may be near: where fits end elsewhere, it is in doubt.
     """
-    comparison = crossing.level(RESTARTED, refined.sensor_from_image)
+    comparison = crossing.level(RESTART, fit.sensor_from_image)
     beside = np.repeat([np.deg2rad(_BESIDE_DEG), _BESIDE_MM * crossing.unit], 3)
     ends = []
     for side in np.concatenate([np.zeros((1, 6)), _SIDES, -_SIDES]):
-        start = stepped(refined.sensor_from_image, side * beside, comparison.pivot_mm)
+        start = step_pose(fit.sensor_from_image, side * beside, comparison.pivot_mm)
         ends.append(refine(comparison, start, _RESTART_STEPS).sensor_from_image)
-    away = [ends[0].inv() * end for end in ends[1:]]
-    moves = np.array([np.append(one.rotation.as_rotvec(), one.translation) for one in away])
+    steps = [ends[0].inv() * end for end in ends[1:]]
+    moves = np.array([np.append(step.rotation.as_rotvec(), step.translation) for step in steps])
     return np.asarray(moves.T @ moves / (len(moves) - 1))
 
 
-def _pulls(refined: Refined, step_mm: float) -> FloatArray:
+def _pulls(fit: Fit, step_mm: float) -> FloatArray:
     """How each patch's slopes change as the second sweep is displaced along the world's axes, (p, 6, 3)."""
-    first, second = refined.comparison.stacks
+    first, second = fit.comparison.stacks
     columns = []
     for axis in np.eye(3):
-        seen = []
+        sides = []
         for sign in (-1.0, 1.0):
             world = RigidTransform.from_translation(sign * step_mm * axis) * second.world_from_sensor
-            moved = replace(refined.comparison, stacks=(first, replace(second, world_from_sensor=world)))
-            seen.append(moved.at(refined.sensor_from_image, True))
-        columns.append(_fallen(refined, seen) / (2.0 * step_mm))
+            stacks = first, replace(second, world_from_sensor=world)
+            sides.append(replace(fit.comparison, stacks=stacks).at(fit.sensor_from_image, True))
+        columns.append(_slope_difference(fit, sides) / (2.0 * step_mm))
     return np.stack(columns, axis=2)
 
 
-def _fallen(refined: Refined, seen: list[Similarity]) -> FloatArray:
+def _slope_difference(fit: Fit, sides: list[Similarity]) -> FloatArray:
     """Difference of the weighted slopes at two places, of patches with support throughout; zero of others."""
-    there = refined.similarity.valid & seen[0].valid & seen[1].valid
-    fallen = refined.weight[:, None] * (seen[0].gradient - seen[1].gradient)
-    return np.where(there[:, None], fallen, 0.0)
+    valid = fit.similarity.valid & sides[0].valid & sides[1].valid
+    difference = fit.weight[:, None] * (sides[0].gradient - sides[1].gradient)
+    return np.where(valid[:, None], difference, 0.0)
 
 
-def _wandering(refined: Refined, pulls: FloatArray, variance: FloatArray) -> FloatArray:
+def _wandering(fit: Fit, pulls: FloatArray, variance: FloatArray) -> FloatArray:
     """Covariance of the slope from an error of each sweep's poses that wanders over the sweep's length.
 
     An image's error counts where the image is compared, and as much again where it is cut.
@@ -218,22 +223,22 @@ def _wandering(refined: Refined, pulls: FloatArray, variance: FloatArray) -> Flo
         Of displacements (mm^2) and turns (rad^2) of one sweep against the other about the tissue.
     """
     share = np.linalg.norm(pulls, axis=(1, 2))
-    arms = refined.places_mm - share @ refined.places_mm / max(float(share.sum()), 1e-300)
-    each = 2.0 * np.concatenate([pulls, pulls @ -skew(arms)], axis=2)
-    found = np.zeros((pulls.shape[1],) * 2)
-    comparison = refined.comparison
-    parts = np.split(each, [len(comparison.patches[0].where)])
+    arms = fit.places_mm - share @ fit.places_mm / max(float(share.sum()), 1e-300)
+    effects = 2.0 * np.concatenate([pulls, pulls @ -skew(arms)], axis=2)
+    covariance = np.zeros((pulls.shape[1],) * 2)
+    comparison = fit.comparison
+    parts = np.split(effects, [len(comparison.patches[0].where)])
     for stack, patches, part in zip(comparison.stacks, comparison.patches, parts, strict=True):
-        sums = np.zeros((len(stack), *each.shape[1:]))
+        sums = np.zeros((len(stack), *effects.shape[1:]))
         np.add.at(sums, patches.where[:, 0], part)
         lag = np.arange(len(stack)) / (WANDERS * len(stack))
         alike = np.exp(-np.abs(lag[:, None] - lag))
         # Half of the variance is this sweep's.
-        found += np.einsum("iak,ij,jbk,k->ab", sums, alike, sums, 0.5 * variance, optimize=True)
-    return found
+        covariance += np.einsum("iak,ij,jbk,k->ab", sums, alike, sums, 0.5 * variance, optimize=True)
+    return covariance
 
 
-def _left_out(slopes: FloatArray, bends: FloatArray, cluster: IntArray, curvature: FloatArray) -> FloatArray:
+def _jackknife(slopes: FloatArray, bends: FloatArray, cluster: IntArray, curvature: FloatArray) -> FloatArray:
     """Jackknife over clusters: covariance by what the answer moves by when each is left out."""
     count = int(cluster.max()) + 1
     if count < 2:
@@ -243,16 +248,16 @@ def _left_out(slopes: FloatArray, bends: FloatArray, cluster: IntArray, curvatur
     slope, bend = np.zeros((count, slopes.shape[1])), np.zeros((count, *curvature.shape))
     np.add.at(slope, cluster, slopes)
     np.add.at(bend, cluster, bends)
-    # The rest of the tissue counts at least a fifth of the whole.
-    rests = (positive(curvature - b, curvature, 0.2) for b in bend)
-    moves = np.array([np.linalg.solve(rest, s) for rest, s in zip(rests, slope, strict=True)])
+    # What remains of the tissue counts at least a fifth of the whole.
+    remainders = (positive(curvature - b, curvature, 0.2) for b in bend)
+    moves = np.array([np.linalg.solve(r, s) for r, s in zip(remainders, slope, strict=True)])
     moves -= moves.mean(axis=0)
     return np.asarray((count - 1.0) / count * moves.T @ moves)
 
 
-def positive(found: FloatArray, normal: FloatArray, least: float = LEAST_CURVATURE) -> FloatArray:
+def positive(matrix: FloatArray, normal: FloatArray, least: float = LEAST_CURVATURE) -> FloatArray:
     """Symmetrise, and raise to at least a share of a positive matrix in every direction."""
     firm = normal + 1e-9 * np.trace(normal) * np.eye(len(normal))
-    part, axes = eigh((found + found.T) / 2.0, firm)
+    part, axes = eigh((matrix + matrix.T) / 2.0, firm)
     back = firm @ axes
     return np.asarray((back * np.maximum(part, least)) @ back.T)

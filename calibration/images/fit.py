@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from calibration.images.similarity import Comparison, Similarity, stepped
+from calibration.images.similarity import Comparison, Similarity, step_pose
 from speckle3d.core.arrays import FloatArray
 
 ROBUST = 0.5
@@ -28,7 +28,7 @@ CLOSE_MM = 2e-3
 
 
 @dataclass(frozen=True)
-class Refined:
+class Fit:
     """Result of `refine`.
 
     Attributes
@@ -59,29 +59,29 @@ class Refined:
         return normal, self.weight @ self.similarity.gradient
 
 
-def refine(comparison: Comparison, start: RigidTransform, max_steps: int = MAX_STEPS) -> Refined:
+def refine(comparison: Comparison, start: RigidTransform, max_steps: int = MAX_STEPS) -> Fit:
     """Levenberg-Marquardt steps until they are too small to matter."""
 
-    def look(pose: RigidTransform) -> Refined:
-        seen = comparison.at(pose, True)
-        return Refined(pose, seen, weights(seen), comparison)
+    def evaluate(pose: RigidTransform) -> Fit:
+        similarity = comparison.at(pose, True)
+        return Fit(pose, similarity, weights(similarity), comparison)
 
-    now, damping = look(start), 1e-2
+    best, damping = evaluate(start), 1e-2
     for _ in range(max_steps - 1):
-        if now.similarity.valid.sum() < 3 or damping > 1e6:
+        if best.similarity.valid.sum() < 3 or damping > 1e6:
             break
-        matrix, slope = now.system
+        matrix, slope = best.system
         lift = damping * np.diag(matrix) + 1e-9 * np.trace(matrix)
         step = np.asarray(np.linalg.solve(matrix + np.diag(lift), slope), dtype=np.float64)
         size = float(np.abs(step * LEVERS_MM).max())
-        trial = look(stepped(now.sensor_from_image, step, comparison.pivot_mm))
-        if better(now.similarity, trial.similarity, now.weight):
-            now, damping = trial, max(0.2 * damping, 1e-5)
+        trial = evaluate(step_pose(best.sensor_from_image, step, comparison.pivot_mm))
+        if is_better(trial.similarity, best.similarity, best.weight):
+            best, damping = trial, max(0.2 * damping, 1e-5)
         else:
             damping *= 8.0
         if size < CLOSE_MM:
-            return replace(now, converged=True)
-    return now
+            return replace(best, converged=True)
+    return best
 
 
 def weights(similarity: Similarity) -> FloatArray:
@@ -96,8 +96,8 @@ def weights(similarity: Similarity) -> FloatArray:
     return np.asarray(np.where(valid, structure * (ROBUST / (ROBUST + unlike)) ** 2, 0.0))
 
 
-def better(here: Similarity, there: Similarity, weight: FloatArray) -> bool:
+def is_better(trial: Similarity, best: Similarity, weight: FloatArray) -> bool:
     """Whether patches supported at both places correlate better; others would reward losing bad patches."""
-    both = here.valid & there.valid
-    gain = weight[both] @ (there.alike[both] - here.alike[both])
-    return bool(gain > 0 and both.sum() >= 0.5 * here.valid.sum())
+    valid = best.valid & trial.valid
+    gain = weight[valid] @ (trial.alike[valid] - best.alike[valid])
+    return bool(gain > 0 and valid.sum() >= 0.5 * best.valid.sum())

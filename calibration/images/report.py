@@ -30,10 +30,10 @@ _REACH_MM = 1.5
 
 def calibration_from_images(result: ImageCalibration, sweeps: tuple[Recording, Recording]) -> Calibration:
     """Turn an answer into a `Calibration`; the second sweep's frames are numbered after the first's."""
-    counts = [len(each.frame_time_s) for each in sweeps]
+    counts = [len(sweep.frame_time_s) for sweep in sweeps]
     first, second = result.sweeps.frames
     pose, numbers = result.sensor_from_image, (*first.tolist(), *(counts[0] + second).tolist())
-    uncovered = np.setdiff1d(np.arange(sum(counts)), numbers)
+    unread = np.setdiff1d(np.arange(sum(counts)), numbers)
     return Calibration(
         method="images",
         sensor="tracker",
@@ -45,9 +45,7 @@ def calibration_from_images(result: ImageCalibration, sweeps: tuple[Recording, R
         rms=1.0 - result.after,
         rms_unit="",
         condition_number=result.condition_number,
-        frames=FramesUsed(
-            sum(counts), numbers, dict.fromkeys(uncovered.tolist(), "no reading of the sensor")
-        ),
+        frames=FramesUsed(sum(counts), numbers, dict.fromkeys(unread.tolist(), "no reading of the sensor")),
         time_offset_s=sweeps[0].time_offset_s,
         verdict=_verdict(result),
     )
@@ -62,9 +60,9 @@ def notes_of(result: ImageCalibration) -> list[str]:
         f"correlation of patches with the other sweep: {before} before, {result.after:.3f} after",
         f"image centre known to {centre[0]:.2f}, {centre[1]:.2f} and {centre[2]:.2f} mm across, along the "
         "beam and out of plane",
-        f"sweeps at {angles.crossing_deg:.0f} degrees, fans of {angles.fan_deg[0]:.0f} and "
-        f"{angles.fan_deg[1]:.0f}",
-        "what both sweeps have wrong alike, as pixel sizes or a clock offset, shows in none of these",
+        f"the sweeps cross at {angles.crossing_deg:.0f} degrees and fan by {angles.fan_deg[0]:.0f} and "
+        f"{angles.fan_deg[1]:.0f} degrees",
+        "errors that both sweeps share, of the pixel size or the clock, show in none of these numbers",
         f"claimed errors allow for a tracker that displaces one sweep against the other by "
         f"{settings.tracker_mm:g} mm and {settings.tracker_deg:g} degrees",
     ]
@@ -75,23 +73,22 @@ def figure_of(result: ImageCalibration, sweeps: tuple[Recording, Recording]) -> 
     figure = Figure(figsize=(12.0, 8.0), layout="constrained")
     FigureCanvasAgg(figure)
     panels = figure.subplots(2, 3)
-    for k, (one, other) in enumerate((sweeps, sweeps[::-1])):
-        frames = result.sweeps.frames[k]
-        _draw_images(panels[k], result, one, other, int(frames[len(frames) // 2]))
+    for row, frames, pair in zip(panels, result.sweeps.frames, (sweeps, sweeps[::-1]), strict=True):
+        _draw_images(row, result, *pair, int(frames[len(frames) // 2]))
     figure.suptitle(f"verdict: {_verdict(result)}", fontsize=10)
     return figure
 
 
 def _draw_images(
-    row: Sequence[Axes], result: ImageCalibration, shown: Recording, other: Recording, frame: int
+    row: Sequence[Axes], result: ImageCalibration, sweep: Recording, crossing: Recording, frame: int
 ) -> None:
     """An image, and what the other sweep shows in its place at the start and at the answer."""
-    own, grid = np.asarray(shown.images[frame]).T, shown.grid
-    grey = own[np.isfinite(own)]
+    image, grid = np.asarray(sweep.images[frame]).T, sweep.grid
+    grey = image[np.isfinite(image)]
     low, high = np.percentile(grey, [2.0, 99.5]) if grey.size else (0.0, 1.0)
     extent = (0.0, grid.width_mm, grid.depth_mm - grid.first_sample_depth_mm, 0.0)
-    frames = other.covered()
-    sensors, sensor = other.world_from_sensor(frames), shown.world_from_sensor(np.array([frame]))[0]
+    frames = crossing.covered()
+    sensors, sensor = crossing.world_from_sensor(frames), sweep.world_from_sensor(np.array([frame]))[0]
     cuts = []
     for pose in (result.start, result.sensor_from_image):
         poses = sensors * pose
@@ -99,12 +96,12 @@ def _draw_images(
         steps = np.linalg.norm(np.diff(poses.apply([0.0, 40.0, 0.0]), axis=0), axis=1)
         reach = max(_REACH_MM, 1.5 * float(np.percentile(steps, 98)))
         plane = image_plane(sensor * pose, grid, PIXEL_MM)
-        cuts += reslice_at(ChosenImages(other.images, frames), other.grid, [(poses, plane)], reach)
+        cuts += reslice_at(ChosenImages(crossing.images, frames), crossing.grid, [(poses, plane)], reach)
     beside = (f"the other sweep there, {when} (blue-grey: no frame)" for when in ("before", "after"))
-    titles = [f"{shown.name}, frame {frame}", *beside]
-    for axes, title, image in zip(row, titles, (own, *cuts), strict=True):
+    titles = [f"{sweep.name}, frame {frame}", *beside]
+    for axes, title, picture in zip(row, titles, (image, *cuts), strict=True):
         axes.set_facecolor(_UNSEEN)
-        axes.imshow(image, cmap="gray", vmin=low, vmax=high, extent=extent)
+        axes.imshow(picture, cmap="gray", vmin=low, vmax=high, extent=extent)
         axes.set_title(title, fontsize=8)
         axes.set(xlabel="lateral / mm", ylabel="depth / mm")
 

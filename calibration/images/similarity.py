@@ -33,7 +33,7 @@ FEWEST_PATCHES = 0.1
 """Part of the patches that must have support for the score to mean anything."""
 
 
-def stepped(sensor_from_image: RigidTransform, step: FloatArray, pivot_mm: FloatArray) -> RigidTransform:
+def step_pose(sensor_from_image: RigidTransform, step: FloatArray, pivot_mm: FloatArray) -> RigidTransform:
     """Turn about a point of the image and displace it, in the image's own frame."""
     # As one product of matrices: transforms check themselves, which takes as long as a small comparison.
     matrix = np.eye(4)
@@ -166,13 +166,13 @@ def spread_patches(
         starts.append(np.unique(np.linspace(0, last, count).round()).astype(np.int64))
         within.append(starts[-1][:, None] + stride * np.arange(sides[-1]))
     across, down = within
-    kept = []
+    corners = []
     for image in images:
-        there = np.isfinite(stack.images[image])
-        share = there[across[:, :, None, None], down[None, None]].mean(axis=(1, 3))
+        valid = np.isfinite(stack.images[image])
+        share = valid[across[:, :, None, None], down[None, None]].mean(axis=(1, 3))
         a, b = np.nonzero(share > LEAST_SHARE)
-        kept.append(np.column_stack([np.full(len(a), image), starts[0][a], starts[1][b]]))
-    return PatchGrid(np.concatenate(kept).astype(np.int64).reshape(-1, 3), (sides[0], sides[1]), stride)
+        corners.append(np.column_stack([np.full(len(a), image), starts[0][a], starts[1][b]]))
+    return PatchGrid(np.concatenate(corners).astype(np.int64).reshape(-1, 3), (sides[0], sides[1]), stride)
 
 
 @dataclass(frozen=True)
@@ -219,7 +219,7 @@ class CrossingSweeps:
     frames: tuple[IntArray, IntArray]
     pixel_mm: FloatArray
     unit: float
-    _blurred: dict[tuple[int, float, float], Stack] = field(default_factory=dict, repr=False, compare=False)
+    _cache: dict[tuple[int, float, float], Stack] = field(default_factory=dict, repr=False, compare=False)
 
     @property
     def centre_mm(self) -> FloatArray:
@@ -231,10 +231,10 @@ class CrossingSweeps:
         sigma, stacks = level.sigma_mm * self.unit, list[Stack]()
         for way, stack in enumerate(self.stacks):
             key, spacing = (way, sigma, level.least_weight), stack.spacing_mm(sensor_from_image)
-            if key not in self._blurred:
-                self._blurred[key] = stack.blurred(sigma, level.least_weight)
-            apart, width = max(0.75 * sigma, spacing), max(0.7 * sigma, 0.5 * spacing)
-            stacks.append(self._blurred[key].thinned(sensor_from_image, apart, width))
+            if key not in self._cache:
+                self._cache[key] = stack.blur(sigma, level.least_weight)
+            step, width = max(0.75 * sigma, spacing), max(0.7 * sigma, 0.5 * spacing)
+            stacks.append(self._cache[key].resample(sensor_from_image, step, width))
         first, second = (
             spread_patches(stack, evenly(len(stack), level.images), sigma, level.side, level.overlap)
             for stack in stacks
@@ -257,24 +257,24 @@ def prepare(first: Recording, second: Recording, progress: Progress | None = Non
         If a sweep has too few frames with readings, or its images never change.
     """
     grid = first.grid
-    ours, theirs = (
-        (one.grid.vector_pitch_mm, one.grid.sample_spacing_mm, one.grid.first_sample_depth_mm)
-        for one in (first, second)
+    pixels, second_pixels = (
+        (sweep.grid.vector_pitch_mm, sweep.grid.sample_spacing_mm, sweep.grid.first_sample_depth_mm)
+        for sweep in (first, second)
     )
-    if not np.allclose(ours, theirs, rtol=1e-3, atol=1e-6):
+    if not np.allclose(pixels, second_pixels, rtol=1e-3, atol=1e-6):
         raise MismatchError(
             f"{second.name}: expected the pixels of {first.name}, {{:g}} x {{:g}} mm from {{:g}} mm, got "
-            "{:g} x {:g} mm from {:g} mm".format(*ours, *theirs)
+            "{:g} x {:g} mm from {:g} mm".format(*pixels, *second_pixels)
         )
     extent = float(np.sqrt(max(grid.width_mm, 1.0) * (grid.depth_mm - grid.first_sample_depth_mm)))
     unit = float(np.clip(extent / USUAL_EXTENT_MM, 0.5, 4.0))
-    (one, numbers), (other, more) = (
+    (stack, frames), (second_stack, second_frames) = (
         read_stack(sweep, BASE_PIXEL_MM * unit, progress) for sweep in (first, second)
     )
-    return CrossingSweeps((one, other), (numbers, more), first.pixel_mm, unit)
+    return CrossingSweeps((stack, second_stack), (frames, second_frames), first.pixel_mm, unit)
 
 
-def evenly(count: int, wanted: int) -> IntArray:
-    """Numbers of `wanted` images spread evenly over `count`, without the two at the ends."""
-    spread = np.linspace(0.5, count - 1.5, min(wanted, count)).round()
+def evenly(count: int, number: int) -> IntArray:
+    """Indices of `number` images spread evenly over `count`, without the two at the ends."""
+    spread = np.linspace(0.5, count - 1.5, min(number, count)).round()
     return np.unique(np.clip(spread, 0, count - 1).astype(np.int64))

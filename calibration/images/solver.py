@@ -19,12 +19,12 @@ from scipy.spatial.transform import RigidTransform
 from calibration.images.angulation import Angulation, angulation, point_motion
 from calibration.images.errors import (
     LEAST_SIMILARITY,
-    claimed,
-    require_known,
+    covariance_of,
+    require_accuracy,
     require_one_answer,
 )
 from calibration.images.fit import refine
-from calibration.images.search import DECIDED, search
+from calibration.images.search import DECISION, search
 from calibration.images.similarity import CrossingSweeps, Level, prepare
 from calibration.points import Recording
 from calibration.settings import ImageFit
@@ -85,8 +85,8 @@ class ImageCalibration:
 
     def covariance_of(self, point_mm: FloatArray) -> FloatArray:
         """Covariance of where a point of the image lies, along the image's axes, shape (3, 3), mm^2."""
-        moved = point_motion(np.asarray(point_mm, dtype=float)[None])[0]
-        return np.asarray(moved @ self.covariance @ moved.T)
+        motion = point_motion(np.asarray(point_mm, dtype=float)[None])[0]
+        return np.asarray(motion @ self.covariance @ motion.T)
 
 
 def calibrate_images(
@@ -123,41 +123,44 @@ def calibrate_from_sweeps(
     progress: Progress | None = None,
 ) -> ImageCalibration:
     """Calibrate as `calibrate_images`, from sweeps that are prepared already: for many starts."""
-    chosen = settings or ImageFit()
+    s = settings or ImageFit()
     answer, rivals = start, list[RigidTransform]()
-    if chosen.capture_mm > 0.0 or chosen.capture_deg > 0.0:
-        reach = float(np.deg2rad(chosen.capture_deg))
-        answer, *rivals = search(crossing, start, chosen.capture_mm, reach, progress)
+    if s.capture_mm > 0.0 or s.capture_deg > 0.0:
+        reach = float(np.deg2rad(s.capture_deg))
+        answer, *rivals = search(crossing, start, s.capture_mm, reach, progress)
     for level in FINE:
-        refined = refine(crossing.level(level, answer), answer)
-        answer = refined.sensor_from_image
+        fit = refine(crossing.level(level, answer), answer)
+        answer = fit.sensor_from_image
     poses = [stack.world_from_sensor for stack in crossing.stacks]
-    decided = crossing.level(DECIDED, answer)
-    alike = decided.at(answer).score
+    comparison = crossing.level(DECISION, answer)
+    alike = comparison.at(answer).score
     if alike < LEAST_SIMILARITY:
-        got = "no overlap" if alike < 0 else f"{alike:.2f} at best"
+        result = "no overlap" if alike < 0 else f"{alike:.2f} at best"
         raise InsufficientDataError(
             "expected sweeps that show the same structure, with a correlation of at least "
-            f"{LEAST_SIMILARITY:g} over what both cover, got {got}"
+            f"{LEAST_SIMILARITY:g} over what both cover, got {result}"
         )
     angles = angulation(poses[0], poses[1], answer)
     angles.require()
-    if not refined.converged:
-        raise InsufficientDataError("expected a better start, or longer sweeps with more structure")
-    tracker = chosen.tracker_mm, float(np.deg2rad(chosen.tracker_deg))
-    covariance, curvature = claimed(refined, crossing, tracker)
-    require_known(covariance, angles, crossing.centre_mm)
-    require_one_answer(decided, answer, rivals)
+    if not fit.converged:
+        raise InsufficientDataError(
+            "expected a fit of the two sweeps that comes to rest, got one that still moves after all its "
+            "steps: a better start, or longer sweeps with more structure, would help"
+        )
+    tracker = s.tracker_mm, float(np.deg2rad(s.tracker_deg))
+    covariance, curvature = covariance_of(fit, crossing, tracker)
+    require_accuracy(covariance, angles, crossing.centre_mm)
+    require_one_answer(comparison, answer, rivals)
     return ImageCalibration(
-        settings=chosen,
+        settings=s,
         start=start,
         sensor_from_image=answer,
         pixel_mm=crossing.pixel_mm,
         covariance=covariance,
         condition_number=condition_number(np.asarray(np.linalg.cholesky(curvature).T, np.float64)),
         alike=alike,
-        before=decided.at(start).mean,
-        after=decided.at(answer).mean,
+        before=comparison.at(start).mean,
+        after=comparison.at(answer).mean,
         angulation=angles,
         sweeps=crossing,
     )

@@ -61,8 +61,8 @@ class Stack:
     def __len__(self) -> int:
         return len(self.images)
 
-    def __getitem__(self, which: IntArray) -> Stack:
-        return Stack(self.images[which], self.pixels, self.world_from_sensor[which])
+    def __getitem__(self, index: IntArray) -> Stack:
+        return Stack(self.images[index], self.pixels, self.world_from_sensor[index])
 
     @property
     def centre_mm(self) -> FloatArray:
@@ -77,7 +77,7 @@ class Stack:
         share = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
         return np.column_stack([self.pixels[2:] + share * last * self.pixels[:2], np.zeros(4)])
 
-    def blurred(self, sigma_mm: float, least_weight: float = WHOLE) -> Stack:
+    def blur(self, sigma_mm: float, least_weight: float = WHOLE) -> Stack:
         """Blur the images by a Gaussian and reduce them to the pixels it needs.
 
         Parameters
@@ -89,25 +89,24 @@ class Stack:
         """
         sigma = np.append(0.0, sigma_mm / self.pixels[:2])
         steps = np.maximum(1, np.floor(sigma[1:] / _PIXELS_PER_BLUR + 1e-6)).astype(int)
-        few = np.empty_like(self.images[:, :: steps[0], :: steps[1]], order="C")
+        coarse = np.empty_like(self.images[:, :: steps[0], :: steps[1]], order="C")
 
-        def some(first: int, stop: int) -> None:
+        def blur_part(first: int, stop: int) -> None:
             images = self.images[first:stop]
-            there = np.isfinite(images)
-            filled = np.where(there, images, np.float32(0.0))
+            valid = np.isfinite(images)
             grey, weight = (
-                gaussian_filter(one, sigma, mode="constant", truncate=3.0)
-                for one in (filled, there.astype(np.float32))
+                gaussian_filter(values, sigma, mode="constant", truncate=3.0)
+                for values in (np.where(valid, images, np.float32(0.0)), valid.astype(np.float32))
             )
             grey /= np.maximum(weight, np.float32(1e-6))
-            grey[~there | (weight <= least_weight)] = np.nan
-            few[first:stop] = grey[:, :: steps[0], :: steps[1]]
+            grey[~valid | (weight <= least_weight)] = np.nan
+            coarse[first:stop] = grey[:, :: steps[0], :: steps[1]]
 
-        in_parallel(some, len(self), grain=8)
+        in_parallel(blur_part, len(self), grain=8)
         pixels = np.concatenate([self.pixels[:2] * steps, self.pixels[2:]])
-        return replace(self, images=few, pixels=pixels)
+        return replace(self, images=coarse, pixels=pixels)
 
-    def travelled(self, sensor_from_image: RigidTransform) -> FloatArray:
+    def path_mm(self, sensor_from_image: RigidTransform) -> FloatArray:
         """Distance travelled along the normals up to each image, mm: mean of the corners, smoothed.
 
         Corners are used since the centre of a fan does not move if the start puts it on the fan's axis.
@@ -121,9 +120,9 @@ class Stack:
 
     def spacing_mm(self, sensor_from_image: RigidTransform) -> float:
         """Mean distance between neighbouring images along their normals."""
-        return float(self.travelled(sensor_from_image)[-1] / max(len(self) - 1, 1))
+        return float(self.path_mm(sensor_from_image)[-1] / max(len(self) - 1, 1))
 
-    def thinned(self, sensor_from_image: RigidTransform, spacing_mm: float, sigma_mm: float) -> Stack:
+    def resample(self, sensor_from_image: RigidTransform, spacing_mm: float, sigma_mm: float) -> Stack:
         """Average neighbouring images and their poses by a Gaussian, at equal distances along the sweep.
 
         Parameters
@@ -133,23 +132,23 @@ class Stack:
         """
         to_centre = sensor_from_image * RigidTransform.from_translation(self.centre_mm)
         centre = self.world_from_sensor * to_centre
-        way = self.travelled(sensor_from_image)
-        count = max(2, int(way[-1] / spacing_mm) + 1)
-        knots = np.linspace(way[0], way[-1], count)
-        weight = np.exp(-0.5 * ((way - knots[:, None]) / sigma_mm) ** 2) + 1e-12
+        path = self.path_mm(sensor_from_image)
+        count = max(2, int(path[-1] / spacing_mm) + 1)
+        knots = np.linspace(path[0], path[-1], count)
+        weight = np.exp(-0.5 * ((path - knots[:, None]) / sigma_mm) ** 2) + 1e-12
         # Frames count by the distance they stand for, so that a pause does not outweigh its neighbours.
-        weight *= np.maximum(np.gradient(way), 1e-3 * way[-1] / len(way))
+        weight *= np.maximum(np.gradient(path), 1e-3 * path[-1] / len(path))
         weight /= weight.sum(axis=1, keepdims=True)
-        turns = Rotation.concatenate([centre.rotation.mean(one) for one in weight])
-        held = RigidTransform.from_components(weight @ centre.translation, turns)
+        turns = Rotation.concatenate([centre.rotation.mean(row) for row in weight])
+        centres = RigidTransform.from_components(weight @ centre.translation, turns)
         flat, share = self.images.reshape(len(self), -1), weight.astype(np.float32)
-        there = np.isfinite(flat)
-        seen = share @ there.astype(np.float32)
-        total = share @ np.where(there, flat, np.float32(0.0))
+        valid = np.isfinite(flat)
+        support = share @ valid.astype(np.float32)
+        total = share @ np.where(valid, flat, np.float32(0.0))
         # Nothing where the images that count most show nothing.
-        mean = np.where(seen > 0.5, total / np.maximum(seen, np.float32(1e-6)), np.float32(np.nan))
+        mean = np.where(support > 0.5, total / np.maximum(support, np.float32(1e-6)), np.float32(np.nan))
         images = mean.reshape(count, *self.images.shape[1:]).astype(np.float32)
-        return Stack(images, self.pixels, held * to_centre.inv())
+        return Stack(images, self.pixels, centres * to_centre.inv())
 
 
 def read_stack(
@@ -177,7 +176,7 @@ def read_stack(
     shape = (len(frames), grid.vectors // bins[0], grid.samples // bins[1])
     if min(shape[1:]) < 8:
         raise InvalidInputError(
-            f"{recording.name}: expected images of at least 8 pixels of {pixel_mm:g} mm either way, "
+            f"{recording.name}: expected images of at least 8 pixels of {pixel_mm:g} mm either path, "
             f"got {shape[1]} x {shape[2]}"
         )
     transform = extra_module("skimage.transform", "calibrate", "a calibration from images")

@@ -20,14 +20,14 @@ from calibration.motion import require_adequate
 from calibration.nwires import label_by_wires, nwire_errors_mm, trimmed_mean_mm
 from calibration.orientation import calibrate_orientation
 from calibration.plane import calibrate_plane
-from calibration.points import ImagePoints, Recording, Seen
+from calibration.points import Detections, ImagePoints, Recording
 from calibration.recording import (
     CHOICE_STEP_S,
     SEARCH_S,
     Outcome,
     calibrate_recording,
     choose_crossings,
-    paired,
+    with_poses,
 )
 from calibration.repeatability import validate
 from calibration.report import figure_report
@@ -57,8 +57,8 @@ _BEAM_MM = (1.0, 2.0, 3.0)
 
 
 @dataclass(frozen=True)
-class Wired:
-    """What is known of a phantom of wires before it is seen.
+class WireSetup:
+    """A phantom of wires, and what its configuration says of the images.
 
     Attributes
     ----------
@@ -68,14 +68,14 @@ class Wired:
         Column pitch and row spacing, roughly.
     clip_px : ndarray, shape (4, 2), optional
         The part of an image in which dots are looked for.
-    found : bool
+    is_detectable : bool
         Whether its dots can be found in the images; else they must be picked by hand.
     """
 
     phantom: WirePhantom | None = None
     pixel_mm: tuple[float, float] | None = None
     clip_px: FloatArray | None = None
-    found: bool = True
+    is_detectable: bool = True
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -83,7 +83,7 @@ class Wired:
         return () if self.phantom is None else self.phantom.names
 
     @classmethod
-    def of(cls, phantom: str) -> Wired:
+    def of(cls, phantom: str) -> WireSetup:
         """Look up a phantom: ``cross``, ``three``, or a configuration of PLUS.
 
         Raises
@@ -94,22 +94,24 @@ class Wired:
         if phantom == "cross":
             return cls()
         if phantom == "three":
-            return cls(three_wires(), found=False)
+            return cls(three_wires(), is_detectable=False)
         config = read_wire_phantom(phantom)
         size = None if config.pixel_mm is None else (config.pixel_mm, config.pixel_mm)
         return cls(config.phantom, size, config.clip_px)
 
 
-def opened(images: Path, settings: ScanSettings) -> Recording:
+def open_phantom(images: Path, settings: ScanSettings) -> Recording:
     """Open a recording of a phantom; for errors see `open_recording`."""
     sensor = settings.sensor if isinstance(settings, OrientationSettings) else "tracker"
     pixel_mm = settings.pixel_mm
     if pixel_mm is None and isinstance(settings, WireSettings):
-        pixel_mm = Wired.of(settings.phantom).pixel_mm
+        pixel_mm = WireSetup.of(settings.phantom).pixel_mm
     return open_recording(images, settings.poses, pixel_mm, sensor, settings.transform)
 
 
-def found(recording: Recording, settings: ScanSettings, progress: Progress | None = None) -> Seen:
+def detect_phantom(
+    recording: Recording, settings: ScanSettings, progress: Progress | None = None
+) -> Detections:
     """Find the phantom in every image, or read the points picked by hand; without the frames left out.
 
     Raises
@@ -119,11 +121,12 @@ def found(recording: Recording, settings: ScanSettings, progress: Progress | Non
     """
     require_frames(settings.frames_left_out, recording.images.shape[0])
     if isinstance(settings, WireSettings):
-        seen = _seen_wires(recording, settings, progress)
+        detections = _detect_wires(recording, settings, progress)
     else:
         assert isinstance(settings, PlaneSettings | OrientationSettings)
-        seen = detect_lines(recording.images, recording.pixel_mm, settings, settings.corners, progress)
-    return seen.without(settings.frames_left_out, BY_HAND)
+        region = settings.corners
+        detections = detect_lines(recording.images, recording.pixel_mm, settings, region, progress)
+    return detections.without(settings.frames_left_out, BY_HAND)
 
 
 def require_frames(frames: Sequence[int], count: int) -> None:
@@ -132,7 +135,7 @@ def require_frames(frames: Sequence[int], count: int) -> None:
         raise MismatchError(f"--leave-out: expected frames from 0 to {count - 1}, got {max(frames)}")
 
 
-def picked(recording: Recording, points: PickedPoints, settings: ScanSettings) -> Seen:
+def detections_by_hand(recording: Recording, points: PickedPoints, settings: ScanSettings) -> Detections:
     """Take points picked by hand, without the frames left out.
 
     Raises
@@ -141,34 +144,39 @@ def picked(recording: Recording, points: PickedPoints, settings: ScanSettings) -
         If a point lies in no image of the recording.
     """
     points.require_inside(recording.images.shape)
-    return Seen(points.frame, points.pixels, points.wire).without(settings.frames_left_out, BY_HAND)
+    return Detections(points.frame, points.pixels, points.wire).without(settings.frames_left_out, BY_HAND)
 
 
-def solved(recording: Recording, seen: Seen, settings: ScanSettings) -> Outcome:
+def solve_phantom(recording: Recording, detections: Detections, settings: ScanSettings) -> Outcome:
     """Calibrate with what was found; for errors see `calibrate_recording`."""
     size, clock = recording.pixel_mm, settings.time_offset_s
     solve = partial(calibrate_recording, recording)
     if isinstance(settings, OrientationSettings):
-        return solve(seen, "orientation", lambda points: calibrate_orientation(points, size, settings), clock)
+        return solve(
+            detections, "orientation", lambda points: calibrate_orientation(points, size, settings), clock
+        )
     if not isinstance(recording.readings, TimedPoses):
         raise InvalidInputError(
             "expected a position sensor (tracker), got an orientation sensor: speckle3d calibrate orientation"
         )
     if isinstance(settings, PlaneSettings):
-        outcome = solve(seen, "plane", lambda points: calibrate_plane(points, size, settings), clock)
+        outcome = solve(detections, "plane", lambda points: calibrate_plane(points, size, settings), clock)
         widths = () if settings.reflector == "bar" else settings.beam_mm or _BEAM_MM
         return replace(outcome, beam=tuple(predict_bias(outcome.solution, width) for width in widths))
     assert isinstance(settings, WireSettings)
-    phantom = Wired.of(settings.phantom).phantom
+    phantom = WireSetup.of(settings.phantom).phantom
     if phantom is None:
         offsets = [clock if isinstance(clock, float) else recording.time_offset_s]
         if clock == "estimate":
             offsets = delays_around(offsets[0], SEARCH_S, CHOICE_STEP_S).tolist()
-        chosen = choose_crossings(recording, seen, offsets) if len(seen) else seen
-        return solve(chosen, "cross-wire", lambda points: calibrate_cross_wire(points, size, settings), clock)
+        if len(detections):
+            detections = choose_crossings(recording, detections, offsets)
+        return solve(
+            detections, "cross-wire", lambda points: calibrate_cross_wire(points, size, settings), clock
+        )
     # The clock is sought with what depends least on the phantom's place and yet is determined.
     return solve(
-        seen,
+        detections,
         "n-wire" if phantom.n_shapes else "three-wire",
         lambda points: require_adequate(solve_wires(points, phantom, size, settings)),
         clock,
@@ -185,26 +193,26 @@ def remarks(outcome: Outcome) -> list[str]:
     return notes
 
 
-def validated(outcome: Outcome, settings: ScanSettings, progress: Progress | None) -> list[str]:
+def validation_notes(outcome: Outcome, settings: ScanSettings, progress: Progress | None) -> list[str]:
     """Check a calibration on the settings' other recording, if any, of which no frame is left out."""
     path = settings.validation
     if path is None:
         return []
-    points = getattr(settings, "validation_points", None)
-    settings = settings.model_copy(update={"leave_out": "", "poses": None, "points": points})
-    other = opened(path, settings)
+    csv = getattr(settings, "validation_points", None)
+    settings = settings.model_copy(update={"leave_out": "", "poses": None, "points": csv})
+    recording = open_phantom(path, settings)
     with naming(str(path)):
-        seen = found(other, settings, progress)
+        detections = detect_phantom(recording, settings, progress)
         seconds = outcome.calibration.time_offset_s
-        offset_s = other.time_offset_s if seconds is None else seconds
+        offset_s = recording.time_offset_s if seconds is None else seconds
         if isinstance(outcome.solution.phantom, CrossWire):
-            seen = choose_crossings(other, seen, [offset_s])
-        shown, _ = paired(other, seen, offset_s)
-        residuals = validate(outcome.solution, shown)
-    frames = len(set(shown.frame.tolist()))
+            detections = choose_crossings(recording, detections, [offset_s])
+        points, _ = with_poses(recording, detections, offset_s)
+        residuals = validate(outcome.solution, points)
+    frames = len(points.frames)
     rms, unit = readable(float((residuals**2).mean() ** 0.5), outcome.calibration.rms_unit)
     notes = [f"on {path.name}, not used: RMS residual {rms} {unit}, {frames} frames, none left out"]
-    return notes + [f"on {path.name}: {text}" for text in _nwire_notes(outcome, shown)]
+    return notes + [f"on {path.name}: {text}" for text in _nwire_notes(outcome, points)]
 
 
 def write_outcome(
@@ -215,42 +223,42 @@ def write_outcome(
     notes: Sequence[str],
 ) -> Written:
     """Write a calibration with its report, the settings that made it, and the dots it was made from."""
-    dots = outcome.seen
-    names = Wired.of(settings.phantom).names if isinstance(settings, WireSettings) else ()
-    picked = PickedPoints(dots.frame, dots.pixels, dots.wire)
+    dots = outcome.detections
+    names = WireSetup.of(settings.phantom).names if isinstance(settings, WireSettings) else ()
+    points = PickedPoints(dots.frame, dots.pixels, dots.wire)
     return write_with_report(
         outcome.calibration,
         [images],
         out,
-        lambda calibration: figure_report(outcome.solution, calibration, outcome.shots),
+        lambda calibration: figure_report(outcome.solution, calibration, outcome.snapshots),
         [*notes, f"made by: {command_line(settings, images, out)}"],
         outcome.beam,
-        None if dots.are_lines else lambda path: write_points(path, picked, names),
+        None if dots.are_lines else lambda path: write_points(path, points, names),
         settings.model_dump_json(exclude_defaults=True),
     )
 
 
-def _seen_wires(recording: Recording, settings: WireSettings, progress: Progress | None) -> Seen:
-    wired = Wired.of(settings.phantom)
+def _detect_wires(recording: Recording, settings: WireSettings, progress: Progress | None) -> Detections:
+    setup = WireSetup.of(settings.phantom)
     if settings.points is not None:
-        read = read_points(settings.points, wired.names)
+        points = read_points(settings.points, setup.names)
         with naming(str(settings.points)):
-            return picked(recording, read, settings)
-    if not wired.found:
+            return detections_by_hand(recording, points, settings)
+    if not setup.is_detectable:
         raise InvalidInputError(
             f"--phantom {settings.phantom}: expected --points (of --validation: --validation-points), a CSV "
             "that says on which wire each dot lies, got none"
         )
     size, region = recording.pixel_mm, settings.corners
-    if wired.phantom is None:
+    if setup.phantom is None:
         return crossings_in_frames(recording.images, size, region, progress)
-    clip: npt.ArrayLike | None = wired.clip_px if region is None else region
+    clip: npt.ArrayLike | None = setup.clip_px if region is None else region
     dots = dots_in_frames(recording.images, size, clip, progress).without(settings.frames_left_out, BY_HAND)
     times, offset_s = recording.frame_time_s, recording.time_offset_s
     if isinstance(recording.readings, TimedPoses) and covered(recording.readings, times, offset_s).all():
         # A calibration from the frames that show all wires finds those of the other frames.
-        return label_by_wires(dots, wired.phantom, recording.readings.at(times - offset_s), size)
-    return label_dots(dots, wired.phantom, size)
+        return label_by_wires(dots, setup.phantom, recording.readings.at(times - offset_s), size)
+    return label_dots(dots, setup.phantom, size)
 
 
 def _nwire_notes(outcome: Outcome, points: ImagePoints) -> list[str]:

@@ -59,10 +59,10 @@ def open_recording(
 
 def _load(path: Path, pixel_mm: tuple[float, float] | None, transform: str | None) -> Sweep:
     column, row = pixel_mm or (None, None)
-    given = ImportSettings(tracker_transform=transform, column_pitch_mm=column, row_spacing_mm=row)
-    require_unsaid(path, given)
+    options = ImportSettings(tracker_transform=transform, column_pitch_mm=column, row_spacing_mm=row)
+    require_unsaid(path, options)
     try:
-        return load_sweep(path, given.model_copy(update={"dynamic_range_db": DYNAMIC_RANGE_DB}))
+        return load_sweep(path, options.model_copy(update={"dynamic_range_db": DYNAMIC_RANGE_DB}))
     except MissingSettingsError as error:
         raise InvalidInputError(
             f"{path}: the recording does not say its {', '.join(error.settings)}: give --pixel-mm COLUMN "
@@ -70,29 +70,29 @@ def _load(path: Path, pixel_mm: tuple[float, float] | None, transform: str | Non
         ) from None
 
 
-def require_unsaid(path: Path, given: ImportSettings) -> None:
+def require_unsaid(path: Path, options: ImportSettings) -> None:
     """Refuse settings for a recording that says all of them itself.
 
     Raises
     ------
     InvalidInputError
     """
-    names = sorted(name for name in given.model_fields_set if getattr(given, name) is not None)
+    names = sorted(name for name in options.model_fields_set if getattr(options, name) is not None)
     if names and kind_of(path) in SIZED:
         words = ", ".join(names).replace("_", " ")
         raise InvalidInputError(f"{path} ({kind_of(path)}) has its own {words}: expected no option for that")
 
 
 def _readings(sweep: Sweep, path: Path, sensor: str) -> tuple[TimedPoses | TimedRotations, float]:
-    found = sweep.orientation if sensor == "orientation" else sweep.tracker
-    if found is None:
-        others = lacking_poses(path) if kind_of(path) == IMAGE else "none"
+    stream = sweep.orientation if sensor == "orientation" else sweep.tracker
+    if stream is None:
+        content = lacking_poses(path) if kind_of(path) == IMAGE else "none"
         if sweep.tracker is not None:
-            others = "a tracker (--sensor tracker uses its orientation)"
+            content = "a tracker (--sensor tracker uses its orientation)"
         raise InsufficientDataError(
-            f"{path}: expected readings of the {sensor} there or in --poses, got {others}"
+            f"{path}: expected readings of the {sensor} there or in --poses, got {content}"
         )
-    return found.readings, found.time_offset_s
+    return stream.readings, stream.time_offset_s
 
 
 def _readings_of(path: Path, sensor: str, transform: str | None) -> tuple[TimedPoses | TimedRotations, float]:

@@ -149,7 +149,7 @@ class WireSettings(WireFit, ScanSettings):
 
 def model_of(method: str) -> type[ScanSettings]:
     """The settings of a method, as ``plane``."""
-    return {one.method: one for one in (PlaneSettings, OrientationSettings, WireSettings)}[method]
+    return {model.method: model for model in (PlaneSettings, OrientationSettings, WireSettings)}[method]
 
 
 def with_values(settings: Model, values: Mapping[str, Any]) -> Model:
@@ -169,6 +169,7 @@ def command_line(settings: ScanSettings, images: Path, out: Path) -> str:
     for name, field in type(settings).model_fields.items():
         value, option = getattr(settings, name), f"--{name.replace('_', '-')}"
         if value != field.default or name == "phantom":
-            for one in value if isinstance(value, list) else [value]:
-                words += [option, *map(str, one if isinstance(one, tuple) else [] if one is True else [one])]
+            for item in value if isinstance(value, list) else [value]:
+                arguments = item if isinstance(item, tuple) else [] if item is True else [item]
+                words += [option, *map(str, arguments)]
     return shlex.join(words)

@@ -70,15 +70,15 @@ def write_with_report(
         Settings that made it, kept in the file.
     """
     names, hashes = (" ".join(map(of, inputs)) for of in (str, recording_sha256))
-    named = replace(calibration, source=Source(names, hashes, version("speckle3d"), settings_json))
-    table = text_report(named, beam, notes)
+    calibration = replace(calibration, source=Source(names, hashes, version("speckle3d"), settings_json))
+    table = text_report(calibration, beam, notes)
     text, pictures, points = (out.with_suffix(suffix) for suffix in BESIDE)
-    written = FileSet(out.name, (text.name, pictures.name, *([points.name] if dots else [])))
-    with written.replaced(out.parent) as part:
-        write_calibration(part / out.name, named)
+    files = FileSet(out.name, (text.name, pictures.name, *([points.name] if dots else [])))
+    with files.replaced(out.parent) as part:
+        write_calibration(part / out.name, calibration)
         with atomic_path(part / text.name) as path:
             path.write_text(table, encoding="utf-8")
-        save_figure(figure(named), part / pictures.name)
+        save_figure(figure(calibration), part / pictures.name)
         if dots:
             dots(part / points.name)
-    return Written(named, table, (out, text, pictures))
+    return Written(calibration, table, (out, text, pictures))

@@ -24,7 +24,7 @@ from scipy.spatial.transform import RigidTransform
 
 from calibration.detection.lines import detect_lines
 from calibration.points import Recording
-from speckle3d.calibrating.phantoms import found, solved
+from speckle3d.calibrating.phantoms import detect_phantom, solve_phantom
 from speckle3d.calibrating.settings import OrientationSettings, PlaneSettings, WireSettings
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.io.calibrations import read_calibration
@@ -52,17 +52,20 @@ def plane(reflector, seed, frames):
     orientation, tracker = (recording_of(sweep, sensor) for sensor in (sweep.orientation, sweep.tracker))
     lines = detect_lines(orientation.images, orientation.pixel_mm)
     for level in (False, True):
-        outcome = solved(orientation, lines, OrientationSettings(level=level))
+        outcome = solve_phantom(orientation, lines, OrientationSettings(level=level))
         yield f"orientation sensor, {'level' if level else 'any'} plane", outcome.calibration
     for fixed in (False, True):
-        outcome = solved(tracker, lines, PlaneSettings(fixed_pixels=fixed, reflector="bar"))
+        outcome = solve_phantom(tracker, lines, PlaneSettings(fixed_pixels=fixed, reflector="bar"))
         yield f"tracker, pixels {'held' if fixed else 'fitted'}", outcome.calibration
 
 
 def wires(seed, frames):
     sweep = simulate_sweep("wires", seed, frames, vectors=64)
     recording = recording_of(sweep, sweep.tracker)
-    yield "tracker", solved(recording, found(recording, WireSettings()), WireSettings()).calibration
+    yield (
+        "tracker",
+        solve_phantom(recording, detect_phantom(recording, WireSettings()), WireSettings()).calibration,
+    )
 
 
 def handheld(reflector, seed, frames):

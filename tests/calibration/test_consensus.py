@@ -49,6 +49,6 @@ def test_chance_candidates_are_refused_and_the_statistic_told(frames, each):
     frame = np.repeat(np.arange(frames), each)
     pixels = anywhere(rng, points, frames * each)
     chance = ImagePoints(pixels, frame, points.world_from_sensor[frame])
-    assert not find_consensus(chance, PIXEL_MM).believed
+    assert not find_consensus(chance, PIXEL_MM).is_significant
     with pytest.raises(InsufficientDataError):
         calibrate_cross_wire(chance, PIXEL_MM)

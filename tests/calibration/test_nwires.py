@@ -3,7 +3,7 @@ import pytest
 from wire_scenes import PIXEL_MM, candidates, plus_results, scene
 
 from calibration.nwires import label_by_wires, nwire_errors_mm, trimmed_mean_mm
-from calibration.points import Seen
+from calibration.points import Detections
 from speckle3d.io.metaimage import read_poses
 from speckle3d.io.plus_config import read_wire_phantom
 
@@ -28,7 +28,7 @@ def test_published_errors_are_reproduced_for_every_frame(realdata, kind):
     phantom = read_wire_phantom(folder / "PlusDeviceSet_fCal_Sim_SpatialCalibration_2.0.xml").phantom
     poses = read_poses(folder / f"fCal_Test_{kind}_3NWires_fCal2.0.igs.mha").readings.world_from_sensor
     frames, pixels, errors, matrix = plus_results(folder, kind)
-    labelled = Seen(np.repeat(frames, 9), pixels.reshape(-1, 2), np.tile(np.arange(9), len(frames)))
+    labelled = Detections(np.repeat(frames, 9), pixels.reshape(-1, 2), np.tile(np.arange(9), len(frames)))
     points = labelled.points(poses[labelled.frame])
     found = nwire_errors_mm(points, phantom, matrix, phantom.world_from_phantom)
     # Six digits of pixels, poses and matrix leave 0.0002 mm.

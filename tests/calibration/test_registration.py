@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 from wire_scenes import PIXEL_MM, scene
 
-from calibration.points import Seen
+from calibration.points import Detections
 from calibration.wires import calibrate_wires
 
 CORNERS = np.array([[0.0, 0.0, 0.0], [70.0, 0.0, 0.0], [0.0, 48.0, 0.0], [70.0, 48.0, 0.0]])
@@ -23,7 +23,7 @@ def recording(seed, frames=48):
     jitter = Rotation.from_rotvec(np.deg2rad(0.05) * rng.standard_normal((frames, 3)))
     poses = RigidTransform.from_components(place + 0.1 * rng.standard_normal(place.shape), turn * jitter)
     frame = np.repeat(np.arange(frames), wires)
-    seen = Seen(frame, pixels.reshape(-1, 2), np.tile(np.arange(wires), frames))
+    seen = Detections(frame, pixels.reshape(-1, 2), np.tile(np.arange(wires), frames))
     return shown, seen.points(poses[frame], frame / 10.0)
 
 

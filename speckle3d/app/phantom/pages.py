@@ -8,7 +8,7 @@ from panel.viewable import Viewable
 
 from speckle3d.app.phantom.lines import LinesViewer
 from speckle3d.app.phantom.points import PointsViewer
-from speckle3d.calibrating.phantoms import opened, require_frames
+from speckle3d.calibrating.phantoms import open_phantom, require_frames
 from speckle3d.calibrating.settings import ScanSettings, WireSettings
 from speckle3d.core.errors import InvalidInputError
 
@@ -30,7 +30,7 @@ class PhantomPage:
     """
 
     def __init__(self, images: Path, settings: ScanSettings) -> None:
-        recording = opened(images, settings)
+        recording = open_phantom(images, settings)
         if not recording.images.shape[0]:
             raise InvalidInputError(f"{images}: expected frames to look at, got none")
         require_frames(settings.frames_left_out, recording.images.shape[0])

@@ -13,14 +13,14 @@ import panel as pn
 from bokeh.models import ColumnDataSource, PointDrawTool
 from panel.viewable import Viewable
 
-from calibration.points import Recording, Seen
+from calibration.points import Detections, Recording
 from calibration.recording import choose_crossings
 from speckle3d.app.folder import save_new
 from speckle3d.app.look import batch_changes
 from speckle3d.app.phantom.plots import BLUE, ORANGE, SKY_BLUE
 from speckle3d.app.phantom.run import run_in_thread, sentence
 from speckle3d.app.phantom.viewer import PhantomViewer
-from speckle3d.calibrating.phantoms import Wired, found, picked
+from speckle3d.calibrating.phantoms import WireSetup, detect_phantom, detections_by_hand
 from speckle3d.calibrating.settings import ScanSettings, WireSettings, with_values
 from speckle3d.core.errors import InvalidInputError, Speckle3DError
 from speckle3d.io.points import PickedPoints, read_points, write_points
@@ -56,7 +56,7 @@ class Picks(dict[tuple[int, str], tuple[float, float]]):
             if wire in self.names:
                 self[frame, wire] = round(column, _DIGITS), round(row, _DIGITS)
 
-    def take(self, points: PickedPoints | Seen) -> None:
+    def take(self, points: PickedPoints | Detections) -> None:
         """Take points of many frames, in place of all that were there."""
         wires = np.zeros(len(points.frame), int) if points.wire is None else points.wire
         self.clear()
@@ -85,7 +85,7 @@ class PointsViewer(PhantomViewer):
     def __init__(self, recording: Recording, images: Path, settings: ScanSettings) -> None:
         assert isinstance(settings, WireSettings)
         super().__init__(recording, images, settings)
-        self._phantom, self._drawing = Wired.of(settings.phantom), False
+        self._phantom, self._drawing = WireSetup.of(settings.phantom), False
         self.picks = Picks(self._phantom.names)
         if settings.points is not None:
             points = read_points(settings.points, self._phantom.names)
@@ -116,7 +116,7 @@ class PointsViewer(PhantomViewer):
         )
         self._wire.param.watch(self._name_next, "value")
         self._search = pn.widgets.Button(
-            name="Find points in all frames", width=190, disabled=not self._phantom.found
+            name="Find points in all frames", width=190, disabled=not self._phantom.is_detectable
         )
         self._points_name = pn.widgets.TextInput(
             name="file of the points", value=f"{images.stem}-points.csv", width=460
@@ -152,12 +152,12 @@ class PointsViewer(PhantomViewer):
         total, frames = len(self.picks), len({frame for frame, _ in self.picks})
         return f"frame {self.frame}: {len(points)} points{lacking}; {total} in {frames} frames"
 
-    def find(self, settings: ScanSettings) -> Seen:
+    def find(self, settings: ScanSettings) -> Detections:
         """Take the points that are there."""
         self._run_points = self.picks.points()
         if not len(self._run_points):
             raise InvalidInputError("expected points: find them, or click where they are")
-        return picked(self.recording, self._run_points, settings)
+        return detections_by_hand(self.recording, self._run_points, settings)
 
     def before_saving(self, settings: ScanSettings, out: Path) -> ScanSettings:
         """Save the points that a calibration was made from, for the command to be given them."""
@@ -189,8 +189,8 @@ class PointsViewer(PhantomViewer):
             return
         self._mark_picks()
 
-    def _find_points(self, settings: ScanSettings) -> Seen:
-        points = found(self.recording, settings)
+    def _find_points(self, settings: ScanSettings) -> Detections:
+        points = detect_phantom(self.recording, settings)
         if self._phantom.names:
             return points
         return choose_crossings(self.recording, points, [self.recording.time_offset_s])

@@ -12,7 +12,7 @@ import numpy.typing as npt
 import panel as pn
 from panel.viewable import Viewable
 
-from calibration.points import Recording, Seen
+from calibration.points import Detections, Recording
 from calibration.recording import Outcome
 from calibration.report import text_report
 from speckle3d.app.folder import new_path
@@ -20,7 +20,13 @@ from speckle3d.app.look import batch_changes
 from speckle3d.app.phantom.plots import BLUE, ORANGE, FramePlot, FrameStrip
 from speckle3d.app.phantom.run import run_in_thread, sentence
 from speckle3d.app.phantom.widgets import WIDTH_PX, widget
-from speckle3d.calibrating.phantoms import BY_HAND, found, remarks, require_frames, solved, write_outcome
+from speckle3d.calibrating.phantoms import (
+    BY_HAND,
+    detect_phantom,
+    remarks,
+    require_frames,
+    write_outcome,
+)
 from speckle3d.calibrating.settings import (
     OrientationSettings,
     PlaneSettings,
@@ -158,9 +164,9 @@ class PhantomViewer:
         """Draw what is found in a frame, and return what to say; raise `Speckle3DError` where nothing is."""
         raise NotImplementedError
 
-    def find(self, settings: ScanSettings) -> Seen:
+    def find(self, settings: ScanSettings) -> Detections:
         """Find the phantom in all frames; called in a thread."""
-        return found(self.recording, settings)
+        return detect_phantom(self.recording, settings)
 
     def before_saving(self, settings: ScanSettings, out: Path) -> ScanSettings:
         """Bring the settings of a run into what a command can be given, as by saving points set by hand."""

@@ -65,17 +65,17 @@ def clock(
 
     if by == "images" and sensor != "tracker":
         raise InvalidInputError(f"--by images: expected --sensor tracker, which knows places, got {sensor}")
-    known = None if calibration is None else read_calibration(calibration)
-    if known is not None and known.sensor != sensor:
+    start = None if calibration is None else read_calibration(calibration)
+    if start is not None and start.sensor != sensor:
         raise MismatchError(
-            f"{calibration}: expected a calibration of the {sensor}, got one of {known.sensor}"
+            f"{calibration}: expected a calibration of the {sensor}, got one of {start.sensor}"
         )
     outside = nan if by == "images" else 0.0
     recording = open_recording(images, poses, pixel_mm, sensor, transform, outside)
     if by == "images":
         mounting = recording.mounting
-        if known is not None:
-            mounting, offset_s = known.sensor_from_image, known.time_offset_s
+        if start is not None:
+            mounting, offset_s = start.sensor_from_image, start.time_offset_s
             recording = recording if offset_s is None else replace(recording, time_offset_s=offset_s)
         if mounting is None:
             raise InsufficientDataError(
@@ -84,28 +84,26 @@ def clock(
             )
         with progress_bar("trying delays") as progress, naming(str(images)):
             delay = delay_from_images(recording, mounting, search_s, progress=progress)
-        frames, words = (
-            len(recording.frame_time_s),
-            f"images of the two ways correlate by {delay.followed:.2f}",
-        )
+        frames = len(recording.frame_time_s)
+        words = f"images of the way forward correlate by {delay.followed:.2f} with those of the way back"
     else:
         with naming("--region"):
             corners = region_of(region or "")
         times, columns = recording.frame_time_s, recording.images.shape[1]
         with progress_bar(f"finding lines in {images.name}") as progress, naming(str(images)):
-            seen = detect_lines(recording.images, recording.pixel_mm, None, corners, progress)
-            frames = len(seen)
+            lines = detect_lines(recording.images, recording.pixel_mm, None, corners, progress)
+            frames = len(lines)
             if frames < FEWEST_FRAMES:
                 raise InsufficientDataError(
                     f"expected a line in at least {FEWEST_FRAMES} frames, got one in {frames} of "
                     f"{len(times)}: record a plane's echo, for longer; of tissue use --by images"
                 )
-            signal = line_signal(seen.pixels, recording.pixel_mm, (columns - 1) / 2)
+            signal = line_signal(lines.pixels, recording.pixel_mm, (columns - 1) / 2)
             readings, around_s = recording.readings, recording.time_offset_s
-            delay = delay_from_lines(signal, times[seen.frame], readings, around_s, search_s)
+            delay = delay_from_lines(signal, times[lines.frame], readings, around_s, search_s)
         words = f"the sensor explains {100 * delay.followed:.0f} % of the line's motion in {frames} frames"
-    if known is not None and out is not None:
-        write_calibration(out, replace(known, time_offset_s=delay.seconds))
+    if start is not None and out is not None:
+        write_calibration(out, replace(start, time_offset_s=delay.seconds))
         note(f"calibration with this offset in {out}")
     error_s = delay.standard_error_s
     offset = {"time_offset_s": delay.seconds, "standard_error_s": error_s}

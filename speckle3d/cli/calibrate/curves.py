@@ -73,22 +73,20 @@ def curves(
     if probe is not None:
         with naming(str(probe)):
             sheet = load_toml(ProbeSheet, probe)
-            found = data_sheet_curves(sheet, load_sweep(like) if like else None, settings)
+            result = data_sheet_curves(sheet, load_sweep(like) if like else None, settings)
     else:
-        known, loaded = (
-            read_curves(start) if start else None,
-            [part_of(load_sweep(path), frames, "--frames") for path in sweeps or []],
-        )
+        rough = read_curves(start) if start else None
+        recordings = [part_of(load_sweep(path), frames, "--frames") for path in sweeps or []]
         with progress_bar("correlating frames") as progress:
-            if known is not None or all(jitters(sweep) for sweep in loaded):
-                found = tracked_curves(loaded, known, settings, progress)
+            if rough is not None or all(jitters(sweep) for sweep in recordings):
+                result = tracked_curves(recordings, rough, settings, progress)
             else:
-                found = calibrate_curves(loaded, settings, progress)
-    write_curves(out, found)
-    return _shown(found)
+                result = calibrate_curves(recordings, settings, progress)
+    write_curves(out, result)
+    return _report(result)
 
 
-def _shown(curves: DecorrelationCurves) -> Result:
+def _report(curves: DecorrelationCurves) -> Result:
     import numpy as np
 
     first = (curves.correlation < 0.5).argmax(axis=1)
@@ -96,11 +94,14 @@ def _shown(curves: DecorrelationCurves) -> Result:
     by_depth = {"depth_mm": curves.depth_mm, "half_mm": half_mm, "cells": curves.cells}
     tilt = {} if curves.tilt is None else vars(curves.tilt)
     about = {"pairs": curves.pairs_used, "origin": curves.origin, "scale_sigma": curves.scale_sigma}
-    made = (
-        "calculated, not measured" if curves.origin == "data sheet" else "corrected to the tracker's length"
+    origin = (
+        "calculated from the data sheet"
+        if curves.origin == "data sheet"
+        else "fitted to the tracker's length"
     )
-    seen = f"{curves.pairs_used} frame pairs" if curves.pairs_used else made
-    lines = [f"{seen}; correlation falls to one half at"]
+    if curves.pairs_used:
+        origin = f"measured on {curves.pairs_used} frame pairs"
+    lines = [f"curves {origin}; correlation falls to one half at"]
     for depth, distance, cells in zip(curves.depth_mm, half_mm, curves.cells, strict=True):
         width = f"{distance:.2f}" if np.isfinite(distance) else f"more than {curves.distance_mm[-1]:.2f}"
         lines.append(f"  {depth:5.1f} mm depth: {width} mm  ({cells:.0f} independent cells in a patch)")

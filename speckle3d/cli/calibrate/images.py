@@ -84,27 +84,24 @@ def images(
 
     if poses and len(poses) != 2:
         raise InvalidInputError(f"--poses: expected it twice, for A and for B, got {len(poses)}")
-    known = None if start is None else read_calibration(start)
-    offset_s = known.time_offset_s if time_offset_s is None and known is not None else time_offset_s
-    readings = poses or (None, None)
-    one, other = (
+    calibration = None if start is None else read_calibration(start)
+    if time_offset_s is None and calibration is not None:
+        time_offset_s = calibration.time_offset_s
+    a, b = (
         open_recording(images, poses, pixel_mm, "tracker", transform, np.nan)
-        for images, poses in zip((first, second), readings, strict=True)
+        for images, poses in zip((first, second), poses or (None, None), strict=True)
     )
-    if offset_s is not None:
-        one, other = (replace(sweep, time_offset_s=offset_s) for sweep in (one, other))
-    mounting = one.mounting if known is None else known.sensor_from_image
+    if time_offset_s is not None:
+        a, b = (replace(sweep, time_offset_s=time_offset_s) for sweep in (a, b))
+    mounting = a.mounting if calibration is None else calibration.sensor_from_image
     begin = _start(start_mm, start_deg, mounting, first)
-    sweeps = one, other
     # Half of the limits: a mounting that is off by 20 degrees is good enough for no more.
-    posed = [sweep.world_from_sensor(sweep.covered()) for sweep in sweeps]
-    angulation(posed[0], posed[1], begin).require(0.5)
+    angulation(*(sweep.world_from_sensor(sweep.covered()) for sweep in (a, b)), begin).require(0.5)
     with progress_bar("comparing sweeps") as bar:
-        found = calibrate_images(one, other, begin, settings, bar)
-    notes = notes_of(found)
-    made = calibration_from_images(found, sweeps)
-    written = write_with_report(made, (first, second), out, lambda _: figure_of(found, sweeps), notes)
-    return report_of(written, notes)
+        result = calibrate_images(a, b, begin, settings, bar)
+    notes, answer = notes_of(result), calibration_from_images(result, (a, b))
+    files = write_with_report(answer, (first, second), out, lambda _: figure_of(result, (a, b)), notes)
+    return report_of(files, notes)
 
 
 def _start(

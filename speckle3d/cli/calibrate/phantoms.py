@@ -80,21 +80,28 @@ def wires(
 
 def _calibrate(images: Path, settings: ScanSettings, out: Path) -> Result:
     """Calibrate, check on the other recording, and write the calibration, its report and the dots."""
-    from speckle3d.calibrating.phantoms import found, opened, remarks, solved, validated, write_outcome
+    from speckle3d.calibrating.phantoms import (
+        detect_phantom,
+        open_phantom,
+        remarks,
+        solve_phantom,
+        validation_notes,
+        write_outcome,
+    )
 
     if settings.validation is None and getattr(settings, "validation_points", None) is not None:
         raise InvalidInputError("--validation-points: expected the recording in --validation, got none")
-    recording = opened(images, settings)
+    recording = open_phantom(images, settings)
     with progress_bar(f"looking into {images.name}") as progress, naming(str(images)):
-        seen = found(recording, settings, progress)
+        detections = detect_phantom(recording, settings, progress)
     with naming(str(images)):
-        outcome = solved(recording, seen, settings)
+        outcome = solve_phantom(recording, detections, settings)
     notes = remarks(outcome)
     if settings.validation is not None:
         with progress_bar(f"looking into {settings.validation.name}") as progress:
-            notes += validated(outcome, settings, progress)
-    written = write_outcome(outcome, settings, images, out, notes)
-    return report_of(written, notes, outcome.beam)
+            notes += validation_notes(outcome, settings, progress)
+    files = write_outcome(outcome, settings, images, out, notes)
+    return report_of(files, notes, outcome.beam)
 
 
 def repeatability(calibrations: list[Path], size_px: tuple[int, int] | None = None) -> Result:

@@ -9,8 +9,8 @@ from dataclasses import replace
 import numpy as np
 from floor_scenes import Floor
 
-from calibration.points import Recording, Seen
-from speckle3d.calibrating.phantoms import solved
+from calibration.points import Detections, Recording
+from speckle3d.calibrating.phantoms import solve_phantom
 from speckle3d.calibrating.settings import PlaneSettings
 from speckle3d.core.errors import Speckle3DError
 from speckle3d.core.grid import ImageGrid
@@ -37,7 +37,7 @@ def simulate_recording(seed):
     readings = TimedPoses(sensor_s - offset_s, floor.readings(sensor_s, drifts=bool(seed % 2)))
     images, pixel_mm = np.zeros((len(frame_s), 2, 2), np.uint8), floor.pixel_mm * rng.uniform(0.99, 1.01, 2)
     recording = Recording(images, ImageGrid(2, 2, *pixel_mm), frame_s, readings)
-    return recording, Seen(np.arange(len(frame_s)), floor.lines(frame_s)), offset_s
+    return recording, Detections(np.arange(len(frame_s)), floor.lines(frame_s)), offset_s
 
 
 def judge(seed):
@@ -45,10 +45,12 @@ def judge(seed):
     recording, lines, offset_s = simulate_recording(seed)
     settings = PlaneSettings(fixed_pixels=seed % 4 < 2, reflector="bar")
     try:
-        offset = solved(recording, lines, settings.model_copy(update={"time_offset_s": "estimate"})).offset
+        offset = solve_phantom(
+            recording, lines, settings.model_copy(update={"time_offset_s": "estimate"})
+        ).offset
     except Speckle3DError as error:
         try:
-            solved(replace(recording, time_offset_s=offset_s), lines, settings)
+            solve_phantom(replace(recording, time_offset_s=offset_s), lines, settings)
         except Speckle3DError:
             return np.nan, np.nan, MOTION
         return np.nan, np.nan, str(error)
