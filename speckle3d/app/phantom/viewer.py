@@ -25,6 +25,7 @@ from speckle3d.calibrating.phantoms import (
     detect_phantom,
     remarks,
     require_frames,
+    solve_phantom,
     write_outcome,
 )
 from speckle3d.calibrating.settings import (
@@ -212,7 +213,9 @@ class PhantomViewer:
                 raise InvalidInputError("say first what the plane is: a bare wall, or a thin bar")
             settings = self.settings()
             points = await run_in_thread(self._button, partial(self.find, settings))
-            outcome = await run_in_thread(self._button, partial(solved, self.recording, points, settings))
+            outcome = await run_in_thread(
+                self._button, partial(solve_phantom, self.recording, points, settings)
+            )
         except Speckle3DError as error:
             self._verdict.object, self._table.object = sentence(f"No calibration: {error}", ORANGE), ""
             uses = {} if points is None else dict.fromkeys(map(int, points.frame), "found")
