@@ -27,7 +27,7 @@ def test_frames_are_numbers_and_ranges():
 
 
 @pytest.mark.parametrize(
-    "given",
+    "settings",
     [
         PlaneSettings(
             poses=Path("its poses.mha"), transform="ProbeToTracker", pixel_mm=(0.1, 1 / 3),
@@ -40,19 +40,19 @@ def test_frames_are_numbers_and_ranges():
         WireSettings(phantom="three", points=Path("a b.csv"), registration="held", fixed_pixels=True),
     ],
 )  # fmt: skip
-def test_the_command_that_is_told_takes_the_same_settings(monkeypatch, given, tmp_path):
-    taken = []
+def test_the_command_that_is_told_takes_the_same_settings(monkeypatch, settings, tmp_path):
+    calls = []
     monkeypatch.chdir(tmp_path)
     for name in ("the images.mha", "its poses.mha", "a b.csv"):
         (tmp_path / name).touch()
     monkeypatch.setattr(
         calibrate_phantoms,
         "_calibrate",
-        lambda images, found, out, *rest, **more: taken.append((images, found, out)),
+        lambda images, options, out, *arguments, **keywords: calls.append((images, options, out)),
     )
-    line = command_line(given, Path("the images.mha"), Path("out.h5"))
+    line = command_line(settings, Path("the images.mha"), Path("out.h5"))
     monkeypatch.setattr(sys, "argv", shlex.split(line))
     with pytest.raises(SystemExit) as leave:
         cli.main()
     assert leave.value.code == 0
-    assert taken == [(Path("the images.mha"), given, Path("out.h5"))]
+    assert calls == [(Path("the images.mha"), settings, Path("out.h5"))]

@@ -9,11 +9,11 @@ from calibration.plane import calibrate_plane
 from calibration.settings import PlaneFit
 
 
-def moved_mm(found, columns_and_rows):
+def moved_mm(chain, columns_and_rows):
     """Displacement of a pixel from where the true mounting has it, along the image's axes."""
     before, after = (
         mounting.apply(np.append(columns_and_rows * pixel_mm, 0.0))
-        for mounting, pixel_mm in ((TRIAL_1, PIXEL_MM), (found.sensor_from_image, found.pixel_mm))
+        for mounting, pixel_mm in ((TRIAL_1, PIXEL_MM), (chain.sensor_from_image, chain.pixel_mm))
     )
     return TRIAL_1.rotation.inv().apply(after - before)
 
@@ -27,13 +27,13 @@ def test_what_is_predicted_is_what_a_thick_beam_does():
         for w in (0.0, width_mm)
     )
     middle = thin.points.pixels.mean(axis=0)
-    happened = moved_mm(thick.chain, middle)
-    size = np.linalg.norm(happened)
+    shift = moved_mm(thick.chain, middle)
+    size = np.linalg.norm(shift)
     # From exact lines; and, as on real ones, from lines that the beam has already moved.
     for solution in (thin, thick):
-        predicted = predict_bias(solution, width_mm)
-        np.testing.assert_allclose(predicted.simulated_mm, happened, atol=0.005 * size)
-        assert predicted.rms_mm == pytest.approx(thick.rms, rel=0.01)
-        assert predicted.width_mm == width_mm
-    assert happened[1] < 0
-    assert abs(happened[1]) > 0.99 * size
+        bias = predict_bias(solution, width_mm)
+        np.testing.assert_allclose(bias.simulated_mm, shift, atol=0.005 * size)
+        assert bias.rms_mm == pytest.approx(thick.rms, rel=0.01)
+        assert bias.width_mm == width_mm
+    assert shift[1] < 0
+    assert abs(shift[1]) > 0.99 * size

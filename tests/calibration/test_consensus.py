@@ -23,7 +23,7 @@ def anywhere(rng, points, count):
     return rng.uniform(points.pixels.min(axis=0), points.pixels.max(axis=0), (count, 2))
 
 
-def test_the_right_one_of_six_candidates_is_chosen_and_frames_without_are_not_used():
+def test_one_right_candidate_of_six_in_two_thirds_of_the_frames():
     points, rng = scan(2), np.random.default_rng(3)
     pixels = np.stack([anywhere(rng, points, 52) for _ in range(6)], axis=1)
     lacking = rng.permutation(52) < 16
@@ -35,19 +35,19 @@ def test_the_right_one_of_six_candidates_is_chosen_and_frames_without_are_not_us
     solution = calibrate_cross_wire(candidates, PIXEL_MM)
     assert len(solution.points) == 52
     np.testing.assert_array_equal(solution.points.frame, np.arange(52))
-    chosen = solution.points.pixels[solution.used & ~lacking]
-    np.testing.assert_array_equal(chosen, points.pixels[solution.used & ~lacking])
+    crossings = solution.points.pixels[solution.used & ~lacking]
+    np.testing.assert_array_equal(crossings, points.pixels[solution.used & ~lacking])
     assert (solution.used & ~lacking).sum() >= 0.9 * (~lacking).sum()
     # A wrong candidate may be near by chance: one in thirty is within 4 mm.
     assert (solution.used & lacking).sum() <= 2
     assert solution.rms < 0.6
 
 
-@pytest.mark.parametrize(("frames", "each"), [(8, 1), (30, 6)])
-def test_chance_candidates_are_refused_and_the_statistic_told(frames, each):
+@pytest.mark.parametrize(("frames", "per_frame"), [(8, 1), (30, 6)])
+def test_chance_candidates(frames, per_frame):
     points, rng = scan(4, frames), np.random.default_rng(5)
-    frame = np.repeat(np.arange(frames), each)
-    pixels = anywhere(rng, points, frames * each)
+    frame = np.repeat(np.arange(frames), per_frame)
+    pixels = anywhere(rng, points, frames * per_frame)
     chance = ImagePoints(pixels, frame, points.world_from_sensor[frame])
     assert not find_consensus(chance, PIXEL_MM).is_significant
     with pytest.raises(InsufficientDataError):

@@ -19,10 +19,10 @@ def lines_of(moves, count=200, noise_mm=0.1):
     """Lines of a floor, from a probe that turns about a point of it, 23 mm deep unless moved up and down."""
     rng, middle_mm = np.random.default_rng(0), (COLUMNS - 1) / 2 * PIXEL_MM[0]
 
-    def turned(word, axis):
+    def turn_about(word, axis):
         return about(axis, np.deg2rad(moves.get(word, 0.0)) * rng.uniform(-1, 1, count))
 
-    turn = BEAM_DOWN * turned("roll", 2) * turned("tilt", 0) * turned("rotate", 1)
+    turn = BEAM_DOWN * turn_about("roll", 2) * turn_about("tilt", 0) * turn_about("rotate", 1)
     depth = 23.0 + moves.get("move", 0.0) * rng.uniform(-1, 1, count)
     up = turn.inv().apply([0.0, 0.0, 1.0])
     height = -(up[:, 0] * middle_mm + up[:, 1] * depth)
@@ -43,22 +43,22 @@ def calibrate_directions(moves):
     return calibrate_orientation(lines_of(moves, 100), PIXEL_MM)
 
 
-def advised(text):
+def advice(text):
     return [motion.split()[0] for motion in MOTIONS if motion in text]
 
 
 @pytest.mark.parametrize(
-    ("calibrate", "done"),
+    ("calibrate", "motions"),
     [
         (calibrate_lines, ("tilt", "move")),
         (calibrate_directions, ("roll", "rotate")),
     ],
 )
-def test_doing_as_told_cures_a_calibration(calibrate, done):
-    moves = {word: FULL[word] for word in done}
-    with pytest.raises(InsufficientDataError) as refused:
+def test_doing_as_told_cures_a_calibration(calibrate, motions):
+    moves = {word: FULL[word] for word in motions}
+    with pytest.raises(InsufficientDataError) as error:
         calibrate(moves)
-    new = [word for word in advised(str(refused.value)) if word not in moves]
+    new = [word for word in advice(str(error.value)) if word not in moves]
     assert new
     solution = calibrate(moves | {word: FULL[word] for word in new})
     chain, error = solution.chain, solution.adequacy.standard_error

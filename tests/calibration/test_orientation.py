@@ -16,8 +16,8 @@ LINE_NOISE_DEG = 0.15
 """Of a line 30 mm long with 30 independent edges found to 0.1 mm: 0.1 / 30 * sqrt(12 / 30) rad, 0.12 deg."""
 
 
-def tilt_yaw_roll_deg(found, mounting):
-    return np.rad2deg((mounting.inv() * found.chain.sensor_from_image.rotation).as_rotvec())
+def tilt_yaw_roll_deg(solution, mounting):
+    return np.rad2deg((mounting.inv() * solution.chain.sensor_from_image.rotation).as_rotvec())
 
 
 def calibrate(directions, readings, **options):
@@ -52,8 +52,8 @@ def test_the_mirror_is_never_wrong(trials):
         directions, readings, mounting = line_directions(
             rng, 30, noise_deg=rng.uniform(0, 0.3), tilt_deg=30.0, roll_deg=25.0, from_below=bool(trial % 2)
         )
-        viewed = "below" if trial % 2 else "above"
-        solution = calibrate(directions, readings, level=bool(trial % 3), viewed_from=viewed)
+        side = "below" if trial % 2 else "above"
+        solution = calibrate(directions, readings, level=bool(trial % 3), viewed_from=side)
         assert np.linalg.norm(tilt_yaw_roll_deg(solution, mounting)) < 20.0, trial
 
 
@@ -63,8 +63,8 @@ def test_errors_of_the_mirror_are_about_its_own_axes():
         calibrate(directions, readings, viewed_from=side).image_covariance(("gamma", "beta", "alpha"))
         for side in ("above", "below")
     )
-    turned = np.diag([-1.0, -1.0, 1.0])
-    np.testing.assert_allclose(below, turned @ above @ turned, rtol=1e-6)
+    signs = np.diag([-1.0, -1.0, 1.0])
+    np.testing.assert_allclose(below, signs @ above @ signs, rtol=1e-6)
 
 
 def test_beams_that_are_level_on_average_cannot_be_told_from_their_mirror():

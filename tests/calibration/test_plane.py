@@ -20,8 +20,8 @@ IMAGE = ("gamma", "beta", "alpha", "x", "y", "z")
 
 def moved_mm(solution, mounting=TRIAL_1):
     """Displacement of the image's centre from the truth, along the image's axes."""
-    found = centre_of(solution.chain.sensor_from_image, solution.chain.pixel_mm)
-    return mounting.rotation.inv().apply(found - centre_of(mounting, PIXEL_MM))
+    centre = centre_of(solution.chain.sensor_from_image, solution.chain.pixel_mm)
+    return mounting.rotation.inv().apply(centre - centre_of(mounting, PIXEL_MM))
 
 
 def degrees_off(solution, mounting=TRIAL_1):
@@ -35,7 +35,7 @@ def lines(depth_mm=(12.0, 34.0), count=100, noise_mm=0.1, **options):
 
 # TR 303, Table 6: 2.09, 4.18 and 6.28 mm towards the probe, RMS 0.020 mm per mm of beam width.
 @pytest.mark.parametrize(("seed", "beam_mm", "shift_mm"), [(0, 1.0, 2.09), (1, 2.0, 4.18), (0, 3.0, 6.28)])
-def test_a_thick_beam_biases_a_bare_wall_as_published(seed, beam_mm, shift_mm):
+def test_bias_of_a_thick_beam_as_in_table_6(seed, beam_mm, shift_mm):
     scan = scan_plane(np.random.default_rng(seed), beam_mm=beam_mm)
     solution = calibrate_plane(scan.lines, settings=ALL_FRAMES)
     across, along, out = moved_mm(solution)
@@ -58,7 +58,7 @@ def test_exact_lines_give_the_exact_calibration(fixed):
 @pytest.mark.parametrize(
     "seed", [*range(2), *(pytest.param(s, marks=pytest.mark.slow) for s in range(2, 10))]
 )
-def test_any_mounting_is_found(seed):
+def test_any_mounting(seed):
     rng = np.random.default_rng(seed)
     mounting = RigidTransform.from_components(rng.uniform(-150, 150, 3), Rotation.random(rng=rng))
     floor = RigidTransform.from_components(rng.uniform(-300, 300, 3), Rotation.random(rng=rng))
@@ -94,33 +94,33 @@ def test_wrong_lines_in_a_tenth_of_the_frames_hardly_move_the_answer():
     step = (clean.chain.sensor_from_image.inv() * spoilt.chain.sensor_from_image).as_components()
     errors = np.sqrt(np.diag(clean.image_covariance(IMAGE)))
     assert (np.abs(np.concatenate([step[1].as_rotvec(), step[0]])) < errors).all()
-    dropped = set(right.frame[~spoilt.used])
+    outliers = set(right.frame[~spoilt.used])
     # A wrong line may lie near the right one by chance; Gaussian ones are hardly ever dropped.
-    assert len(dropped & set(wrong)) >= 27
-    assert len(dropped - set(wrong)) <= 1
+    assert len(outliers & set(wrong)) >= 27
+    assert len(outliers - set(wrong)) <= 1
 
 
 @pytest.mark.parametrize(
-    ("options", "named"),
+    ("options", "motion"),
     [({"tilt_deg": 0.0}, TILT), ({"roll_deg": 0.0}, ROLL), ({"depth_mm": (23.0, 23.0)}, UP_AND_DOWN)],
 )
-def test_the_missing_motion_is_named_and_nothing_returned(options, named):
-    with pytest.raises(InsufficientDataError, match=re.escape(named)) as refused:
+def test_a_missing_motion_is_in_the_message(options, motion):
+    with pytest.raises(InsufficientDataError, match=re.escape(motion)) as error:
         calibrate_plane(lines(**options), PIXEL_MM, FIXED)
-    others = {TILT, ROLL, UP_AND_DOWN} - {named}
-    assert not any(other in str(refused.value) for other in others)
+    motions = {TILT, ROLL, UP_AND_DOWN} - {motion}
+    assert not any(name in str(error.value) for name in motions)
 
 
-def test_lines_that_contradict_a_pixel_size_are_believed():
+def test_lines_against_a_wrong_pixel_size():
     # Determined to 0.2 % by 100 lines.
     np.testing.assert_allclose(calibrate_plane(lines(), 1.3 * PIXEL_MM).chain.pixel_mm, PIXEL_MM, rtol=0.01)
 
 
-def test_what_cannot_be_calibrated_is_refused():
+def test_shuffled_poses_few_lines_and_no_pixel_size():
     right = lines()
-    shuffled = right.world_from_sensor[np.repeat(2 * np.random.default_rng(1).permutation(100), 2)]
+    poses = right.world_from_sensor[np.repeat(2 * np.random.default_rng(1).permutation(100), 2)]
     with pytest.raises(InsufficientDataError):
-        calibrate_plane(ImagePoints(right.pixels, right.frame, shuffled))
+        calibrate_plane(ImagePoints(right.pixels, right.frame, poses))
     for count in (0, 2, 10):  # of points, two in a frame
         with pytest.raises(InsufficientDataError):
             calibrate_plane(right[np.arange(len(right)) < count])

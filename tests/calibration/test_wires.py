@@ -48,8 +48,8 @@ def scan_phantom(seed, phantom, count=120, **options):
 
 
 def centre_error_mm(solution, mounting=TRIAL_1):
-    found = centre_of(solution.chain.sensor_from_image, solution.chain.pixel_mm)
-    return np.linalg.norm(found - centre_of(mounting, PIXEL_MM))
+    centre = centre_of(solution.chain.sensor_from_image, solution.chain.pixel_mm)
+    return np.linalg.norm(centre - centre_of(mounting, PIXEL_MM))
 
 
 @pytest.mark.parametrize("fit_pixels", [True, False])
@@ -64,7 +64,7 @@ def test_exact_points_of_a_crossing_give_the_exact_calibration(fit_pixels):
 
 
 @pytest.fixture(scope="module")
-def picked(realdata):
+def hand_picks(realdata):
     """54 frames of a crossing, picked by hand to whole pixels."""
     folder = realdata / "cross-wire"
     pixels = np.loadtxt(folder / "crossWirePhantom2DPoints.txt")
@@ -78,8 +78,8 @@ def points_of(pixels, rows):
 
 
 @pytest.mark.realdata
-def test_points_picked_by_hand_are_explained_to_a_millimetre(picked):
-    solution = calibrate_cross_wire(points_of(*picked), settings=ALL_FRAMES)
+def test_points_picked_by_hand_are_explained_to_a_millimetre(hand_picks):
+    solution = calibrate_cross_wire(points_of(*hand_picks), settings=ALL_FRAMES)
     assert solution.used.all()
     # 0.980 mm, and as much with nine free numbers instead of a rigid mounting and two scales, which make
     # image axes 89.9 degrees apart: nothing is left that any mounting could explain.
@@ -88,7 +88,7 @@ def test_points_picked_by_hand_are_explained_to_a_millimetre(picked):
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_any_mounting_and_any_place_of_three_wires_is_found(seed):
+def test_any_mounting_and_place_of_three_wires(seed):
     rng = np.random.default_rng([seed, 9])
     mounting, place = (
         RigidTransform.from_components(rng.uniform(-reach, reach, 3), Rotation.random(rng=rng))
@@ -101,15 +101,15 @@ def test_any_mounting_and_any_place_of_three_wires_is_found(seed):
     assert len(solution.free) == 14
     # The standard error of the centre is 0.04 mm, of the worst angle 0.1 degrees; four times that.
     assert centre_error_mm(solution, mounting) < 0.2
-    turned = (mounting.inv() * solution.chain.sensor_from_image).rotation.magnitude()
-    assert turned < np.deg2rad(0.4)
+    angle = (mounting.inv() * solution.chain.sensor_from_image).rotation.magnitude()
+    assert angle < np.deg2rad(0.4)
     # In frames on image and phantom every mounting is as good as another: 7.8 to 9.9.
     assert solution.condition_number < 15
 
 
-@pytest.mark.parametrize(("labels", "registered"), [([1, 0, 3, 2], False), ([0, 1, 3, 2], True)])
-def test_labels_swapped_throughout_are_refused(labels, registered):
+@pytest.mark.parametrize(("labels", "with_place"), [([1, 0, 3, 2], False), ([0, 1, 3, 2], True)])
+def test_swapped_labels(labels, with_place):
     points = scan_phantom(0, SKEW, 200, noise_mm=0.2, world_from_phantom=PLACE)
-    geometry = replace(SKEW, world_from_phantom=PLACE if registered else None)
+    geometry = replace(SKEW, world_from_phantom=PLACE if with_place else None)
     with pytest.raises(InsufficientDataError, match="phantom"):
         calibrate_wires(replace(points, wire=np.array(labels)[points.wire]), geometry)

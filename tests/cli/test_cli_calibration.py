@@ -19,10 +19,14 @@ def sweep(bench):
 def test_a_turned_calibration_turns_the_reference(run, bench, sweep, tmp_path):
     """The image turned by 30 degrees about its own normal: the world's poses turn with it."""
     about_z = Rotation.from_euler("z", 30, degrees=True)
-    own, path, grid = sweep.tracker.sensor_from_image, tmp_path / "cal.h5", GreyImages(sweep, 60.0).grid
-    turned = {"rotation": own.rotation * about_z, "translation_mm": own.translation, "time_offset_s": None}
+    mounting, path, grid = sweep.tracker.sensor_from_image, tmp_path / "cal.h5", GreyImages(sweep, 60.0).grid
+    pose = {
+        "rotation": mounting.rotation * about_z,
+        "translation_mm": mounting.translation,
+        "time_offset_s": None,
+    }
     pixel_mm = np.array([grid.vector_pitch_mm, grid.sample_spacing_mm])
-    write_calibration(path, example_calibration("tracker", pixel_mm=pixel_mm, **turned))
+    write_calibration(path, example_calibration("tracker", pixel_mm=pixel_mm, **pose))
     options = ("--drift", "pose", "--calibration", path)
     code, _, err = run("reconstruct", bench / "sweep.h5", "-o", tmp_path / "o", *options)
     assert code == 0, err

@@ -13,13 +13,13 @@ from speckle3d.io.calibrations import read_calibration
 from speckle3d.io.sweep_writer import write_sweep
 
 
-def test_two_sweeps_of_a_curved_array_are_calibrated(run, tmp_path):
+def test_two_sweeps_of_a_curved_array(run, tmp_path):
     grid = ImageGrid.of_fan(96, 200, 0.2, 40.0, (-0.45, 0.45))
     *sweeps, truth = crossing_sweeps(0, frames=36, grid=grid)
     files = [tmp_path / name for name in ("one.h5", "across.h5")]
-    for path, made in zip(files, sweeps, strict=True):
-        tracker = Tracker(made.readings)
-        write_sweep(path, Sweep(made.images, grid, BModeSettings(60.0), made.frame_time_s, tracker=tracker))
+    for path, sweep in zip(files, sweeps, strict=True):
+        tracker = Tracker(sweep.readings)
+        write_sweep(path, Sweep(sweep.images, grid, BModeSettings(60.0), sweep.frame_time_s, tracker=tracker))
     start = displace(truth, np.random.default_rng(3), 2.0, 2.0)
     degrees = np.rad2deg(roll_yaw_tilt(start.rotation))
     code, _, err = run(
@@ -27,12 +27,15 @@ def test_two_sweeps_of_a_curved_array_are_calibrated(run, tmp_path):
         *("--capture-deg", "0", "--start-mm", *start.translation, "--start-deg", *degrees),
     )
     assert code == 0, err
-    found = read_calibration(tmp_path / "tracker.h5")
-    error, moved = centre_error_mm(found.sensor_from_image, truth, grid), found.covariance[3:, 3:]
+    calibration = read_calibration(tmp_path / "tracker.h5")
+    error, covariance = (
+        centre_error_mm(calibration.sensor_from_image, truth, grid),
+        calibration.covariance[3:, 3:],
+    )
     # As of parallel lines: 0.1 mm across and out of plane, 0.3 along the beam.
     assert np.linalg.norm(error) < 0.5
     assert np.linalg.norm(error[[0, 2]]) < 0.15
-    assert np.sqrt(np.diag(moved)).max() < 1.0
+    assert np.sqrt(np.diag(covariance)).max() < 1.0
 
 
 @pytest.mark.slow

@@ -20,11 +20,11 @@ RATE_HZ = 50.0
 def recording(back):
     """Tissue passed forward and back; the simulated images, not the sensor."""
     sweep = load_sweep(back)
-    made = GreyImages(sweep, 60.0, clipped=False)
-    return sweep, np.stack([made[i] for i in range(len(sweep))]), made.grid
+    grey = GreyImages(sweep, 60.0, clipped=False)
+    return sweep, np.stack([grey[i] for i in range(len(sweep))]), grey.grid
 
 
-def tracked(recording, offset_s, jitter_mm=0.0, seed=0):
+def recording_with(recording, offset_s, jitter_mm=0.0, seed=0):
     """The images with readings of their true poses on another clock; frames at the ends have none."""
     sweep, images, grid = recording
     times = np.arange(sweep.frame_time_s[0], sweep.frame_time_s[-1], 1.0 / RATE_HZ)
@@ -36,24 +36,24 @@ def tracked(recording, offset_s, jitter_mm=0.0, seed=0):
 
 # Two milliseconds is the target; the poses here are interpolated between frames 40 ms apart.
 @pytest.mark.parametrize("offset_s", [0.065, -0.03])
-def test_a_known_delay_is_found(recording, offset_s):
-    found = delay_from_images(tracked(recording, offset_s), RigidTransform.identity(), 0.15)
-    assert found.seconds == pytest.approx(offset_s, abs=0.002)
-    assert found.standard_error_s < 0.002
+def test_delay_of_simulated_tissue(recording, offset_s):
+    delay = delay_from_images(recording_with(recording, offset_s), RigidTransform.identity(), 0.15)
+    assert delay.seconds == pytest.approx(offset_s, abs=0.002)
+    assert delay.standard_error_s < 0.002
 
 
 @pytest.mark.slow
 def test_the_standard_error_knows_the_trackers_jitter(recording):
-    exact = delay_from_images(tracked(recording, 0.02), RigidTransform.identity(), 0.1)
+    exact = delay_from_images(recording_with(recording, 0.02), RigidTransform.identity(), 0.1)
     noisy = [
-        delay_from_images(tracked(recording, 0.02, 0.2, seed), RigidTransform.identity(), 0.1)
+        delay_from_images(recording_with(recording, 0.02, 0.2, seed), RigidTransform.identity(), 0.1)
         for seed in (1, 2, 3)
     ]
     # 0.2 mm in 100 readings at 10 mm/s: 0.2 * 2 / 10 / 20 = 2 ms, less what counts for the bootstrap too.
-    for found in noisy:
-        assert found.standard_error_s > exact.standard_error_s
-        assert 0.0012 < found.standard_error_s < 0.006
-        assert abs(found.seconds - 0.02) < 3.0 * found.standard_error_s
+    for delay in noisy:
+        assert delay.standard_error_s > exact.standard_error_s
+        assert 0.0012 < delay.standard_error_s < 0.006
+        assert abs(delay.seconds - 0.02) < 3.0 * delay.standard_error_s
 
 
 def noise(images):
@@ -67,7 +67,7 @@ def noise(images):
         (noise, 0.0, 0.4),
     ],
 )
-def test_images_that_do_not_show_where_they_were_taken_are_refused(recording, change, offset_s, search_s):
-    whole = tracked(recording, offset_s)
+def test_no_delay_outside_the_range_or_of_noise(recording, change, offset_s, search_s):
+    whole = recording_with(recording, offset_s)
     with pytest.raises(InsufficientDataError, match="--search-s"):
         delay_from_images(replace(whole, images=change(whole.images)), RigidTransform.identity(), search_s)

@@ -22,7 +22,7 @@ def hand(seed, count=5):
     return lambda t: np.sin(2 * np.pi * frequency * np.asarray(t)[..., None] + phase).sum(-1) / np.sqrt(count)
 
 
-def recorded(seed, *, seconds=12.0, noise_mm=0.1, jitter_mm=0.1):
+def simulate(seed, *, seconds=12.0, noise_mm=0.1, jitter_mm=0.1):
     """Line depth and slope in frames, and both kinds of readings whose clock is behind by `DELAY_S`."""
     rng = np.random.default_rng(seed)
     height, tilt = hand(seed), hand(seed + 1000)
@@ -41,17 +41,17 @@ def recorded(seed, *, seconds=12.0, noise_mm=0.1, jitter_mm=0.1):
 @pytest.mark.parametrize("kind", ["tracker", "orientation"])
 def test_a_delay_is_found_within_two_milliseconds(kind):
     for seed in range(3):
-        signal, frames, poses, rotations = recorded(seed)
-        found = delay_from_lines(signal, frames, poses if kind == "tracker" else rotations)
-        assert found.seconds == pytest.approx(DELAY_S, abs=0.002)
-        assert found.followed > 0.9
+        signal, frames, poses, rotations = simulate(seed)
+        delay = delay_from_lines(signal, frames, poses if kind == "tracker" else rotations)
+        assert delay.seconds == pytest.approx(DELAY_S, abs=0.002)
+        assert delay.followed > 0.9
 
 
-def test_what_tells_no_one_delay_is_refused():
-    signal, frames, poses, _ = recorded(0, noise_mm=0.01, jitter_mm=0.01)
-    other = recorded(50, noise_mm=0.01)[0]
+def test_no_delay_of_another_motion_or_outside_the_range():
+    signal, frames, poses, _ = simulate(0, noise_mm=0.01, jitter_mm=0.01)
+    noise_signal = simulate(50, noise_mm=0.01)[0]
     for arguments in (
-        (other, frames, poses),  # of another motion
+        (noise_signal, frames, poses),  # of another motion
         (signal, frames, poses, 0.0, 0.05),  # beyond the range searched
     ):
         with pytest.raises(InsufficientDataError):
@@ -63,11 +63,11 @@ def test_what_tells_no_one_delay_is_refused():
 @pytest.mark.realdata
 def test_the_real_water_tank_has_the_published_delay(realdata):
     plus = realdata / "plus"
-    needed = ImportSettings(column_pitch_mm=0.078, row_spacing_mm=0.078, dynamic_range_db=60.0)
-    sweep = load_sweep(plus / "WaterTankBottomTranslationVideoBuffer.igs.mha", needed)
+    settings = ImportSettings(column_pitch_mm=0.078, row_spacing_mm=0.078, dynamic_range_db=60.0)
+    sweep = load_sweep(plus / "WaterTankBottomTranslationVideoBuffer.igs.mha", settings)
     readings = read_poses(plus / "WaterTankBottomTranslationTrackerBuffer.igs.mha").readings
     lines = detect_lines(sweep.frames, (0.078, 0.078))
     signal = line_signal(lines.pixels, np.array([0.078, 0.078]), 409.5)
-    found = delay_from_lines(signal, sweep.frame_time_s[lines.frame], readings)
+    delay = delay_from_lines(signal, sweep.frame_time_s[lines.frame], readings)
     # PLUS: TrackerLagSec -0.0648266, the same delay with its sign the other way round. Measured 0.0652.
-    assert found.seconds == pytest.approx(0.0648266, abs=0.003)
+    assert delay.seconds == pytest.approx(0.0648266, abs=0.003)

@@ -14,7 +14,7 @@ from speckle3d.core.streams import TimedPoses
 OFFSET_S = 0.08
 
 
-def found(seed, search_s):
+def estimate(seed, search_s):
     """The offset of a tracker whose clock is behind; the solver starts at the answer, which is quick."""
     floor = Floor(seed)
     frame_s, sensor_s = floor.time_s, np.arange(-1.0, floor.time_s[-1] + 1.0, 1 / 50.0)
@@ -24,18 +24,18 @@ def found(seed, search_s):
     frame_s, pixels = frame_s[inside], pixels[inside]
     points = ImagePoints.of_lines(np.arange(len(frame_s)), pixels, readings.at(frame_s), frame_s)
     return estimate_offset(
-        lambda some: Problem(Plane(), POSE).solve(some, truth), points, readings, search_s=search_s
+        lambda subset: Problem(Plane(), POSE).solve(subset, truth), points, readings, search_s=search_s
     )
 
 
 def test_a_clock_that_is_off_is_found_within_the_claimed_error():
-    offset = found(0, search_s=0.14)
+    offset = estimate(0, search_s=0.14)
     # Over hundreds of recordings clocks err by 1.0 to 1.2 times what is claimed; three of those.
     assert abs(offset.seconds - OFFSET_S) < 3.6 * offset.standard_error_s
     # Hands turn by some 20 degrees/s: 0.3 degrees or 0.2 mm in 100 frames are a few milliseconds.
     assert offset.standard_error_s < 0.002
 
 
-def test_a_clock_beyond_the_range_is_refused():
+def test_a_clock_beyond_the_range():
     with pytest.raises(InsufficientDataError, match="range"):
-        found(0, search_s=0.06)
+        estimate(0, search_s=0.06)

@@ -7,8 +7,8 @@ from calibration.detection.dots import dots_in_frames
 
 
 def dots_in(image, *options):
-    seen = dots_in_frames(image[None], *options)
-    return seen.pixels, seen.score
+    dots = dots_in_frames(image[None], *options)
+    return dots.pixels, dots.score
 
 
 @given(u=st.floats(20, 100), v=st.floats(20, 80), gain=st.floats(0.1, 1000), floor=st.floats(-50, 50))
@@ -26,15 +26,15 @@ def test_a_dot_is_placed_between_pixels_whatever_the_gain(u, v, gain, floor):
 
 
 def test_wires_are_found_in_speckle_through_side_lobes_and_ringing():
-    shown, rng = scene(1, frames=12), np.random.default_rng(0)
+    wires, rng = scene(1, frames=12), np.random.default_rng(0)
     away, ranks = [], []
-    for i, true in enumerate(shown.pixels):
+    for i, true in enumerate(wires.pixels):
         image = picture(true, seed=i, strength=rng.uniform(0.2, 1.5, len(true)))
         pixels, score = dots_in(image, PIXEL_MM)
         assert (np.diff(score) <= 0).all()
-        apart = np.linalg.norm((pixels[None] - true[:, None]) * PIXEL_MM, axis=2)
-        away.append(apart.min(axis=1))
-        ranks.append(apart.argmin(axis=1).max())
+        distance = np.linalg.norm((pixels[None] - true[:, None]) * PIXEL_MM, axis=2)
+        away.append(distance.min(axis=1))
+        ranks.append(distance.argmin(axis=1).max())
     # The first ring, a third of the dot 0.7 mm beneath it, moves a mean of all the echo by 0.2 mm.
     assert np.max(away) < 0.2
     # Nine wires, and three in four frames without any candidate before the last of them.

@@ -34,7 +34,7 @@ def floor_echo(
     depth_mm=10.0,
     degrees=5.0,
     rough_mm=0.3,
-    lit=np.ones_like,
+    brightness=np.ones_like,
     reverberation=0.3,
     lobes=0.02,
     haze=0.05,
@@ -42,15 +42,15 @@ def floor_echo(
 ):
     """Amplitude (column, row) of a floor through `depth_mm` in the image's middle, sinking by `degrees`.
 
-    Its scatterers lie from the floor to some `rough_mm` beneath; `lit` says how strongly each place across
-    (0 to 1) answers. Echoes come again beneath, the wide side lobes show the floor above it, and there are
+    Its scatterers lie from the floor to some `rough_mm` beneath; `brightness` is their amplitude by place
+    across (0 to 1). Echoes come again beneath, the wide side lobes show the floor above it, and there are
     echoes of anything in the water.
     """
     rng = np.random.default_rng(seed)
     width, height = np.multiply(SHAPE, PIXEL_MM)
     x = rng.uniform(-2.0, width + 2.0, int(12 * width))
     y = depth_mm + np.tan(np.radians(degrees)) * (x - (SHAPE[0] - 1) * PIXEL_MM[0] / 2)
-    strength = (rng.normal(size=x.size) + 1j * rng.normal(size=x.size)) * lit(x / width)
+    strength = (rng.normal(size=x.size) + 1j * rng.normal(size=x.size)) * brightness(x / width)
     floor = np.stack([x, y + rng.exponential(rough_mm, x.size)], axis=1)
     dust = rng.uniform([0, 0], [width, height], (int(width * height / 4), 2))
     groups = [
@@ -85,7 +85,7 @@ def detect_line(image, settings=None):
         ({"noise": 0.05}, -14.0),
         ({"haze": 0.15, "lobes": 0.04}, 12.0),
         ({"reverberation": 1.0}, -14.0),
-        ({"lit": lambda place: np.where(np.abs(place - 0.4) > 0.12, 1.0, 0.0)}, 12.0),
+        ({"brightness": lambda place: np.where(np.abs(place - 0.4) > 0.12, 1.0, 0.0)}, 12.0),
     ],
     ids=["noise", "haze", "reverberations as bright", "drop-out"],
 )
@@ -98,7 +98,7 @@ def test_a_floor_is_found_where_it_is(conditions, degrees):
     assert 0.7 * line.possible <= line.consensus <= line.possible <= 61
 
 
-def test_where_on_the_echo_the_line_is_put():
+def test_places_on_an_echo():
     image = floor_image(4, 10.0, 3.0, rough_mm=0.1)
     depths = [
         too_deep_mm(detect_line(image, LineSettings(place=place)), 10.0, 3.0).mean()
@@ -109,7 +109,7 @@ def test_where_on_the_echo_the_line_is_put():
     assert abs(depths[2]) < 0.2  # a rough floor's own depth and half
 
 
-def test_images_without_a_line_are_refused():
+def test_images_without_a_line():
     noise = [np.random.default_rng(seed).integers(0, 256, SHAPE, dtype=np.uint8) for seed in range(20)]
     darker = np.tile(np.arange(300, 0, -1.0), (160, 1))
     for image in (*noise, darker, np.zeros(SHAPE), np.where(np.eye(*SHAPE) > 0, np.nan, floor_echo(0))):

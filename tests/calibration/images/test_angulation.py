@@ -24,12 +24,12 @@ def fan(frames, degrees, length, heading_deg):
 )
 def test_sweeps_that_hardly_cross_or_fan_are_refused_with_the_advice(degrees, heading_deg, word):
     first, second = fan(60, degrees, 20.0, 0.0), fan(60, degrees, 20.0, heading_deg)
-    found = angulation(first, second, RigidTransform.identity())
-    assert found.crossing_deg == pytest.approx(heading_deg, abs=1e-6)
-    assert found.fan_deg == pytest.approx((degrees, degrees))
-    assert word in found.verdict
-    if found.verdict.startswith("insufficient"):
+    angles = angulation(first, second, RigidTransform.identity())
+    assert angles.crossing_deg == pytest.approx(heading_deg, abs=1e-6)
+    assert angles.fan_deg == pytest.approx((degrees, degrees))
+    assert word in angles.verdict
+    if angles.verdict.startswith("insufficient"):
         with pytest.raises(InsufficientDataError, match=word):
-            found.require()
+            angles.require()
     else:
-        found.require()
+        angles.require()

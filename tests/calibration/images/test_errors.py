@@ -33,22 +33,22 @@ def test_a_tracker_that_displaces_a_sweep_is_within_the_claims(scene, crossing):
     centre = second.world_from_sensor(np.arange(24)) * truth
     about = RigidTransform.from_translation(centre.apply(first.grid.centre_mm).mean(axis=0))
     poses = about * nudge * about.inv() * second.readings.world_from_sensor
-    moved = dataclasses.replace(second, readings=TimedPoses(second.readings.time_s, poses))
+    shifted_sweep = dataclasses.replace(second, readings=TimedPoses(second.readings.time_s, poses))
     settings = ImageFit(capture_mm=0.0, capture_deg=0.0, tracker_mm=0.3, tracker_deg=0.15)
     plain = calibrate_from_sweeps(crossing, truth, settings)
-    found = calibrate_from_sweeps(prepare(first, moved), truth, settings)
-    off = plain.sensor_from_image.inv() * found.sensor_from_image
-    turns, errors = off.rotation.as_rotvec(), np.sqrt(np.diag(found.covariance)[:3])
+    nudged = calibrate_from_sweeps(prepare(first, shifted_sweep), truth, settings)
+    off = plain.sensor_from_image.inv() * nudged.sensor_from_image
+    turns, errors = off.rotation.as_rotvec(), np.sqrt(np.diag(nudged.covariance)[:3])
     shifts = off.apply(first.grid.centre_mm) - first.grid.centre_mm
-    spread = np.sqrt(np.diag(found.covariance_of(first.grid.centre_mm)))
+    spread = np.sqrt(np.diag(nudged.covariance_of(first.grid.centre_mm)))
     # Displacements of one standard error each move the answer, and within two and a half of what is claimed.
     assert np.linalg.norm(shifts) > 0.15
     assert (np.abs(shifts) < 2.5 * spread).all()
     assert (np.abs(turns) < 2.5 * errors).all()
     # And claims without a word of it would be too small.
-    told = settings.model_copy(update={"tracker_mm": 0.0, "tracker_deg": 0.0})
+    no_tracker = settings.model_copy(update={"tracker_mm": 0.0, "tracker_deg": 0.0})
     silent = np.sqrt(
-        np.diag(calibrate_from_sweeps(crossing, truth, told).covariance_of(first.grid.centre_mm))
+        np.diag(calibrate_from_sweeps(crossing, truth, no_tracker).covariance_of(first.grid.centre_mm))
     )
     assert (silent[[0, 2]] < 0.5 * spread[[0, 2]]).all()
     assert silent[1] > DEEP_MM * crossing.unit

@@ -18,36 +18,36 @@ def crossing(scene):
 
 
 @pytest.fixture(scope="module")
-def found(scene, crossing):
+def calibration(scene, crossing):
     start = displace(scene[2], np.random.default_rng(0))
     return calibrate_from_sweeps(crossing, start)
 
 
 @pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
-def test_far_starts_reach_the_truth(scene, crossing, found, seed):
+def test_far_starts_reach_the_truth(scene, crossing, calibration, seed):
     start = displace(scene[2], np.random.default_rng(seed))
-    result = found if seed == 0 else calibrate_from_sweeps(crossing, start)
+    result = calibration if seed == 0 else calibrate_from_sweeps(crossing, start)
     error = centre_error_mm(result.sensor_from_image, scene[2], scene[0].grid)
     # Of it, 0.1 mm along the beams comes from the tracker: 0.1 mm and 0.05 degrees of jitter.
     assert np.linalg.norm(error) < 0.5
     assert np.linalg.norm(error[[0, 2]]) < 0.1
-    turned = (scene[2].inv() * result.sensor_from_image).rotation.magnitude()
-    assert np.rad2deg(turned) < 0.5
+    angle = (scene[2].inv() * result.sensor_from_image).rotation.magnitude()
+    assert np.rad2deg(angle) < 0.5
     assert result.after > 0.9
 
 
-def test_errors_are_within_what_the_covariance_says(scene, found):
+def test_errors_are_within_what_the_covariance_says(scene, calibration):
     grid, truth = scene[0].grid, scene[2]
-    spread = np.sqrt(np.diag(found.covariance_of(grid.centre_mm)))
-    assert (np.abs(centre_error_mm(found.sensor_from_image, truth, grid)) < 4.0 * spread).all()
-    turned = (truth.inv() * found.sensor_from_image).rotation.as_rotvec()
-    assert (np.abs(turned) < 4.0 * np.sqrt(np.diag(found.covariance)[:3])).all()
+    spread = np.sqrt(np.diag(calibration.covariance_of(grid.centre_mm)))
+    assert (np.abs(centre_error_mm(calibration.sensor_from_image, truth, grid)) < 4.0 * spread).all()
+    angle = (truth.inv() * calibration.sensor_from_image).rotation.as_rotvec()
+    assert (np.abs(angle) < 4.0 * np.sqrt(np.diag(calibration.covariance)[:3])).all()
     # Neither is it a bound that anything keeps. What the tracker may displace a sweep by, 0.15 mm, makes up
     # most of it: 0.1 mm across and out of plane, twice that along the beam.
     assert (spread < [0.15, 0.3, 0.15]).all()
 
 
 @pytest.mark.slow
-def test_sweeps_of_different_things_are_refused(scene):
+def test_sweeps_of_different_things(scene):
     with pytest.raises(InsufficientDataError):
         calibrate_images(scene[0], crossing_sweeps(1, frames=20)[1], scene[2])
