@@ -63,6 +63,10 @@ SIDEWAYS = "shift the probe sideways (the phantom then appears elsewhere across 
 UP_AND_DOWN = "move the probe up and down (the phantom then appears at other depths)"
 MOTIONS = (TILT, YAW, ROLL, SIDEWAYS, UP_AND_DOWN)
 
+_DOUBTS = (
+    "do images and readings belong together (one clock, one order, readings in mm), and are the phantom, its "
+    "wires and their numbers the ones named?"
+)
 _WORDS = (
     "the distance between columns", "the distance between rows",
     "the image's place across the beam", "the image's place along the beam", "the image's place out of plane",
@@ -80,7 +84,7 @@ class Adequacy:
     standard_error : float
         Of the image's worst corner, mm; about its worst axis, rad, where only directions are known.
     missing : tuple of str
-        Motions that would help; none if the answer is certain enough.
+        Motions that would help, or a doubt about the data; none if the answer is certain enough.
     """
 
     standard_error: float
@@ -125,15 +129,11 @@ def judge(solution: Solution) -> Adequacy:
     errors = np.maximum(white, _errors(solution, solution.full_covariance))
     excess, weak = float((errors / LIMITS).max()), bool((errors > WEAK).any())
     error = float(errors[int(angular)])
-    share = MISFIT[int(angular)] / max(solution.rms, np.finfo(float).tiny)
-    # Where even a phantom that fits would not determine the answer, the misfit comes from the motion: the
+    rms, usual = solution.rms, WEAK[int(angular)]
+    # Where residuals of the usual size would not determine the answer, the misfit comes from the motion: the
     # solver runs away in the direction left open.
-    if share < 1 and share * float((white / LIMITS).max()) <= _LET_PASS:
-        misfit = (
-            f"the phantom does not explain the images (they miss it by {_size(solution.rms, angular)}): do "
-            "the images and the sensor readings belong together, and are the phantom, its wires and their "
-            "numbers the ones named?"
-        )
+    if rms > MISFIT[int(angular)] and usual / rms * float((white / LIMITS).max()) <= _LET_PASS:
+        misfit = f"the phantom does not explain the images (they miss it by {_size(rms, angular)}): {_DOUBTS}"
         return Adequacy(error, (), True, misfit)
     ambiguous = solution.evidence < TIE
     extent_of = extents(solution)
@@ -145,8 +145,11 @@ def judge(solution: Solution) -> Adequacy:
     no_size = solution.phantom.seen_as == "line" and solution.prior is None and "s_x" in solution.free
     no_size &= UP_AND_DOWN in lacking
     inadequate = bool(excess > limit or not condition <= MAX_CONDITION or ambiguous or no_size)
-    # If none is absent, the least of them.
-    missing = tuple(lacking or [min(extent_of, key=extent_of.__getitem__)]) if weak or inadequate else ()
+    noisy = rms > usual and not lacking
+    missing = tuple(lacking) if weak or inadequate else ()
+    if (weak or inadequate) and not lacking:
+        doubt = f"the images miss the phantom by {_size(rms, angular)} (RMS); {_DOUBTS}"
+        missing = (doubt if noisy else min(extent_of, key=extent_of.__getitem__),)
     state = f"standard error {_size(error, angular)}" + ("" if angular else " at the image's corners")
     if not angular and np.argmax(errors / LIMITS) == 1:
         state += f" and {_size(errors[1], True)}"
@@ -154,15 +157,13 @@ def judge(solution: Solution) -> Adequacy:
     verdict = "the motion was sufficient"
     if ambiguous and excess <= limit:
         verdict = "two answers explain the images equally well, one of them mirrored"
-    elif inadequate:
-        verdict = "the motion does not determine the calibration"
-    elif weak:
-        verdict = "the motion weakly determines the calibration"
+    elif inadequate or weak:
+        cause = "with residuals so large, the motion" if noisy else "the motion"
+        verdict = f"{cause} {'does not determine' if inadequate else 'weakly determines'} the calibration"
     verdict += f" ({state})"
     if missing:
         deviations = np.sqrt(np.maximum(np.diag(independent), np.diag(solution.full_covariance)))
-        least = least_certain(solution, deviations)
-        verdict += f": {'; and '.join(missing)}. Least certain without that is {least}"
+        verdict += f". Least certain is {least_certain(solution, deviations)}: {'; and '.join(missing)}"
     verdict += f"; {solution.assumed}" if solution.assumed else ""
     return Adequacy(error, missing, inadequate, verdict)
 
@@ -251,4 +252,5 @@ def _errors(solution: Solution, covariance: FloatArray) -> FloatArray:
 
 
 def _size(error: float, angular: bool) -> str:
-    return f"{np.rad2deg(error):.2g} degrees" if angular else f"{error:.2g} mm"
+    value, unit = (np.rad2deg(error), "degrees") if angular else (error, "mm")
+    return f"{value:.2g} {unit}" if value < 100 else f"{value:.0f} {unit}"

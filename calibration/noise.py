@@ -171,6 +171,8 @@ def fit_wandering(
     steps = -np.einsum("gij,gj->gi", spread, pull)
     step = weight @ steps
     away = steps - step
+    # Student's: of few residuals the variance itself is uncertain.
+    spread *= free / max(free - 2, 1)
     covariance = np.einsum("g,gij->ij", weight, spread) + (weight * away.T) @ away
     noise = Noise(
         step / scale,

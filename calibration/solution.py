@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.special import ndtr, stdtrit
 
 from calibration.motion import Adequacy, judge
 from calibration.noise import fit_noise
@@ -207,7 +208,7 @@ class Problem:
         first = [name for name in self.free if self.prior is None or name not in SCALES]
         chain = equations.least_absolute(start, first)
         residuals = equations.residuals(chain)
-        inliers = _within(residuals, points.frame, self.outlier_sigma * sigma_of(residuals))
+        inliers = _within(residuals, points.frame, self._limit(residuals))
         for _ in range(_ROUNDS):
             frames, agreeing = len(points.frames), len(np.unique(points.frame[inliers]))
             if 2 * agreeing <= frames:
@@ -218,10 +219,17 @@ class Problem:
             sigma, before = sigma_of(residuals[inliers]), inliers
             chain = equations[inliers].least_squares(chain, self.free, self.prior, sigma)
             residuals = equations.residuals(chain)
-            inliers = _within(residuals, points.frame, self.outlier_sigma * sigma_of(residuals[before]))
+            inliers = _within(residuals, points.frame, self._limit(residuals[before]))
             if (inliers == before).all():
                 break
         return chain, inliers
+
+    def _limit(self, residuals: FloatArray) -> float:
+        """Largest residual that agrees with the others: Student's quantile as rare as `outlier_sigma`."""
+        count = residuals.size
+        free = max(count - len(self.free), 1)
+        quantile = abs(float(stdtrit(free, ndtr(-self.outlier_sigma))))
+        return quantile * sigma_of(residuals) * float(np.sqrt(count / free))
 
     def best(self, points: ImagePoints, starts: Sequence[Chain]) -> Solution:
         """Solve from several starts and their discrete alternatives; the best solution, with its rival.

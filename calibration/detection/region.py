@@ -154,7 +154,7 @@ def detect_in_frames(
     find: Callable[[npt.NDArray[Any]], tuple[FloatArray, FloatArray]],
     progress: Callable[[int, int], None] | None = None,
 ) -> Detections:
-    """Apply a detector to every frame, read one at a time; an error names the frame.
+    """Apply a detector to every frame but repeats, read one at a time; an error names the frame.
 
     Parameters
     ----------
@@ -166,14 +166,18 @@ def detect_in_frames(
         Called with the number of frames done and their total.
     """
     count, numbers, reasons = frames.shape[0], list[int](), dict[int, str]()
-    detections = list[tuple[FloatArray, FloatArray]]()
+    detections, previous = list[tuple[FloatArray, FloatArray]](), np.zeros(0)
     for index in range(count):
+        image = frames[index]
         with naming(f"frame {index}"):
             try:
-                detections.append(find(frames[index]))
+                if np.array_equal(image, previous):
+                    raise InsufficientDataError("the image repeats the one before")
+                detections.append(find(image))
                 numbers += [index] * len(detections[-1][1])
             except InsufficientDataError as error:
                 reasons[index] = str(error)
+        previous = image
         if progress:
             progress(index + 1, count)
     pixels, scores = map(np.concatenate, zip(*detections, strict=True)) if detections else np.zeros((2, 0, 2))

@@ -35,5 +35,5 @@ def test_one_size_and_time_give_what_dense_algebra_gives():
     residual = residuals + jacobian @ step
     variance = residual @ np.linalg.solve(whole, residual) / 117
     np.testing.assert_allclose(noise.step, step, rtol=1e-9)
-    np.testing.assert_allclose(noise.covariance, variance * bread, rtol=1e-9)
+    np.testing.assert_allclose(noise.covariance, variance * bread * 117 / 115, rtol=1e-9)
     assert noise.white == pytest.approx(np.sqrt(variance))

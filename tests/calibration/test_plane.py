@@ -126,3 +126,28 @@ def test_shuffled_poses_few_lines_and_no_pixel_size():
             calibrate_plane(right[np.arange(len(right)) < count])
     with pytest.raises(InvalidInputError):
         calibrate_plane(right, settings=FIXED)
+
+
+def test_few_good_lines_are_kept_and_their_errors_claimed():
+    scores, shares = [], []
+    for seed in range(12):
+        rng = np.random.default_rng([seed, 44])
+        scan = scan_plane(rng, 16, tilt_deg=30.0, roll_deg=15.0, line_noise_mm=0.2).lines
+        try:
+            solution = calibrate_plane(scan, PIXEL_MM)
+        except InsufficientDataError:
+            continue
+        step = solution.chain.sensor_from_image.inv() * TRIAL_1
+        errors = np.concatenate([step.rotation.as_rotvec(), step.translation])
+        scores.append(errors / np.sqrt(np.diag(solution.image_covariance(IMAGE))))
+        shares.append(solution.used.mean())
+    assert len(scores) >= 4
+    assert np.mean(shares) > 0.96
+    assert np.sqrt(np.mean(np.square(scores))) < 1.5
+
+
+def test_readings_in_centimetres_are_not_taken_for_a_lack_of_motion():
+    poses = (right := lines(noise_mm=0.2)).world_from_sensor
+    shrunk = RigidTransform.from_components(poses.translation / 10.0, poses.rotation)
+    with pytest.raises(InsufficientDataError, match="readings in mm"):
+        calibrate_plane(ImagePoints(right.pixels, right.frame, shrunk), PIXEL_MM)

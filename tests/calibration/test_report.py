@@ -62,7 +62,7 @@ def test_a_weak_verdict_names_what_is_known_least_with_its_interval():
     lines = ImagePoints(directions, np.arange(60), RigidTransform.from_rotation(readings))
     solution = calibrate_orientation(lines, np.ones(2))
     deviations = np.sqrt(np.diag(solution.image_covariance(("gamma", "beta", "alpha"))))
-    words = re.search(r"Least certain without that is (\w+), \+- (\S+) deg", solution.adequacy.verdict)
+    words = re.search(r"Least certain is (\w+), \+- (\S+) deg", solution.adequacy.verdict)
     name, half = words.groups()
     assert name == ("tilt", "yaw", "roll")[int(np.argmax(deviations))]
     assert float(half) == pytest.approx(np.rad2deg(1.96 * deviations.max()), rel=0.1)

@@ -96,7 +96,8 @@ def images(
     mounting = a.mounting if calibration is None else calibration.sensor_from_image
     begin = _start(start_mm, start_deg, mounting, first)
     # Half of the limits: a mounting that is off by 20 degrees is good enough for no more.
-    angulation(*(sweep.world_from_sensor(sweep.covered()) for sweep in (a, b)), begin).require(0.5)
+    poses_a, poses_b = (sweep.world_from_sensor(sweep.covered()) for sweep in (a, b))
+    angulation(poses_a, poses_b, begin).require(0.5)
     with progress_bar("comparing sweeps") as bar:
         result = calibrate_images(a, b, begin, settings, bar)
     notes, answer = notes_of(result), calibration_from_images(result, (a, b))

@@ -40,3 +40,11 @@ def test_wires_are_found_in_speckle_through_side_lobes_and_ringing():
     # Nine wires, and three in four frames without any candidate before the last of them.
     assert max(ranks) < 12
     assert np.median(ranks) == 8
+
+
+def test_a_repeated_image_is_left_out():
+    wires = scene(1, frames=2)
+    first, second = (picture(pixels, seed=i) for i, pixels in enumerate(wires.pixels))
+    dots = dots_in_frames(np.stack([first, first, second, first]), PIXEL_MM)
+    assert list(dots.dropped) == [1]
+    assert set(dots.frame) == {0, 2, 3}
