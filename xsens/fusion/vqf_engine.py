@@ -85,6 +85,6 @@ def _at(places: FloatArray, grid: FloatArray, values: FloatArray) -> FloatArray:
 
 
 def _apart(first: FloatArray, second: FloatArray) -> FloatArray:
-    """Turn between quaternions, scalar last, about each of the world's axes, to a sign, rad."""
-    (v, w), (u, z) = ((q[:, :3], q[:, 3:]) for q in (first, second))
-    return np.asarray(2.0 * np.arcsin(np.clip(z * v - w * u - np.cross(v, u), -1.0, 1.0)))
+    """Turn between quaternions, scalar last, about each of the world's axes, rad."""
+    turns = Rotation.from_quat(first) * Rotation.from_quat(second).inv()
+    return np.asarray(2.0 * np.arcsin(turns.as_quat(canonical=True)[:, :3]))

@@ -35,12 +35,14 @@ from xsens.logs.texttables import (
 from xsens.logs.worlds import Claim, are_rotations
 
 _SENSOR_LIKE = re.compile(r"acc|gyr|mag|quat|euler|roll|pitch|yaw|time", re.ASCII)
-_IS = r"\s*[:=,;][,;\s]*"
+_EQUALS = r"\s*[:=,;][,;\s]*"
 _RATE = re.compile(
-    rf"(?:update|output|sampl(?:e|ing)|data)[ _]?(?:rate|frequency)(?:[ _]?\(?hz\)?)?{_IS}([0-9.e+-]+)",
+    rf"(?:update|output|sampl(?:e|ing)|data)[ _]?(?:rate|frequency)(?:[ _]?\(?hz\)?)?{_EQUALS}([0-9.e+-]+)",
     re.IGNORECASE,
 )
-_WORLD = re.compile(rf"(# world|.*\b(?:coordinate ?system|frame|world)){_IS}(ENU|NED|NWU)\b", re.IGNORECASE)
+_WORLD = re.compile(
+    rf"(# world|.*\b(?:coordinate ?system|frame|world)){_EQUALS}(ENU|NED|NWU)\b", re.IGNORECASE
+)
 """What names the orientation's world; nothing outweighs a plain file's."""
 
 _ENOUGH = 1000

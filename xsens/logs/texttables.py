@@ -86,15 +86,17 @@ _UNITS = {
 """Units by quantity; the field stays in the unit it is in, and angles are in degrees."""
 
 _SPELLINGS = {
-    "s": "(?:per_)?sec(?:ond)?s?",
-    "ms": "m(?:illi)?sec(?:ond)?s?|millis",
-    "us": "(?:u|micro)sec(?:ond)?s?|micros",
-    "ns": "n(?:ano)?sec(?:ond)?s?|nanos",
-    "deg": "degrees?",
-    "rad": "radians?",
+    short: re.compile(rf"(?<![^_])(?:{spelling})(?![^_])")
+    for short, spelling in (
+        ("s", "(?:per_)?sec(?:ond)?s?"),
+        ("ms", "m(?:illi)?sec(?:ond)?s?|millis"),
+        ("us", "(?:u|micro)sec(?:ond)?s?|micros"),
+        ("ns", "n(?:ano)?sec(?:ond)?s?|nanos"),
+        ("deg", "degrees?"),
+        ("rad", "radians?"),
+    )
 }
-_WORDS = {short: re.compile(rf"(?<![^_])(?:{spelling})(?![^_])") for short, spelling in _SPELLINGS.items()}
-"""Units as they may be spelt out."""
+"""Units by how they may be spelt out."""
 
 _AXES = {
     "quat": {"0": "w", "1": "x", "2": "y", "3": "z", "scalar": "w"},
@@ -120,7 +122,7 @@ def column_of(name: str) -> tuple[str, float | None] | None:
     With it comes what turns its numbers to SI units, None if the name states no unit.
     """
     words = re.sub(r"[^a-z0-9°µ]+", "_", name.replace("²", "2")).strip("_")
-    for short, spelling in _WORDS.items():
+    for short, spelling in _SPELLINGS.items():
         words = spelling.sub(short, words)
     if words in TIMES:  # as millis
         return "time", TIMES[words]
