@@ -63,7 +63,9 @@ class Video:
         self._path = path
         with reading(path, Exception):  # of whichever plugin imageio takes
             count = sum(1 for _ in iio.imiter(path))
-            self.rate_hz = iio.immeta(path, exclude_applied=False).get("fps")
+            metadata = iio.immeta(path, exclude_applied=False)
+            frame_ms = metadata.get("duration") if path.suffix.lower() == ".gif" else None
+            self.rate_hz = 1e3 / frame_ms if frame_ms else metadata.get("fps")
             self._file = iio.imopen(path, "r")
         first = self[0]
         self.shape, self.dtype = (count, *first.shape), first.dtype
