@@ -12,7 +12,7 @@ import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import nrrd
 import numpy as np
@@ -44,7 +44,7 @@ ZLIB, GZIP, _EITHER = 15, 31, 47
 
 _ENCODINGS = {"ra": "raw", "gz": "deflate", "bz": "bzip2", "tx": "text", "te": "text", "as": "text"}
 """By how NRRD's words for them begin, as bzip2 or bz2."""
-_BYTES_OF_ONE = {"raw": 1, "text": 8, "deflate": 1032, "bzip2": 2**20}
+_BYTES_OF_ONE = {"text": 8, "deflate": 1032, "bzip2": 2**20}
 """Bytes of numbers that a byte of the file may stand for: of deflate and bzip2, where all are zero."""
 _SPACE, _TIME = ("domain", "space", "", "???", "none", "?"), ("list", "time")
 
@@ -139,8 +139,20 @@ class SequenceHeader:
         FileError
         """
         with open_regular(self.data) as stream:
-            length = stream.seek(0, 2) - max(self.start, 0)
-        self._require_numbers(_BYTES_OF_ONE[self.encoding] * length // self.dtype.itemsize)
+            length = self._seek(stream)
+        if self.encoding == "raw":
+            self._require_numbers(length // self.dtype.itemsize)
+        elif self.number_count * self.dtype.itemsize > _BYTES_OF_ONE[self.encoding] * length:
+            raise FileError(f"{self.path}: ends early: {self.frame_count} frames are not in {length} bytes")
+
+    def _seek(self, stream: BinaryIO) -> int:
+        """Go to the first byte of the pixels, and tell how many bytes there are from it on."""
+        length = stream.seek(0, 2)
+        size = self.number_count * self.dtype.itemsize
+        stream.seek(max(length - size, 0) if self.start < 0 else self.start)
+        for _ in range(self.text_lines):
+            stream.readline()
+        return length - stream.tell()
 
     def _require_numbers(self, count: int) -> None:
         if count < self.number_count:
@@ -170,14 +182,11 @@ class SequenceHeader:
         """
         count, item_bytes = self.number_count, self.dtype.itemsize
         with reading(self.path, DEFLATE.error), open_regular(self.data) as stream:
-            length = stream.seek(0, 2)
-            stream.seek(max(length - count * item_bytes, 0) if self.start < 0 else self.start)
-            for _ in range(self.text_lines):
-                stream.readline()
+            length = self._seek(stream)
             if self.encoding == "text":
                 values = np.array(stream.read().split(), dtype=np.float64).astype(self.dtype)
             elif self.encoding == "raw":
-                whole = min((length - stream.tell()) // item_bytes, count)
+                whole = min(length // item_bytes, count)
                 values = np.zeros(0, self.dtype)
                 if whole > 0:
                     values = np.memmap(self.data, self.dtype, "r", stream.tell(), (whole,))
