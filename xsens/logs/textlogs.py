@@ -37,7 +37,8 @@ from xsens.logs.worlds import Claim, are_rotations
 _SENSOR_LIKE = re.compile(r"acc|gyr|mag|quat|euler|roll|pitch|yaw|time", re.ASCII)
 _EQUALS = r"\s*[:=,;][,;\s]*"
 _RATE = re.compile(
-    rf"(?:update|output|sampl(?:e|ing)|data)[ _]?(?:rate|frequency)(?:[ _]?\(?hz\)?)?{_EQUALS}([0-9.e+-]+)",
+    r"(?:update|output|sampl(?:e|ing)|data)[ _]?(?:rate|frequency)(?:[ _]?\(?hz\)?)?"
+    rf"{_EQUALS}([0-9.]+)(?![0-9.]|\s*[kmuµs])",
     re.IGNORECASE,
 )
 _WORLD = re.compile(
@@ -88,8 +89,9 @@ def parse_text(text: str | Iterable[str], hints: Hints | None = None, source: st
     with naming(source):
         table = read_table(StringIO(text, newline=None) if isinstance(text, str) else text)
         table = table if table.names else _mt9_export(table)
-        parts = _samples(table)
-        return assemble_log(replace(parts, notes=(*table.notes, *parts.notes)), hints or Hints(), source)
+        hints = hints or Hints()
+        parts = _samples(table, hints.rate_hz)
+        return assemble_log(replace(parts, notes=(*table.notes, *parts.notes)), hints, source)
 
 
 def _mt9_export(table: TextTable) -> TextTable:
@@ -108,9 +110,13 @@ def _mt9_export(table: TextTable) -> TextTable:
     return replace(table, columns=dict(zip(["time", *keys], columns, strict=True)), notes=notes)
 
 
-def _samples(table: TextTable) -> Parts:
-    """Samples of a table whose columns are known."""
+def _samples(table: TextTable, rate_hz: float | None) -> Parts:
+    """Samples of a table whose columns are known, at a rate that the header may name."""
     columns, notes = dict(table.columns), list[str]()
+    rate_line = _RATE.search("\n".join(table.header))
+    if rate_hz is None and rate_line:
+        rate_hz = number(rate_line[1])
+    period_s = 1.0 / rate_hz if rate_hz and rate_hz > 0.0 else float("nan")
     for key in STAMPS:
         if key in columns and columns[key].size > 1 and not (columns[key] != columns[key][0]).any():
             notes.append(f"{key}: the same in every line, left out")
@@ -118,6 +124,11 @@ def _samples(table: TextTable) -> Parts:
     if "time" in columns and table.names and "time" not in table.with_unit:
         unit = _unit_of(columns["time"], TIMES)
         if unit is None:  # steps of one: milliseconds, or the samples' numbers
+            if np.isnan(period_s):
+                raise InvalidInputError(
+                    "expected a time with its unit, as time_s or time_ms, got steps of 1: if they count "
+                    "samples, give --rate-hz"
+                )
             columns.setdefault("counter", columns.pop("time"))
             notes.append("times without a unit in steps of 1: taken for the samples' numbers")
         else:
@@ -174,9 +185,6 @@ def _samples(table: TextTable) -> Parts:
         raise InvalidInputError(
             f"expected columns of acceleration, rate of turn, field or orientation, {columns_text}"
         )
-    rate_line = _RATE.search("\n".join(table.header))
-    rate_hz = number(rate_line[1]) if rate_line else float("nan")
-    period_s = 1.0 / rate_hz if rate_hz > 0.0 else float("nan")
     stamps = Stamps(counter, time_s, period_s)
     return Parts(stamps, (force, rate, field), orientation, claim, (*odd, *notes))
 
