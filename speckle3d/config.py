@@ -114,8 +114,8 @@ class Config(ImageSettings):
 def _comment(name: str, field: FieldInfo) -> list[str]:
     """Lines of what a setting is, its unit and its default."""
     unit, default = unit_of(name), json.dumps(field.default)
-    told = f"{field.description} Default {default}{f' {unit}' if unit else ''}."
-    return textwrap.wrap(told, _COMMENT_WIDTH)
+    text = f"{field.description} Default {default}{f' {unit}' if unit else ''}."
+    return textwrap.wrap(text, _COMMENT_WIDTH)
 
 
 def config_from_toml(text: str, where: str = "configuration") -> Config:
@@ -127,7 +127,7 @@ def config_from_toml(text: str, where: str = "configuration") -> Config:
         Naming the setting that is unknown, removed or out of range.
     """
     values = parsed(text, where)
-    for name in _removed(values):
+    for name in _obsolete_names(values):
         raise InvalidInputError(f"{where}: {name} was removed: {REMOVED_SETTINGS[name]}")
     return validated(values, where, Config)
 
@@ -135,7 +135,7 @@ def config_from_toml(text: str, where: str = "configuration") -> Config:
 def stored_config(text: str) -> Config:
     """Parse the configuration that a file was made with, whose removed settings no longer matter."""
     values = parsed(text, "configuration")
-    for name in _removed(values):
+    for name in _obsolete_names(values):
         stage, _, setting = name.partition(".")
         if setting:
             del values[stage][setting]
@@ -144,11 +144,11 @@ def stored_config(text: str) -> Config:
     return validated(values, "configuration", Config)
 
 
-def _removed(values: dict[str, Any]) -> list[str]:
-    """Names of settings given that are no more."""
+def _obsolete_names(values: dict[str, Any]) -> list[str]:
+    """Names of stages and settings that older versions had."""
     names = [
         *values,
-        *(f"{s}.{name}" for s, some in values.items() if isinstance(some, dict) for name in some),
+        *(f"{stage}.{name}" for stage, group in values.items() if isinstance(group, dict) for name in group),
     ]
     return [name for name in names if name in REMOVED_SETTINGS]
 

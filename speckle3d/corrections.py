@@ -77,25 +77,27 @@ def correct(
             require_credible(tracked.doubts, sensor_of(sweep, mode), f"{sweep.name}: drift mode {mode}")
     if settings.sensors.examine:
         sweep, _ = repair_readings(sweep)
-    found: dict[str, Correction] = {}
+    corrections: dict[str, Correction] = {}
     for mode in modes:
         if mode in PUBLISHED:
             # What wander the sensed orientation shows, cubics need not make up for.
             start = tracked.subset if tracked.subset is not None else tracked.image
-            found[mode] = correct_mode(mode, start, sweep, settings.drift, tracked.covariance, settings.fused)
+            corrections[mode] = correct_mode(
+                mode, start, sweep, settings.drift, tracked.covariance, settings.fused
+            )
         elif mode == "crossed" and crossed is not None:
-            found[mode] = crossed.of(sweep.frame_time_s, sweep.name)
+            corrections[mode] = crossed.of(sweep.frame_time_s, sweep.name)
         elif mode == "fused":
-            found[mode] = _fused(tracked, sweep, settings, crossed)
-    return found
+            corrections[mode] = _fuse(tracked, sweep, settings, crossed)
+    return corrections
 
 
-def _fused(tracked: Tracked, sweep: Sweep, config: Config, crossed: CrossedPair | None) -> FusedPoses:
+def _fuse(tracked: Tracked, sweep: Sweep, config: Config, pair: CrossedPair | None) -> FusedPoses:
     """Fuse with the sensors that do not contradict themselves."""
     from speckle3d.correction.fused import fuse
 
     sweep = credible_sensors(sweep, tracked.doubts)
-    evidence = () if crossed is None else crossed.of(sweep.frame_time_s, sweep.name).evidence
+    evidence = () if pair is None else pair.of(sweep.frame_time_s, sweep.name).evidence
     with naming(f"{sweep.name}: drift mode fused"):
         return fuse(
             tracked.edges,

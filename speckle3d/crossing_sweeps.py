@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from speckle3d.config import Config
@@ -56,14 +54,49 @@ def cross_sweeps(
     """
     settings = config or Config()
     require_pair(first, second)
-    total, done = len(first) + len(second), 0
-    sides = []
-    for sweep in (first, second):
-        stack = stack_for(sweep, settings)
-        tracked = track(sweep, curves, settings, after(progress, done, total), images=stack.keep)
-        sides.append(crossing_side(sweep, tracked, stack, settings))
-        done += len(sweep)
-    return crossed(sides[0], sides[1], settings.crossing)
+    stack = stack_for(first, settings)
+    report = after(progress, 0, len(first) + len(second))
+    tracking = track(first, curves, settings, report, images=stack.keep)
+    return cross_with(second, first, tracking, stack, curves, settings, progress)[0]
+
+
+def cross_with(
+    second: Sweep,
+    first: Sweep,
+    tracking: Tracked,
+    stack: ImageStack,
+    curves: DecorrelationCurves,
+    config: Config,
+    progress: Progress | None = None,
+) -> tuple[CrossedPair, DecorrelationCurves]:
+    """Track a second sweep and cross it with a first one, which is tracked.
+
+    Parameters
+    ----------
+    tracking, stack
+        Of the first sweep.
+
+    Returns
+    -------
+    pair : CrossedPair
+    curves : DecorrelationCurves
+        Corrected by the lengths of both sweeps.
+
+    Raises
+    ------
+    MismatchError, InsufficientDataError
+        As `cross_sweeps`.
+    """
+    report = after(progress, len(first), len(first) + len(second))
+    second_stack = stack_for(second, config)
+    second_tracking = track(second, curves, config, report, images=second_stack.keep)
+    pair = crossed(
+        crossing_side(first, tracking, stack, config),
+        crossing_side(second, second_tracking, second_stack, config),
+        config.crossing,
+    )
+    lengths = [Length(side.log_scale, side.log_scale_sigma) for side in (pair.first, pair.second)]
+    return pair, corrected_curves(curves, [tracking.curves, second_tracking.curves], lengths)
 
 
 def require_pair(first: Sweep, second: Sweep) -> None:
@@ -76,12 +109,12 @@ def require_pair(first: Sweep, second: Sweep) -> None:
     InvalidInputError
         If they have frames in common.
     """
-    for what, one, other in (("images", first.grid, second.grid), ("signal", first.signal, second.signal)):
-        if one != other:
-            advice = BAND_ADVICE if what == "signal" else ""
+    pairs = ("images", first.grid, second.grid, ""), ("signal", first.signal, second.signal, BAND_ADVICE)
+    for noun, of_first, of_second, advice in pairs:
+        if of_first != of_second:
             raise MismatchError(
-                f"{second.name}: expected the {what} of {first.name} in its crossing: {one}; got "
-                f"{other}{advice}"
+                f"{second.name}: expected the {noun} of {first.name} in its crossing: {of_first}; got "
+                f"{of_second}{advice}"
             )
     if first.name == second.name and np.isin(second.frame_time_s, first.frame_time_s).any():
         raise InvalidInputError(
@@ -91,35 +124,20 @@ def require_pair(first: Sweep, second: Sweep) -> None:
 
 
 def stack_for(sweep: Sweep, config: Config) -> ImageStack:
-    """Where the reduced images of a sweep are to be kept while it is tracked."""
+    """Make the empty stack that keeps a sweep's reduced images while it is tracked."""
     return ImageStack(IntensityExtractor(sweep.signal, sweep.grid, config.intensity).grid)
 
 
-def crossing_side(sweep: Sweep, tracked: Tracked, stack: ImageStack, config: Config) -> CrossingSweep:
-    """One sweep of a crossing pair, as far as it is known before it is crossed."""
+def crossing_side(sweep: Sweep, tracking: Tracked, stack: ImageStack, config: Config) -> CrossingSweep:
+    """Describe one sweep of a crossing pair by what tracking it alone gives."""
     return CrossingSweep(
         sweep.name,
         stack,
-        tracked.image,
+        tracking.image,
         sweep.grid.centre_mm,
-        tracked.scale_sigma,
-        float(tracked.shared.turn_sigma_per_mm.max()),
-        sensed_orientation(credible_sensors(sweep, tracked.doubts), config.sensors),
-        tracked.flags,
+        tracking.scale_sigma,
+        float(tracking.shared.turn_sigma_per_mm.max()),
+        sensed_orientation(credible_sensors(sweep, tracking.doubts), config.sensors),
+        tracking.flags,
         sweep.frame_time_s,
     )
-
-
-def curves_from(
-    tracked: Sequence[Tracked], pair: CrossedPair, curves: DecorrelationCurves
-) -> DecorrelationCurves:
-    """Correct the curves that a crossing pair was read with by what the crossing says of its lengths.
-
-    Parameters
-    ----------
-    tracked : sequence of Tracked
-        The first and the second sweep.
-    """
-    sides = pair.first, pair.second
-    lengths = [Length(side.log_scale, side.log_scale_sigma) for side in sides]
-    return corrected_curves(curves, [own.curves for own in tracked], lengths)

@@ -107,7 +107,7 @@ def _run(heard: list[int]) -> None:
             emit(error.format_message())
             sys.exit(2)
         else:
-            _fail(error.format_message())
+            _fail(error.format_message().replace("Value error, ", ""))
     # Typer turns Ctrl-C into this exit code without a word; a recording ends with it and is whole.
     if code == _STOPPED or (heard and heard[0] != signal.SIGINT):
         _fail("stopped", 128 + heard[0] if heard else _STOPPED)

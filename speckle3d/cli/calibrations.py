@@ -20,7 +20,7 @@ NOTED_DEG, NOTED_MM = 5.0, 10.0
 
 
 def report_of(written: Written, notes: Sequence[str], beam: Sequence[BeamBias] = ()) -> Result:
-    """Table of a calibration that was written; where it is is said on stderr."""
+    """Table of a calibration that was written; its place is noted on stderr."""
     from calibration.report import json_report
 
     out, text, pictures = written.files
@@ -41,14 +41,13 @@ def mount(sweep: Sweep, paths: Sequence[Path]) -> Sweep:
     from speckle3d.core.calibration import mounting_difference
     from speckle3d.io.calibrations import apply_calibrations, read_calibration
 
-    mounted, _ = apply_calibrations(sweep, paths)
     for path in paths:
         calibration = read_calibration(path)
-        turned_deg, moved_mm = mounting_difference(sweep, calibration)
-        if turned_deg > NOTED_DEG or moved_mm > NOTED_MM:
-            moved = f" and {moved_mm:.0f} mm" if calibration.sensor == "tracker" else ""
+        angle_deg, shift_mm = mounting_difference(sweep, calibration)
+        if angle_deg > NOTED_DEG or shift_mm > NOTED_MM:
+            shift = f" and {shift_mm:.0f} mm" if calibration.sensor == "tracker" else ""
             note(
-                f"{path}: puts the image {turned_deg:.0f} degrees{moved} from where the sweep has it on the "
+                f"{path}: puts the image {angle_deg:.0f} degrees{shift} from where the sweep has it on the "
                 f"{calibration.sensor} sensor, and is used: is it of this mounting?"
             )
-    return mounted
+    return apply_calibrations(sweep, paths)[0]

@@ -33,7 +33,7 @@ from typing import (
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from speckle3d.cli.common import emit, shared
+from speckle3d.cli.common import common_options, emit
 from speckle3d.cli.outputs import require_own_places
 from speckle3d.core.errors import FileError, InvalidInputError
 
@@ -51,7 +51,7 @@ _RULE = re.compile(r"\b(With|Not with) (--[\w-]+(?: or --[\w-]+)*)[:.]")
 _CHOICE = re.compile(r"\bOne of ((?:[A-Z]+|--[\w-]+) or --[\w-]+)")
 _OUTPUT = re.compile(r"(?:-o|--output=)(.+)|-o|--output", re.DOTALL)
 _ANY_VIEWER = "frames are cut here, and volumes by any viewer, as 3D Slicer"
-_REMOVED = {
+_REPLACEMENTS = {
     ("reconstruct", "--volume-mode"): "`speckle3d volume --mode` writes a volume at any mode's poses",
     ("reconstruct", "--consistent-subset"): "`--drift consistent-subset`, or the setting of that name",
     ("reslice", "--volume"): _ANY_VIEWER,
@@ -77,19 +77,19 @@ class Fields(NamedTuple):
 
     def options(self, words: Words) -> dict[str, inspect.Parameter]:
         """Options by the fields' names; the model is loaded."""
-        model = _loaded(self.model)
+        model = _load(self.model)
         if is_dataclass(model):
             from pydantic.fields import FieldInfo
 
-            kinds, of = get_type_hints(model), FieldInfo.from_annotated_attribute
-            stated = {f.name: of(kinds[f.name], f.default) for f in fields(model)}
+            kinds, info = get_type_hints(model), FieldInfo.from_annotated_attribute
+            infos = {f.name: info(kinds[f.name], f.default) for f in fields(model)}
         else:
-            stated = model.model_fields
-        names = [name for name in self.only or stated if name not in self.without]
-        return {name: _of_field(name, stated[name], words) for name in names}
+            infos = model.model_fields
+        names = [name for name in self.only or infos if name not in self.without]
+        return {name: _field_option(name, infos[name], words) for name in names}
 
 
-def _loaded(place: str) -> Any:
+def _load(place: str) -> Any:
     module, _, name = place.partition(":")
     return getattr(import_module(module), name)
 
@@ -107,12 +107,12 @@ class Words(NamedTuple):
         """Parse the docstring."""
         text, *parts = _SECTION.split(inspect.getdoc(function) or "")
         sections = dict(zip(parts[::2], parts[1::2], strict=True))
-        common, others = (
+        common, rare = (
             {n: " ".join(body.split()) for names, body in _ENTRY.findall(part) for n in names.split(", ")}
             for part in (sections.get("Parameters", ""), sections.get("Other Parameters", ""))
         )
         examples = re.findall(r"^\$ (.*)", sections.get("Examples", ""), re.MULTILINE)
-        return cls(text.strip(), tuple(common), common | others, examples)
+        return cls(text.strip(), tuple(common), common | rare, examples)
 
 
 def command_of(name: str, function: Command) -> TyperCommand:
@@ -129,36 +129,42 @@ def command_of(name: str, function: Command) -> TyperCommand:
             if writes:
                 places[parameter.name] = writes[0]
         if isinstance(info, Fields):
-            chosen = {each: option for each, option in info.options(words).items() if each not in hints}
-            groups[parameter.name] = info.model, list(chosen)
-            options |= chosen
+            members = {name: option for name, option in info.options(words).items() if name not in hints}
+            groups[parameter.name] = info.model, list(members)
+            options |= members
         else:
             options[parameter.name] = _option(parameter.name, kind, parameter.default, info, words)
     prints = hints["return"] is not type(None)
     if prints:
         options["as_json"] = _option("as_json", bool, False, typer.Option("--json"), words)
     order = [*words.options, *options]
-    options = {each: options[each] for each in sorted(options, key=order.index)}
+    options = {key: options[key] for key in sorted(options, key=order.index)}
 
     def run(**values: Any) -> None:
-        # Zero is a value that was given, and equal to False.
-        given = {
-            _called(option): option
+        # Zero is a value of its own, and equal to False.
+        flags = {
+            _flag_of(option): option
             for name, option in options.items()
             if values[name] is not None and values[name] is not False and values[name] != option.default
         }
-        for flag, option in given.items():
-            values[option.name] = _checked(flag, option, values[option.name], given)
-        written = [(values[name], what) for name, what in places.items() if values[name] is not None]
-        require_own_places(written, [values[name] for name in values.keys() - places], values.get("out"))
+        for flag, option in flags.items():
+            values[option.name] = _check(flag, option, values[option.name], flags)
+        outputs = [(values[name], kind) for name, kind in places.items() if values[name] is not None]
+        require_own_places(outputs, [values[name] for name in values.keys() - places], values.get("out"))
         for choice in _CHOICE.finditer(words.text):
-            if sum(other in given for other in choice[1].split(" or ")) != 1:
+            if sum(flag in flags for flag in choice[1].split(" or ")) != 1:
                 raise InvalidInputError(f"expected one of {choice[1]}, got both or neither")
         for group, (model, names) in groups.items():
-            picked = {name: values.pop(name) for name in names}
-            values[group] = _made(_loaded(model), {k: v for k, v in picked.items() if v is not None})
+            members = {name: values.pop(name) for name in names}
+            values[group] = _make(_load(model), {k: v for k, v in members.items() if v is not None})
         as_json = prints and values.pop("as_json")
-        numbers, text = function(**values) or (None, "")
+        try:
+            numbers, text = function(**values) or (None, "")
+        except InvalidInputError as error:  # of a parameter: the option is named as it was typed
+            name, _, reason = str(error).partition(": ")
+            if name not in options:
+                raise
+            raise InvalidInputError(f"{_flag_of(options[name])}: {reason}") from error
         if as_json:
             from speckle3d.study.results import json_text
 
@@ -167,7 +173,7 @@ def command_of(name: str, function: Command) -> TyperCommand:
             emit(text)
 
     run.__signature__ = inspect.Signature(list(options.values()))  # type: ignore[attr-defined]
-    run.__annotations__ = {each.name: each.annotation for each in options.values()}
+    run.__annotations__ = {option.name: option.annotation for option in options.values()}
     builder = typer.Typer(add_completion=False, rich_markup_mode=None)
     builder.command(name, cls=PlainCommand, help=words.text, context_settings=_SETTINGS)(run)
     command = typer.main.get_command(builder)
@@ -176,11 +182,11 @@ def command_of(name: str, function: Command) -> TyperCommand:
     return command
 
 
-_SHARED = Words.of(shared).options
+_COMMON = Words.of(common_options).options
 
 
-def _made(model: Any, values: Mapping[str, Any]) -> Any:
-    """Settings of options; of the first whose value is refused the option is named."""
+def _make(model: Any, values: Mapping[str, Any]) -> Any:
+    """Make settings of options; an error names the first option whose value is refused."""
     from pydantic import ValidationError
 
     try:
@@ -196,33 +202,33 @@ def _flag(name: str) -> str:
     return f"--{name.removesuffix('_file').removeprefix('tracker_').replace('_', '-')}"
 
 
-def _called(option: inspect.Parameter) -> str:
-    """What an option, or an argument, is called in a help."""
+def _flag_of(option: inspect.Parameter) -> str:
+    """Name of an option, or of an argument, in a help."""
     (info,) = option.annotation.__metadata__
     return _flag(option.name) if isinstance(info, typer.models.OptionInfo) else option.name.upper()
 
 
-def _checked(flag: str, option: inspect.Parameter, value: Any, flags: Mapping[str, Any]) -> Any:
-    """Value of an option; a results folder stands for its reconstruction.
+def _check(flag: str, option: inspect.Parameter, value: Any, flags: Mapping[str, Any]) -> Any:
+    """Check the value of an option and return it; a results folder stands for its reconstruction.
 
     Refused are an option against the rule of its help, a number that is none, an input that is not there.
     """
     (info,) = option.annotation.__metadata__
     for rule in _RULE.finditer(info.help or ""):
-        others = [other for other in rule[2].split(" or ") if other in flags]
-        if rule[1] == "With" and not others:
+        partners = [partner for partner in rule[2].split(" or ") if partner in flags]
+        if rule[1] == "With" and not partners:
             raise InvalidInputError(f"{flag}: expected {rule[2]} with it, got none")
-        if rule[1] == "Not with" and others:
-            raise InvalidInputError(f"{flag}: expected no {others[0]} beside it, got both")
-    for path in value if isinstance(value, list | tuple) else [value]:
-        is_allowed = path == math.inf and re.search(r"\binf\b", info.help or "")
-        if isinstance(path, float) and not math.isfinite(path) and not is_allowed:
-            raise InvalidInputError(f"{flag}: expected a finite number, got {path}")
-        if isinstance(path, Path) and not path.exists() and not info.writable:
+        if rule[1] == "Not with" and partners:
+            raise InvalidInputError(f"{flag}: expected no {partners[0]} beside it, got both")
+    for item in value if isinstance(value, list | tuple) else [value]:
+        is_allowed = item == math.inf and re.search(r"\binf\b", info.help or "")
+        if isinstance(item, float) and not math.isfinite(item) and not is_allowed:
+            raise InvalidInputError(f"{flag}: expected a finite number, got {item}")
+        if isinstance(item, Path) and not item.exists() and not info.writable:
             where = f"{flag}: " if isinstance(info, typer.models.OptionInfo) else ""
-            is_server = re.fullmatch(r"[^/]+:[0-9]+", str(path))
-            live = f"; a server's sweep: speckle3d live {path} --view" if is_server else ""
-            raise FileError(f"{where}{path}: expected a file, got none{live}")
+            is_server = re.fullmatch(r"[^/]+:[0-9]+", str(item))
+            live = f"; a server's sweep: speckle3d live {item} --view" if is_server else ""
+            raise FileError(f"{where}{item}: expected a file, got none{live}")
     is_results = isinstance(value, Path) and not info.writable and (value / "reconstruction.h5").is_file()
     return value / "reconstruction.h5" if is_results else value
 
@@ -231,7 +237,7 @@ def _option(name: str, kind: Any, default: Any, info: Any, words: Words) -> insp
     """A parameter as typer takes it: an argument without a default, unless its annotation says otherwise."""
     flag, only = _flag(name), inspect.Parameter.KEYWORD_ONLY
     info = info or (typer.Argument() if default is inspect.Parameter.empty else typer.Option())
-    info.help = words.options.get(name) or info.help or _SHARED.get(name)
+    info.help = words.options.get(name) or info.help or _COMMON.get(name)
     if isinstance(info, typer.models.ArgumentInfo):
         info.metavar = info.metavar or flag.strip("-").upper()
     else:
@@ -242,12 +248,12 @@ def _option(name: str, kind: Any, default: Any, info: Any, words: Words) -> insp
     return inspect.Parameter(name, only, default=default, annotation=Annotated[kind, info])
 
 
-def _unbounded(kind: Any) -> Any:
+def _without_bounds(kind: Any) -> Any:
     """A type without pydantic's bounds, of which typer knows nothing."""
     return kind.__origin__ if get_origin(kind) is Annotated else kind
 
 
-def _of_field(name: str, field: FieldInfo, words: Words) -> inspect.Parameter:
+def _field_option(name: str, field: FieldInfo, words: Words) -> inspect.Parameter:
     """An option of a field: of its type if that is a word of a command, else text that the model reads."""
     kind: Any = field.annotation
     default = field.default
@@ -257,11 +263,11 @@ def _of_field(name: str, field: FieldInfo, words: Words) -> inspect.Parameter:
         are_literals = all(get_origin(member) is Literal for member in members)
         kind = members[0] if len(members) == 1 else Literal[choices] if are_literals else str
     if get_origin(kind) is tuple:
-        kind = tuple.__class_getitem__(tuple(map(_unbounded, get_args(kind))))
-    kind = _unbounded(kind)
-    shown = "" if isinstance(default, bool | tuple) or default in (None, "") else f" ({default})"
+        kind = tuple.__class_getitem__(tuple(map(_without_bounds, get_args(kind))))
+    kind = _without_bounds(kind)
+    default_text = "" if isinstance(default, bool | tuple) or default in (None, "") else f" ({default})"
     text = (field.description or "").removesuffix(".")
-    info = typer.Option(help=text and f"{text[:1].upper()}{text[1:]}{shown}.")
+    info = typer.Option(help=text and f"{text[:1].upper()}{text[1:]}{default_text}.")
     if default is True:
         info.param_decls = (f"{_flag(name)}/--no-{_flag(name)[2:]}",)
     return _option(name, kind | None, None, info, words)
@@ -275,7 +281,7 @@ class PlainCommand(TyperCommand):
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Take `-o FILE` where the output is an argument, as everywhere else; answer for removed words."""
         for word in args:
-            if text := _REMOVED.get((str(self.name), word.partition("=")[0])):
+            if text := _REPLACEMENTS.get((str(self.name), word.partition("=")[0])):
                 raise InvalidInputError(f"{word} was removed: {text}")
         shows_all = "--help-all" in args
         for param in self.params:
@@ -288,8 +294,8 @@ class PlainCommand(TyperCommand):
     def format_epilog(self, ctx: Any, formatter: Any) -> None:
         """Print examples, and how many options are not shown."""
         formatter.write("".join(["\nExample:\n", *(f"  {line}\n" for line in self.words.examples)]))
-        if others := sum(param.hidden for param in self.params):  # type: ignore[attr-defined]
-            formatter.write(f"\n{others} other options: {ctx.command_path} --help-all\n")
+        if count := sum(param.hidden for param in self.params):  # type: ignore[attr-defined]
+            formatter.write(f"\n{count} other options: {ctx.command_path} --help-all\n")
 
 
 def _output_last(args: list[str]) -> list[str]:
@@ -309,8 +315,9 @@ class Group(TyperGroup):
         """The command or group of that name; None if there is none."""
         if cmd_name in self.table and self.commands[cmd_name] is None:
             entry = self.table[cmd_name]
-            made = group(*entry) if isinstance(entry, tuple) else command_of(cmd_name, _function(entry))
-            self.commands[cmd_name] = made
+            self.commands[cmd_name] = (
+                group(*entry) if isinstance(entry, tuple) else command_of(cmd_name, _function(entry))
+            )
         return super().get_command(ctx, cmd_name)
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
@@ -331,7 +338,7 @@ class Group(TyperGroup):
 
 
 def _function(place: str) -> Command:
-    function: Command = _loaded(f"speckle3d.cli.{place}")
+    function: Command = _load(f"speckle3d.cli.{place}")
     return function
 
 
@@ -339,6 +346,6 @@ def group(text: str, table: Table) -> Any:
     """Make a group of commands."""
     builder = typer.Typer(cls=Group, add_completion=False, no_args_is_help=True, context_settings=_SETTINGS)
     builder.callback(help=text)(lambda: None)
-    made: Any = typer.main.get_command(builder)
-    made.table, made.commands = table, dict.fromkeys(table)
-    return made
+    command: Any = typer.main.get_command(builder)
+    command.table, command.commands = table, dict.fromkeys(table)
+    return command

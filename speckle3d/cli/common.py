@@ -37,13 +37,15 @@ Paths = list[Path] | None
 Out = Annotated[Path, typer.Option("-o", "--output", writable=True)]
 OptionalOut = Annotated[MaybePath, typer.Option("-o", "--output", writable=True)]
 OutArgument = Annotated[Path, typer.Argument(writable=True)]
-Written = Annotated[MaybePath, typer.Option(writable=True)]
+WritablePath = Annotated[MaybePath, typer.Option(writable=True)]
+Positive = Annotated[float, typer.Option(min=1e-6)]
+MaybePositive = Annotated[MaybeNumber, typer.Option(min=1e-6)]
 PixelMm = tuple[float, float] | None
 Result = tuple[Any, str]
 """What a command prints: numbers for --json, else text."""
 
 
-def shared() -> None:
+def common_options() -> None:
     """Options that mean the same in every command that has them.
 
     Parameters
@@ -77,8 +79,8 @@ def shared() -> None:
         World of the sensor's own orientation (east, north, up and so on); by default as its accelerometer and
         magnetometer show.
     mode
-        Which poses to use: image, orientation, pose, crossed, fused of a reconstruction (by default that
-        which claims the smallest error of length); tracker, truth of a recording.
+        Which poses to use: image, orientation, pose, crossed, fused, consistent-subset of a reconstruction
+        (by default those that claim the smallest error of length); tracker, truth of a recording.
     pixel_mm
         Distance between columns and rows, mm, if IMAGES does not say.
     poses
@@ -106,9 +108,9 @@ def notes(lines: Iterable[str]) -> None:
 
 def emit(text: str) -> None:
     """Print results on stdout; but for line breaks, characters that drive a terminal are shown escaped."""
-    shown = printable(text, kept="\n")
+    text = printable(text, kept="\n")
     try:
-        sys.stdout.write(shown if shown.endswith("\n") else shown + "\n")
+        sys.stdout.write(text if text.endswith("\n") else text + "\n")
         sys.stdout.flush()
     except OSError as error:
         raise FileError(f"standard output: cannot be written: {error.strerror}") from error

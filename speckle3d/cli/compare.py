@@ -76,22 +76,21 @@ def compare(
 
     settings, paths = load_settings(config_file), sweeps or []
     table = ""
-    with scheduler_for(scheduler, workers) as where, progress_bar("comparing") as bar:
+    with scheduler_for(scheduler, workers) as runner, progress_bar("comparing") as bar:
         if curves_file is not None and paper:
             study, table = paper_study(
-                out, curves_file, where, bar, lambda n, total: note(f"{n} of {total} sweeps simulated")
+                out, curves_file, runner, bar, lambda n, total: note(f"{n} of {total} sweeps simulated")
             )
         else:
             study = compare_sweeps(
-                paths, out, drift, reference, curves_file, settings, calibration or (), where, bar
+                paths, out, drift, reference, curves_file, settings, calibration or (), runner, bar
             )
     write_report(study)
     emit((out / "study.json").read_text(encoding="utf-8") if as_json else table or study.table)
-    skipped = sum(outcome.skipped for outcome in study.outcomes)
-    if skipped:
-        note(f"{skipped} of {len(study.outcomes)} sweeps were finished before and are taken as they are")
-    for outcome in study.broken:
+    if old := sum(outcome.is_old for outcome in study.outcomes):
+        note(f"{old} of {len(study.outcomes)} sweeps were finished before and are taken as they are")
+    for outcome in study.failures:
         note(f"{outcome.name}: failed: {outcome.reason}")
     note(f"results in {out}; the report is {out / 'report.html'}")
-    if not study.done:
+    if not study.successes:
         raise InsufficientDataError(f"{out}: expected a sweep that can be compared, got none")

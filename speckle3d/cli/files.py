@@ -61,7 +61,7 @@ def config() -> None:
 def convert(
     source: Annotated[Path, typer.Argument(metavar="IN")],
     out: Annotated[OutArgument, "sweep sequence"],
-    imported: Annotated[
+    settings: Annotated[
         Any,
         Fields("speckle3d.io.import_settings:ImportSettings", without=("image_to_probe", "arrays")),
     ],
@@ -104,18 +104,18 @@ def convert(
     from speckle3d.io.reconstructions import FORMAT
     from speckle3d.io.sweep_writer import COMPRESSIONS, write_sweep
     from speckle3d.io.voxels.volume_writer import LABELS_ALONE
-    from speckle3d.study.posed import open_posed
+    from speckle3d.study.posed import USUAL_RANGE_DB, open_posed
     from speckle3d.study.scenes.sequences import slicer_sequence
 
-    is_made = source.is_file() and kind_of(source) == FORMAT
-    suffix = require_suffix(out, SUFFIXES if is_made else (".h5", ".hdf5", *SUFFIXES))
+    is_reconstruction = source.is_file() and kind_of(source) == FORMAT
+    suffix = require_suffix(out, SUFFIXES if is_reconstruction else (".h5", ".hdf5", *SUFFIXES))
     if out.name.lower().endswith(LABELS_ALONE):
         raise InvalidInputError(f"{out}: expected a sequence's name, got one of labels alone")
     packs = compression != "none"
-    if is_made:
-        range_db = imported.dynamic_range_db or 60.0
-        stated = type(imported)(**imported.model_dump(exclude={"dynamic_range_db"}, exclude_unset=True))
-        posed = open_posed(source, mode, sweep_file, stated, calibration or ())
+    if is_reconstruction:
+        range_db = settings.dynamic_range_db or USUAL_RANGE_DB
+        others = type(settings)(**settings.model_dump(exclude={"dynamic_range_db"}, exclude_unset=True))
+        posed = open_posed(source, mode, sweep_file, others, calibration or ())
         notes(posed.notes())
         with progress_bar(f"writing {out.name}") as progress:
             sequence, poses = slicer_sequence(posed, range_db)
@@ -123,11 +123,11 @@ def convert(
         return
     if mode or sweep_file:
         raise InvalidInputError(f"--mode, --sweep: are of a reconstruction, got {source.name}")
-    require_unsaid(source, imported)
+    require_unsaid(source, settings)
     pixels = fitted_pixels(calibration or ())
-    fitted = {name: pixels[name] for name in pixels.keys() - imported.model_fields_set}
-    recording = open_recording(source, imported.model_copy(update=fitted))
-    sweep = mount(resized(recording.sweep, fitted), calibration or ())
+    sizes = {name: pixels[name] for name in pixels.keys() - settings.model_fields_set}
+    recording = open_recording(source, settings.model_copy(update=sizes))
+    sweep = mount(resized(recording.sweep, sizes), calibration or ())
     notes(recording.notes)
     config = recording.settings.plus_config
     if region := clip_of(config, sweep.grid, 0.0 if sweep.tracker is None else sweep.tracker.image_skew_rad):
@@ -161,20 +161,20 @@ def simulate(
     from speckle3d.simulation.presets import simulate as prepare
 
     with progress_bar("computing the beam"):
-        prepared = prepare(settings)
-    paths = [out, out.with_name(f"{out.stem}-crossing{out.suffix}")][: len(prepared)]
+        simulations = prepare(settings)
+    paths = [out, out.with_name(f"{out.stem}-crossing{out.suffix}")][: len(simulations)]
     require_own_place(paths[-1], "simulation")
     if len(paths) == 1:
-        _write(out, prepared[0])
+        _write(out, simulations[0])
         return
     # A pair is replaced together: two sweeps of different simulations do not cross.
     with FileSet(out.name, (paths[1].name,)).replaced(out.parent) as part:
-        for path, simulated in zip(paths, prepared, strict=True):
-            _write(part / path.name, simulated)
+        for path, simulation in zip(paths, simulations, strict=True):
+            _write(part / path.name, simulation)
 
 
-def _write(path: Path, simulated: SimulatedSweep) -> None:
+def _write(path: Path, simulation: SimulatedSweep) -> None:
     from speckle3d.io.sweep_writer import write_sweep
 
     with progress_bar(f"simulating {path.name}") as progress:
-        write_sweep(path, simulated.sweep, progress, simulation=simulated.description())
+        write_sweep(path, simulation.sweep, progress, simulation=simulation.description())

@@ -24,8 +24,8 @@ def require_own_places(places: Sequence[tuple[Path, str]], inputs: Iterable[Any]
     results : path or None
         Folder that the command makes, in which nothing can be in the way.
     """
-    flat = [item for value in inputs for item in (value if isinstance(value, list) else [value])]
-    files = [Path(item) for item in flat if isinstance(item, str | Path) and os.path.isfile(item)]
+    items = [item for value in inputs for item in (value if isinstance(value, list) else [value])]
+    files = [Path(item) for item in items if isinstance(item, str | Path) and os.path.isfile(item)]
     for path, kind in places:
         if path.parent != results or results.exists():
             require_own_place(path, kind, *files)
@@ -52,40 +52,45 @@ def require_own_place(out: Path, kind: str, *inputs: Path) -> None:
     InvalidInputError
         If it is taken.
     """
-    from speckle3d.io.hdf5 import require_target
+    from speckle3d.io.hdf5 import require_suffix, require_target
+    from speckle3d.io.shapes.surfaces import SUFFIXES as SURFACES
+    from speckle3d.io.voxels.volume_writer import SUFFIXES as VOLUMES
+    from speckle3d.io.voxels.volume_writer import volume_suffix
 
-    target = require_target(out)
-    written = [target]
+    target, kinds = require_target(out), kind.split()
+    suffixes = {"picture": (".png",), "surface": SURFACES, "volume": VOLUMES}
+    endings = [suffix for name in kinds for suffix in suffixes.get(name, ())]
+    if endings and require_suffix(out, endings) in VOLUMES:
+        volume_suffix(out, "labels" in kinds)
+    targets = [target]
     if kind == "calibration":
         from speckle3d.calibrating.written import BESIDE
 
-        written += [target.with_suffix(suffix) for suffix in BESIDE]
+        targets += [target.with_suffix(suffix) for suffix in BESIDE]
         if out.suffix in BESIDE:
             raise InvalidInputError(f"{out}: expected a calibration file, not {', '.join(BESIDE)} beside it")
     for path in inputs:
-        if any(place.exists() and path.samefile(place) for place in written):
+        if any(place.exists() and path.samefile(place) for place in targets):
             raise InvalidInputError(f"{path}: is an input and would be overwritten: give -o another name")
-    if not target.exists():
-        return
-    if target.stat().st_size and _kinds_of(target).isdisjoint(kind.split()):
-        wanted = kind.replace(" ", " or ")
+    if target.exists() and target.stat().st_size and _kinds_of(target).isdisjoint(kinds):
+        nouns = " or ".join(kinds)
         raise InvalidInputError(
-            f"{out}: expected a new name or a {wanted} to replace, got another kind of file"
+            f"{out}: expected a new name or a {nouns} to replace, got another kind of file"
         )
 
 
 def _kinds_of(path: Path) -> set[str]:
-    """What a file may be, by its content."""
+    """Kinds that a file may be, by its content."""
     from speckle3d.io.hdf5 import SIGNATURE, open_hdf5
     from speckle3d.io.tum import is_tum
     from speckle3d.io.voxels.volumes import may_be_volume
 
-    with path.open("rb") as file:
-        start = file.read(_FIRST_BYTES)
+    with path.open("rb") as stream:
+        start = stream.read(_FIRST_BYTES)
     if start.startswith(SIGNATURE):
-        with open_hdf5(path) as held:
-            own = str(held.attrs.get("format", "")).removeprefix("speckle3d.")
-            return {own, *({"simulation"} & {*held})}
+        with open_hdf5(path) as file:
+            kind = str(file.attrs.get("format", "")).removeprefix("speckle3d.")
+            return {kind, *({"simulation"} & {*file})}
     triangles = int.from_bytes(start[80:84], "little")
     signs = {
         "log": b"\ntime_s," in b"\n" + start,
@@ -96,4 +101,4 @@ def _kinds_of(path: Path) -> set[str]:
         "trajectory": is_tum(path),
         "volume": may_be_volume(path),
     }
-    return {kind for kind, is_one in signs.items() if is_one}
+    return {kind for kind, applies in signs.items() if applies}

@@ -15,7 +15,7 @@ from speckle3d.cli.common import (
     Out,
     Paths,
     Reference,
-    Written,
+    WritablePath,
     emit,
     load_settings,
     note,
@@ -41,13 +41,13 @@ def reconstruct(
     curves_file: MaybePath = None,
     drift: list[Drift] | None = None,
     crossing_file: MaybePath = None,
-    save_curves: Annotated[Written, "curves"] = None,
+    save_curves: Annotated[WritablePath, "curves"] = None,
     frames: MaybeText = None,
     crossing_frames: MaybeText = None,
     reference: Reference | None = None,
     region: MaybeText = None,
     drift_curves: Literal["published", "distance"] | None = None,
-    volume: Annotated[Written, "volume"] = None,
+    volume: Annotated[WritablePath, "volume"] = None,
     calibration: Paths = None,
     config_file: MaybePath = None,
     as_json: Annotated[bool, typer.Option("--json")] = False,
@@ -94,7 +94,6 @@ def reconstruct(
     """
     from speckle3d.io.curves import curves_beside, read_curves, trust_words, write_curves
     from speckle3d.io.load import load_sweep, open_recording
-    from speckle3d.io.voxels.volume_writer import volume_suffix
     from speckle3d.study.job import run_job
 
     settings = load_settings(config_file).with_choices(drift_curves=drift_curves, region=region)
@@ -102,10 +101,10 @@ def reconstruct(
     recording = open_recording(sweep_file)
     sweep = recording.sweep
     notes(recording.remarks)
-    used = curves_file or curves_beside(sweep_file)
-    curves = read_curves(used)
+    curves_path = curves_file or curves_beside(sweep_file)
+    curves = read_curves(curves_path)
     if curves_file is None:
-        note(trust_words(used, curves, settings.curves.same_probe))
+        note(trust_words(curves_path, curves, settings.curves.same_probe))
     mount(sweep, calibrations)
     crossing = None
     if crossing_file is not None or crossing_frames is not None:
@@ -113,8 +112,6 @@ def reconstruct(
         crossing = part_of(whole, crossing_frames, "--crossing-frames"), crossing_file or sweep_file
         if not {"crossed", "fused"}.intersection(modes):
             modes.append("crossed")
-    if volume is not None:
-        volume_suffix(volume)
     sweep = part_of(sweep, frames, "--frames")
     with progress_bar(f"reconstructing {sweep_file.name}") as progress:
         result = run_job(
@@ -150,14 +147,14 @@ def _write_volume(result: JobResult, sweep_file: Path, out: Path, settings: Conf
 
 
 def _tell(result: JobResult) -> None:
-    """Say on stderr what limits the results."""
+    """Note on stderr what limits the results."""
     details = result.summary.details
     for line in details["flagged_frames"]:
         note(f"{line}: poses there are guesses")
     if 0 < result.summary.coverage < 1:
         note(f"compared over the {100 * result.summary.coverage:.0f} % of frames that have a reference")
-    rejected = details["rejected_patch_share"]
-    if rejected == rejected:
-        note(f"{100 * rejected:.0f} % of patches contradict the sensed orientation and were left out")
+    share = details["rejected_patch_share"]
+    if share == share:
+        note(f"{100 * share:.0f} % of patches contradict the sensed orientation and were left out")
     if (sign := _SIGNS.get(details["direction_from"])) is not None:
         note(f"the sign of the elevational motion is {sign}")

@@ -31,7 +31,7 @@ class ToldToStopError(KeyboardInterrupt):
 
 
 @contextmanager
-def handled(handler: Callable[[int, FrameType | None], None], *names: str) -> Iterator[None]:
+def handle_signals(handler: Callable[[int, FrameType | None], None], *names: str) -> Iterator[None]:
     """Handle signals in a block; those that the process was started to ignore, as by nohup, stay so."""
     before = {}
     if threading.current_thread() is threading.main_thread():  # only the main thread may set handlers
@@ -64,7 +64,7 @@ def stoppable() -> Iterator[list[int]]:
             return
         raise ToldToStopError
 
-    with handled(stop, *ENDS):
+    with handle_signals(stop, *ENDS):
         try:
             yield heard
         finally:

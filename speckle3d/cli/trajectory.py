@@ -26,6 +26,7 @@ def export(
     out
         Text file to write.
     mode
+        Which poses to write (by default those that claim the smallest error of length).
     length_unit
         Unit of lengths.
 
@@ -56,7 +57,9 @@ def score(
         TUM text or reconstruction.
     of
         TUM text, sweep, TUS-REC scan or reconstruction.
-    mode, as_json
+    mode
+        Which poses of a reconstruction (by default those that claim the smallest error of length).
+    as_json
 
     Other Parameters
     ----------------
@@ -71,15 +74,15 @@ def score(
     """
     from speckle3d.scoring.trajectories import compare_trajectories, load_estimate, load_reference
 
-    loaded = load_estimate(estimate, mode, length_unit)
-    scores = compare_trajectories(loaded, load_reference(of, reference, mode, length_unit))
+    trajectory = load_estimate(estimate, mode, length_unit)
+    scores = compare_trajectories(trajectory, load_reference(of, reference, mode, length_unit))
     if scores["same_sweep"] is False:
         note(
-            f"warning: {loaded.name} was made from another file than {of.name} (SHA-256): "
+            f"warning: {trajectory.name} was made from another file than {of.name} (SHA-256): "
             "the scores mean nothing unless both hold the same recording"
         )
     if scores["left_out"]:
-        note(f"{scores['left_out']} poses of {loaded.name} have no reference and were left out")
+        note(f"{scores['left_out']} poses of {trajectory.name} have no reference and were left out")
     if scores["GPE_mm"] is None:
         note("neither file tells of images: drift is that of the poses' origin, and no pixels were scored")
     return scores, _table(scores)

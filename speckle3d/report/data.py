@@ -35,7 +35,7 @@ class SweepView:
 
 
 def load_view(directory: Path, outcome: SweepOutcome) -> SweepView:
-    """Gather what there is to show of a sweep that is done.
+    """Gather poses, curves and notes of a sweep with results.
 
     Parameters
     ----------
@@ -54,17 +54,17 @@ def load_view(directory: Path, outcome: SweepOutcome) -> SweepView:
     notes, poses = list(summary.lines), dict(reconstruction.poses)
     try:
         sweep = sweep_of(reconstruction, outcome.path)
-        alone = tracker_alone(sweep)
-        if alone is not None and any(row.mode == TRACKER for row in summary.rows):
-            poses[TRACKER] = alone
+        tracker = tracker_alone(sweep)
+        if tracker is not None and any(row.mode == TRACKER for row in summary.rows):
+            poses[TRACKER] = tracker
         reference = None if summary.reference == "none" else find_reference(sweep, summary.reference)
         if reference is not None and reference.covered.all():
             poses[reference.name] = reference.world_from_image
     except Speckle3DError as error:
         notes.append(f"{error}: neither the reference nor the tracker is in its curves")
-    covariance = None if reconstruction.trust is None else reconstruction.trust.covariance
+    covariance = None
     if reconstruction.trust is not None:
+        covariance = reconstruction.trust.covariance
         notes += [f"{line}: poses there are guesses" for line in describe(reconstruction.trust.flags)]
-    estimates = poses if reference is None else {m: p for m, p in poses.items() if m != reference.name}
-    curves = sweep_curves(estimates, reconstruction.grid.centre_mm, reference, covariance)
+    curves = sweep_curves(poses, reconstruction.grid.centre_mm, reference, covariance)
     return SweepView(folder, reconstruction, curves, poses, notes)

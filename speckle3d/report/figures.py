@@ -80,8 +80,8 @@ def plot_curves(curves: SweepCurves) -> go.Figure:
             figure.update_xaxes(title_text="frame" if q > 1 else "", **place)
             figure.update_yaxes(title_text=label, **place)
     buttons = [
-        {"label": view, "method": "restyle", "args": [{"visible": [each == view for each in trace_views]}]}
-        for view in views
+        {"label": name, "method": "restyle", "args": [{"visible": [view == name for view in trace_views]}]}
+        for name in views
     ]
     if len(views) > 1:
         menu = {"type": "buttons", "direction": "right", "x": 0, "xanchor": "left", "y": 1.2,
@@ -101,7 +101,7 @@ def _curve_traces(curves: SweepCurves, q: int, zero: FloatArray) -> list[go.Scat
     traces = []
     if curves.reference is not None:
         name = curves.reference_name
-        traces.append(trace(curves.reference, name, {"width": 4, "color": colour_of(name)}, opacity=0.5))
+        traces.append(trace(curves.reference, name, {"width": 4, "color": colour_of(name)}))
     if curves.half_width is not None:
         name, middle, half = "95 % interval of image", curves.modes["image"], curves.half_width
         faint = f"rgba{(*hex_to_rgb(colour_of('image')), 0.16)}"
@@ -120,11 +120,11 @@ def plot_outlines(poses: Mapping[str, RigidTransform], grid: ImageGrid) -> go.Fi
     Modes come and go by the legend; the truth is broad, so that the others lie on it.
     """
     figure = go.Figure(layout=_LAYOUT)
-    closed, breaks = grid.corners_mm[[0, 1, 2, 3, 0]], np.full((1, 3), np.nan)
+    outline, breaks = grid.corners_mm[[0, 1, 2, 3, 0]], np.full((1, 3), np.nan)
     for mode in sorted(poses, key=lambda name: name != "truth"):
-        laid = poses[mode][0].inv() * poses[mode]
-        frames = spread_frames(len(laid), OUTLINES)
-        line = np.concatenate([part for i in frames for part in (laid[int(i)].apply(closed), breaks)])
+        path = poses[mode][0].inv() * poses[mode]
+        frames = spread_frames(len(path), OUTLINES)
+        line = np.concatenate([part for i in frames for part in (path[int(i)].apply(outline), breaks)])
         x, y, z = (_numbers(line[:, axis]) for axis in (2, 0, 1))
         look = {"color": colour_of(mode), "width": 6 if mode == "truth" else 3}
         figure.add_scatter3d(
@@ -138,7 +138,7 @@ def plot_outlines(poses: Mapping[str, RigidTransform], grid: ImageGrid) -> go.Fi
     return figure.update_layout(scene=scene, legend={"orientation": "h"}, height=520)
 
 
-def plot_rejected(pairs: FramePairs, frames: int) -> go.Figure:
+def plot_rejections(pairs: FramePairs, frames: int) -> go.Figure:
     """Share of the frame pairs in which each patch was left out, and of the patches in each frame.
 
     A pair's patches are those of its first frame.
@@ -147,11 +147,11 @@ def plot_rejected(pairs: FramePairs, frames: int) -> go.Figure:
     ----------
     .. [1] Housden et al., BioMedical Engineering OnLine 7:5, 2008, figure 4.
     """
-    measured = np.isfinite(pairs.distance_mm)
-    left_out = measured & ~pairs.used
-    share = _percent(left_out.sum(axis=0), measured.sum(axis=0))
-    in_frames = [np.bincount(pairs.first, mask.sum(axis=1), frames) for mask in (left_out, measured)]
-    by_frame = _percent(in_frames[0], in_frames[1])
+    distances = np.isfinite(pairs.distance_mm)
+    left_out = distances & ~pairs.used
+    share = _percent(left_out.sum(axis=0), distances.sum(axis=0))
+    counts = [np.bincount(pairs.first, mask.sum(axis=1), frames) for mask in (left_out, distances)]
+    by_frame = _percent(counts[0], counts[1])
     centres = np.round(pairs.patch_centre_mm, 6)
     (across, column), (down, row) = (np.unique(places, return_inverse=True) for places in centres.T)
     table = np.full((down.size, across.size), np.nan)

@@ -60,13 +60,13 @@ class PageFigure:
 
 @dataclass(frozen=True)
 class Section:
-    """One sweep on the page; `broken` says why it cannot be shown."""
+    """One sweep on the page; `failure` says why it cannot be shown."""
 
     anchor: str
     name: str
     notes: Sequence[str] = ()
     figures: Sequence[PageFigure] = ()
-    broken: str = ""
+    failure: str = ""
 
 
 def write_report(study: Study) -> Path:
@@ -81,7 +81,9 @@ def write_report(study: Study) -> Path:
         If the page cannot be written.
     """
     overview = _overview(study)
-    sections = [_section(study.directory, outcome, f"sweep-{i + 1}") for i, outcome in enumerate(study.done)]
+    sections = [
+        _section(study.directory, outcome, f"sweep-{i + 1}") for i, outcome in enumerate(study.successes)
+    ]
     target = study.directory / "report.html"
     with atomic_path(target) as part:
         part.write_text(_page(study, overview, sections), encoding="utf-8")
@@ -98,26 +100,26 @@ def _page(study: Study, overview: PageFigure | None, sections: Sequence[Section]
         loader=jinja2.PackageLoader("speckle3d", "report"),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
-        finalize=_shown,
+        finalize=_escape,
         trim_blocks=True,
         lstrip_blocks=True,
     )
     plots = [overview, *(figure for section in sections for figure in section.figures)]
-    keys, (intervals, paired) = ("name", "path", "sha256", "key", "seconds"), study.statistics
+    keys, (intervals, comparisons) = ("name", "path", "sha256", "key", "seconds"), study.statistics
     drifts = {key for row in study.drift for key, value in row.items() if value is not None}
     return environment.get_template("page.html").render(
-        shown=tables.counted(len(study.done) or len(study.broken), "sweep"),
+        sweep_count=tables.quantity_text(len(study.successes) or len(study.failures), "sweep"),
         lead=tables.summary_lines(study),
-        doubts=tables.records_table([_said(doubt) for doubt in study.doubts], (), anchors),
-        broken=tables.records_table(
-            [outcome.record() for outcome in study.broken], ("name", "status", "reason")
+        doubts=tables.records_table([_doubt_row(doubt) for doubt in study.doubts], (), anchors),
+        failures=tables.records_table(
+            [outcome.record() for outcome in study.failures], ("name", "status", "reason")
         ),
         overview=overview,
         parts=tables.parts_table(study.rows, anchors),
         drift=tables.records_table(study.drift, (), anchors),
         meanings={key.partition("_")[0]: words for key, words in MEANINGS.items() if key in drifts},
         intervals=means_table(intervals) if intervals else [],
-        paired=tables.pairs(paired),
+        comparisons=tables.pairs(comparisons),
         sections=sections,
         plots=[figure for figure in plots if figure is not None and figure.plot],
         configuration=study.settings_toml,
@@ -128,19 +130,19 @@ def _page(study: Study, overview: PageFigure | None, sections: Sequence[Section]
     )
 
 
-def _said(doubt: Row) -> dict[str, str]:
+def _doubt_row(doubt: Row) -> dict[str, str]:
     """A doubt as a line of the page's table."""
     fate = "refused" if doubt.get("refuted") else "used"
     return {name: str(doubt[name]) for name in ("sweep", "about", "suspect", "evidence")} | {"it is": fate}
 
 
-def _shown(value: Any) -> Any:
+def _escape(value: Any) -> Any:
     """Escape characters that would change how a reader sees the text around; markup of our own is left."""
     return printable(value, kept="\n\t") if type(value) is str else value
 
 
 def _overview(study: Study) -> PageFigure | None:
-    rows = tables.scored(study)
+    rows = tables.rows_with_error(study)
     if not rows:
         return None
     modes = list(dict.fromkeys(row["mode"] for row in rows))
@@ -154,16 +156,16 @@ def _section(directory: Path, outcome: SweepOutcome, anchor: str) -> Section:
         view = load_view(directory, outcome)
         pictures = [_picture(view.folder / file, caption) for file, caption in _PICTURES.items()]
     except (Speckle3DError, OSError) as error:
-        return Section(anchor, outcome.name, broken=str(error))
+        return Section(anchor, outcome.name, failure=str(error))
     return Section(anchor, outcome.name, view.notes, [*_plots(view, anchor), *pictures])
 
 
 def _plots(view: SweepView, anchor: str) -> list[PageFigure]:
     caption = "Accumulated length of travel, tilt, yaw and roll; the band is the 95 % interval of mode image."
-    plots = [_plotted(f"{anchor}-curves", draw.plot_curves(view.curves), caption)]
+    plots = [_plot_figure(f"{anchor}-curves", draw.plot_curves(view.curves), caption)]
     caption = f"Outlines of {draw.OUTLINES} frames of every mode in space, first frames laid on each other."
     outlines = draw.plot_outlines(view.poses, view.reconstruction.grid)
-    plots.append(_plotted(f"{anchor}-outlines", outlines, caption))
+    plots.append(_plot_figure(f"{anchor}-outlines", outlines, caption))
     pairs = view.reconstruction.pairs
     if pairs is not None and np.isfinite(pairs.distance_mm).any():
         caption = (
@@ -171,11 +173,13 @@ def _plots(view: SweepView, anchor: str) -> list[PageFigure]:
             "other patches contradict them: where in the image, in how many of the pairs, and how many over "
             "the sweep."
         )
-        plots.append(_plotted(f"{anchor}-patches", draw.plot_rejected(pairs, view.curves.frames), caption))
+        plots.append(
+            _plot_figure(f"{anchor}-patches", draw.plot_rejections(pairs, view.curves.frames), caption)
+        )
     return plots
 
 
-def _plotted(name: str, plot: Plot, caption: str) -> PageFigure:
+def _plot_figure(name: str, plot: Plot, caption: str) -> PageFigure:
     return PageFigure(caption, f"plot-{name}", Markup(plot.to_json()))
 
 

@@ -13,9 +13,9 @@ from speckle3d.study.figures import colour_of
 from speckle3d.study.overall import (
     ERRORS,
     Row,
+    better_modes,
     number,
     reference_words,
-    told_apart,
     with_interval,
     words_of,
 )
@@ -25,9 +25,9 @@ Table = Sequence[Sequence[str]]
 """Cells, the first line the heads; markup of our own is `Markup`."""
 
 
-def counted(count: int, what: str) -> str:
+def quantity_text(count: int, noun: str) -> str:
     """Number and noun."""
-    return f"{count} {what}{'s' * (count != 1)}"
+    return f"{count} {noun}{'s' * (count != 1)}"
 
 
 def parts_table(rows: Sequence[Row], anchors: Mapping[str, str]) -> Table:
@@ -41,11 +41,11 @@ def parts_table(rows: Sequence[Row], anchors: Mapping[str, str]) -> Table:
     return records_table(table, columns + remark, anchors)
 
 
-def pairs(paired: Sequence[Row]) -> Table:
+def pairs(comparisons: Sequence[Row]) -> Table:
     """Difference of every two modes in every quantity, bold where they are told apart."""
-    columns = list(dict.fromkeys(f"{row['mode']} − {row['against']}" for row in paired))
+    columns = list(dict.fromkeys(f"{row['mode']} − {row['against']}" for row in comparisons))
     lines: dict[str, dict[str, str]] = {}
-    for row in paired:
+    for row in comparisons:
         text = with_interval(row, "difference", signed=True)
         cell = Markup("<b>{}</b>").format(text) if row["better"] else text
         lines.setdefault(row["quantity"], {})[f"{row['mode']} − {row['against']}"] = cell
@@ -83,21 +83,23 @@ def _cell(key: str, value: object, anchors: Mapping[str, str]) -> str:
     return text
 
 
-def scored(study: Study) -> list[Row]:
+def rows_with_error(study: Study) -> list[Row]:
     """Rows with an error of length."""
     return [row for row in study.rows if np.isfinite(row["length_error_percent"])]
 
 
 def summary_lines(study: Study) -> list[str]:
     """Say in plain sentences how large the errors are, and whether the sweeps tell the modes apart."""
-    done, broken, rows = len(study.done), len(study.broken), scored(study)
-    if not done:
-        return [f"Nothing could be reconstructed from {counted(broken, 'sweep')}; the reasons are below."]
-    lines, (intervals, paired) = [], study.statistics
+    successes, failures, rows = len(study.successes), len(study.failures), rows_with_error(study)
+    if not successes:
+        count = quantity_text(failures, "sweep")
+        return [f"Nothing could be reconstructed from {count}; the reasons are below."]
+    lines, (intervals, comparisons) = [], study.statistics
     for quantity in ("length_error_percent", "tilt_error_deg"):
         of = [row for row in intervals if row["quantity"] == quantity]
         names = ", ".join(
-            f"{row['mode']} {with_interval(row, 'mean')} ({counted(row['sweeps'], 'sweep')})" for row in of
+            f"{row['mode']} {with_interval(row, 'mean')} ({quantity_text(row['sweeps'], 'sweep')})"
+            for row in of
         )
         if of:
             lines.append(f"mean magnitude of {words_of(quantity)}, with its 95 % interval: {names}")
@@ -105,9 +107,9 @@ def summary_lines(study: Study) -> list[str]:
         lines.append("no sweep has a reference: the lengths below are estimates alone")
     elif not lines:
         lines.append(f"fewer than {FEWEST} sweeps: no means over sweeps; errors stand below, sweep by sweep")
-    lines += told_apart(paired)
+    lines += better_modes(comparisons)
     references = {row["sweep"]: row["reference"] for row in rows}
     lines.append(reference_words({row["mode"] for row in rows}, references))
-    if broken:
-        lines.append(f"{broken} of {done + broken} sweeps have no result; the reasons are below")
+    if failures:
+        lines.append(f"{failures} of {successes + failures} sweeps have no result; the reasons are below")
     return [f"{line[0].upper()}{line[1:]}." for line in lines if line]

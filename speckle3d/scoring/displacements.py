@@ -85,8 +85,8 @@ def point_errors(
     _require_comparable(poses, true)
     relative = [(path[0].inv() * path[1:], relative_poses(path)) for path in (poses, true)]
     errors: dict[str, Any] = dict.fromkeys(CHALLENGE_ERRORS)
-    for letter, estimated, exact in zip("GL", *relative, strict=True):
-        differences = estimated.as_matrix()[:, :3] - exact.as_matrix()[:, :3]
+    for letter, estimate, exact in zip("GL", *relative, strict=True):
+        differences = estimate.as_matrix()[:, :3] - exact.as_matrix()[:, :3]
         if grid is not None:
             errors[f"{letter}PE_mm"] = _mean_over_pixels(differences, grid)
         if landmarks is not None:
@@ -119,19 +119,21 @@ def drift_rates(
     centre = np.asarray(centre_mm, dtype=float)
     _require_comparable(world_from_image, reference)
     estimate, true = (p[0].inv() * p for p in (world_from_image, reference))
-    path, estimated = true.apply(centre), estimate.apply(centre)
-    travelled = np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))
-    if not travelled[-1] > 0:
+    centres, true_centres = estimate.apply(centre), true.apply(centre)
+    path_mm = np.cumsum(np.linalg.norm(np.diff(true_centres, axis=0), axis=1))
+    if not path_mm[-1] > 0:
         raise InsufficientDataError("drift rates: expected a reference that moves, got one that rests")
-    drift = np.linalg.norm(estimated - path, axis=1)[1:]
-    moved = travelled > 0
+    drift = np.linalg.norm(centres - true_centres, axis=1)[1:]
+    moves = path_mm > 0
     angle = np.rad2deg(np.atleast_1d((true.rotation.inv() * estimate.rotation).magnitude())[1:])
     return {
-        "FDR_percent": float(100.0 * drift[-1] / travelled[-1]),
-        "ADR_percent": float(100.0 * np.mean(drift[moved] / travelled[moved])),
+        "FDR_percent": float(100.0 * drift[-1] / path_mm[-1]),
+        "ADR_percent": float(100.0 * np.mean(drift[moves] / path_mm[moves])),
         "MD_mm": float(drift.max()),
         "SD_mm": float(drift.sum()),
-        "HD_mm": max(directed_hausdorff(a, b)[0] for a, b in ((estimated, path), (path, estimated))),
+        "HD_mm": max(
+            directed_hausdorff(a, b)[0] for a, b in ((centres, true_centres), (true_centres, centres))
+        ),
         "EA_deg": float(angle.mean()),
     }
 
@@ -180,8 +182,8 @@ def _mean_over_landmarks(differences: FloatArray, landmarks: Landmarks) -> float
     at, points, last = landmarks.frame, landmarks.points_mm, len(differences)
     if not at.size or at.min() < 1 or at.max() > last:
         raise InvalidInputError(f"landmarks: expected some, all in frames 1 to {last}, got frames {at}")
-    moved = differences[at - 1]
-    shifts = moved[:, :, 3] + np.einsum("pij,pj->pi", moved[:, :, :3], points)
+    matrices = differences[at - 1]
+    shifts = matrices[:, :, 3] + np.einsum("pij,pj->pi", matrices[:, :, :3], points)
     return float(np.linalg.norm(shifts, axis=1).mean())
 
 

@@ -49,7 +49,7 @@ _LINE_EXCESS = 1.25
 samples, in 20,000 trials each."""
 
 
-class Accumulated(NamedTuple):
+class MotionSums(NamedTuple):
     """Motion summed from the first frame, all of shape (n,), zero at frame 0."""
 
     length_mm: FloatArray
@@ -77,7 +77,8 @@ class ModeError:
     Attributes
     ----------
     part : str
-        "f" forward, "r" back, numbered where there are several; "all" without a reference.
+        "f" forward, "r" back, numbered where there are several; "all" of a sweep that has no reference and
+        does not turn round.
     mode : str
     frames : int
         Of the part.
@@ -107,7 +108,7 @@ class ModeError:
     sigma_mm: float = np.nan
 
 
-def accumulated(world_from_image: RigidTransform, centre_mm: npt.ArrayLike) -> Accumulated:
+def sum_motion(world_from_image: RigidTransform, centre_mm: npt.ArrayLike) -> MotionSums:
     """Sum the elevational travel of the image centre and the angles from frame to frame.
 
     Parameters
@@ -124,7 +125,7 @@ def accumulated(world_from_image: RigidTransform, centre_mm: npt.ArrayLike) -> A
     steps = relative_poses(world_from_image)
     roll, yaw, tilt = roll_yaw_tilt(steps.rotation).T
     along_z = (steps.apply(centre) - centre)[:, 2]
-    return Accumulated(*(np.concatenate([[0.0], np.cumsum(a)]) for a in (along_z, tilt, yaw, roll)))
+    return MotionSums(*(np.concatenate([[0.0], np.cumsum(a)]) for a in (along_z, tilt, yaw, roll)))
 
 
 def monotone_parts(length_mm: npt.ArrayLike) -> list[Part]:
@@ -205,13 +206,13 @@ def compare_modes(
     if not poses:
         raise InvalidInputError("poses: expected at least one mode, got none")
     frames = len(next(iter(poses.values()))) if covered is None else np.size(covered)
-    used = np.ones(frames, dtype=bool) if covered is None else np.asarray(covered, dtype=bool)
-    true_poses = reference[used] if len(reference) == frames else reference
-    lengths = {*map(len, poses.values()), frames + len(true_poses) - int(used.sum())}
+    mask = np.ones(frames, dtype=bool) if covered is None else np.asarray(covered, dtype=bool)
+    true_poses = reference[mask] if len(reference) == frames else reference
+    lengths = {*map(len, poses.values()), frames + len(true_poses) - int(mask.sum())}
     if lengths != {frames}:
         raise MismatchError(f"expected {frames} poses of each mode and of the reference, got {lengths}")
-    true = accumulated(true_poses, centre_mm)
-    estimates = {mode: accumulated(path[used], centre_mm) for mode, path in poses.items()}
+    true = sum_motion(true_poses, centre_mm)
+    estimates = {mode: sum_motion(path[mask], centre_mm) for mode, path in poses.items()}
     rows = []
     for part in monotone_parts(true.length_mm):
         frames, (exact, reference_sigma_mm) = part.last - part.first + 1, _changes(true, part, end_frames)
@@ -221,17 +222,34 @@ def compare_modes(
             error_mm = sign * (changes[0] - exact[0])
             percent = 100.0 * error_mm / reference_mm if reference_mm else np.nan
             turns = np.rad2deg(np.subtract(changes[1:], exact[1:])).tolist()
-            own_sigma_mm = sigma_mm if mode == TRACKER else np.nan
-            errors = reference_mm + error_mm, error_mm, percent, *turns, reference_sigma_mm, own_sigma_mm
+            jitter_sigma_mm = sigma_mm if mode == TRACKER else np.nan
+            errors = reference_mm + error_mm, error_mm, percent, *turns, reference_sigma_mm, jitter_sigma_mm
             rows.append(ModeError(part.name, mode, frames, reference_mm, *errors))
     return rows
 
 
-def travelled_mm(mode: str, world_from_image: RigidTransform, centre_mm: npt.ArrayLike) -> float:
-    """Signed length of a whole sweep between its ends, read as the module says without a reference."""
-    whole = Part("all", 0, len(world_from_image) - 1)
-    motion = accumulated(world_from_image, centre_mm)
-    return _changes(motion, whole, END_FRAMES if mode == TRACKER else 1)[0][0]
+def part_lengths(
+    poses: Mapping[str, RigidTransform], centre_mm: npt.ArrayLike
+) -> tuple[list[Part], dict[str, FloatArray]]:
+    """Parts of a sweep without a reference, by its first mode, and the length of each in every mode, mm.
+
+    A sweep that does not turn round is one part, "all".
+
+    Parameters
+    ----------
+    poses : mapping of str to RigidTransform, length n
+        ``world_from_image`` by mode, mm, in any world.
+    """
+    motions = {mode: sum_motion(path, centre_mm) for mode, path in poses.items()}
+    first = next(iter(motions.values())).length_mm
+    parts = monotone_parts(first)
+    if len(parts) == 1:
+        parts = [Part("all", 0, len(first) - 1)]
+    lengths = {
+        mode: np.abs([_changes(motion, part, END_FRAMES if mode == TRACKER else 1)[0][0] for part in parts])
+        for mode, motion in motions.items()
+    }
+    return parts, lengths
 
 
 def read_end(values: FloatArray, end_frames: int = END_FRAMES) -> float:
@@ -254,7 +272,7 @@ def read_end(values: FloatArray, end_frames: int = END_FRAMES) -> float:
 def jitter_mm(length_mm: FloatArray) -> float:
     """Standard deviation of a tracker's jitter along the sweep, mm; NaN for fewer than eight readings.
 
-    It is told from third differences: a hand is too smooth to have any at 25 frames/s, white noise of
+    By third differences: a hand is too smooth to have any at 25 frames/s, white noise of
     standard deviation s gives them ``sqrt(20) s``.
 
     Parameters
@@ -271,7 +289,7 @@ def _width(size: int, end_frames: int) -> int:
     return max(1, min(end_frames, size // 10))
 
 
-def _changes(motion: Accumulated, part: Part, end_frames: int) -> tuple[list[float], float]:
+def _changes(motion: MotionSums, part: Part, end_frames: int) -> tuple[list[float], float]:
     """Change of length, tilt, yaw and roll over a part, and the length's deviation by jitter at both ends."""
     inside = [values[part.first : part.last + 1] for values in motion]
     changes = [read_end(values, end_frames) - read_end(values[::-1], end_frames) for values in inside]

@@ -11,25 +11,27 @@ from speckle3d.core.errors import MismatchError
 from speckle3d.core.reconstruction import Reconstruction, Trust
 from speckle3d.correction.claims import length_sigma
 from speckle3d.examine.disagreements import differing_lengths
-from speckle3d.scoring.lengths import travelled_mm
+from speckle3d.scoring.lengths import part_lengths
 
 
 def relative_claims(
     poses: Mapping[str, RigidTransform], trust: Trust, centre_mm: FloatArray
 ) -> dict[str, float]:
-    """Relative standard deviation of the length that each mode claims, of those that do."""
+    """Relative standard deviation of its length by every mode that claims one."""
     claims = {"image": length_sigma(poses["image"], trust.covariance, centre_mm)}
     claims |= {mode: errors.length_sigma for mode, errors in trust.modes.items()}
     return {mode: claim for mode, claim in claims.items() if mode in poses}
 
 
 def length_claims(
-    poses: Mapping[str, RigidTransform], trust: Trust, centre_mm: FloatArray
+    poses: Mapping[str, RigidTransform], claims: Mapping[str, float], centre_mm: FloatArray
 ) -> dict[str, tuple[float, float]]:
-    """Length of each mode that claims an error of it, and its standard deviation, mm."""
-    claims = relative_claims(poses, trust, centre_mm)
-    lengths = {mode: abs(travelled_mm(mode, poses[mode], centre_mm)) for mode in claims}
-    return {mode: (lengths[mode], lengths[mode] * claim) for mode, claim in claims.items()}
+    """Length of each mode with a relative claim, all parts together, and its standard deviation, mm."""
+    lengths = part_lengths(poses, centre_mm)[1]
+    return {
+        mode: (float(lengths[mode].sum()), claim * float(lengths[mode].sum()))
+        for mode, claim in claims.items()
+    }
 
 
 def default_mode(reconstruction: Reconstruction) -> tuple[str, str]:
@@ -40,15 +42,16 @@ def default_mode(reconstruction: Reconstruction) -> tuple[str, str]:
     MismatchError
         If modes differ by more than three joint claims: there is no best one.
     """
-    trust, poses = reconstruction.trust, reconstruction.poses
-    claims = {} if trust is None else length_claims(poses, trust, reconstruction.grid.centre_mm)
-    if doubts := differing_lengths(claims):
+    trust, poses, centre = reconstruction.trust, reconstruction.poses, reconstruction.grid.centre_mm
+    claims = {} if trust is None else relative_claims(poses, trust, centre)
+    lengths = length_claims(poses, claims, centre)
+    if doubts := differing_lengths(lengths):
         raise MismatchError(f"{doubts[0].evidence}: expected --mode to say which to take, got none")
     if len(claims) < 2:
         return "image", ""
     # Of modes that claim as much, the later corrects more.
-    best = min(reversed(claims), key=lambda mode: claims[mode][1] / max(claims[mode][0], 1e-9))
-    length, sigma = claims[best]
+    best = min(reversed(claims), key=claims.__getitem__)
+    length, sigma = lengths[best]
     return best, (
         f"mode {best}: claims the smallest error of length, {length:.2f} +- {1.96 * sigma:.2f} mm (95 %); "
         "--mode takes another"

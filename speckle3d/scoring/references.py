@@ -19,10 +19,10 @@ from speckle3d.scoring.lengths import (
     END_FRAMES,
     TRACKER,
     ModeError,
-    accumulated,
     compare_modes,
+    part_lengths,
     read_end,
-    travelled_mm,
+    sum_motion,
 )
 
 REFERENCES = ("tracker", "truth")
@@ -84,33 +84,32 @@ class SweepCurves:
         return int(next(iter(self.modes.values())).shape[1])
 
 
-def find_reference(sweep: Sweep, wanted: str | None = None) -> Reference | None:
+def find_reference(sweep: Sweep, name: str | None = None) -> Reference | None:
     """Poses to compare a sweep's modes with: by default the truth if stored, else the tracker, else None.
 
     Parameters
     ----------
     sweep : Sweep
-    wanted : {"tracker", "truth"}, optional
+    name : {"tracker", "truth"}, optional
 
     Raises
     ------
     InvalidInputError
-        If `wanted` is neither.
+        If `name` is neither.
     InsufficientDataError
-        If the sweep does not have what is wanted.
+        If the sweep does not have these poses.
     """
-    if wanted not in (None, *REFERENCES):
-        raise InvalidInputError(f"expected {' or '.join(REFERENCES)}, got {wanted!r}")
-    if sweep.truth is not None and wanted != "tracker":
+    if name not in (None, *REFERENCES):
+        raise InvalidInputError(f"expected {' or '.join(REFERENCES)}, got {name!r}")
+    if sweep.truth is not None and name != "tracker":
         return Reference.over_all("truth", sweep.truth)
-    if wanted == "truth":
+    if name == "truth":
         raise InsufficientDataError(f"{sweep.name}: expected true poses in /truth, got none")
     if sweep.tracker is not None and sweep.tracker.sensor_from_image is not None:
-        covered = sweep.tracker.covers(sweep.frame_time_s)
-        if covered.sum() >= 2:
-            poses = sweep.tracker.world_from_image(sweep.frame_time_s[covered])
-            return Reference("tracker", poses, covered)
-    if wanted == "tracker":
+        mask = sweep.tracker.covers(sweep.frame_time_s)
+        if mask.sum() >= 2:
+            return Reference("tracker", sweep.tracker.world_from_image(sweep.frame_time_s[mask]), mask)
+    if name == "tracker":
         raise InsufficientDataError(f"{sweep.name}: expected a calibrated tracker over the frames, got none")
     return None
 
@@ -134,7 +133,7 @@ def sweep_curves(
     Parameters
     ----------
     poses : mapping of str to RigidTransform, length n
-        ``world_from_image`` by mode.
+        ``world_from_image`` by mode; that of the reference's name is left out.
     centre_mm : array_like, shape (3,)
         Image centre in the image frame.
     reference : Reference, optional
@@ -145,16 +144,16 @@ def sweep_curves(
 
     """
     modes = {
-        mode: _curves(path, centre_mm, END_FRAMES if mode == TRACKER else 1) for mode, path in poses.items()
+        mode: _curves(path, centre_mm, END_FRAMES if mode == TRACKER else 1)
+        for mode, path in _estimates(poses, reference).items()
     }
     half_width = None
     if covariance is not None and "image" in modes:
         half_width = 1.96 * _UNITS * np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)).T[2:]
     if reference is None:
         return SweepCurves(modes, half_width=half_width)
-    covered, frames = reference.covered, next(iter(modes.values())).shape[1]
-    curves = np.full((4, frames), np.nan)
-    curves[:, covered] = _curves(reference.world_from_image, centre_mm, reference.end_frames)
+    curves = np.full((4, reference.covered.size), np.nan)
+    curves[:, reference.covered] = _curves(reference.world_from_image, centre_mm, reference.end_frames)
     return SweepCurves(modes, curves, reference.name, half_width)
 
 
@@ -168,12 +167,13 @@ def error_rows(
     poses : mapping of str to RigidTransform, length n
         By mode; the reference may be among them.
     """
-    estimates = {mode: path for mode, path in poses.items() if reference is None or mode != reference.name}
-    frames = len(next(iter(poses.values())))
+    estimates = _estimates(poses, reference)
     if reference is None or not estimates:
+        parts, lengths = part_lengths(poses, centre_mm)
         return [
-            ModeError("all", mode, frames, estimate_mm=abs(travelled_mm(mode, path, centre_mm)))
-            for mode, path in poses.items()
+            ModeError(part.name, mode, part.last - part.first + 1, estimate_mm=float(lengths[mode][k]))
+            for k, part in enumerate(parts)
+            for mode in poses
         ]
     true = reference.world_from_image
     rows = compare_modes(estimates, true, centre_mm, reference.covered, reference.end_frames)
@@ -185,8 +185,15 @@ def error_rows(
     return rows
 
 
+def _estimates(
+    poses: Mapping[str, RigidTransform], reference: Reference | None
+) -> Mapping[str, RigidTransform]:
+    """Poses of every mode but that of the reference's name."""
+    return {mode: path for mode, path in poses.items() if reference is None or mode != reference.name}
+
+
 def _curves(poses: RigidTransform, centre_mm: npt.ArrayLike, end_frames: int) -> FloatArray:
     """Length (mm), tilt, yaw and roll (degrees), shape (4, n), zero where the first end is read."""
-    curves = _UNITS * np.stack(accumulated(poses, centre_mm))
+    curves = _UNITS * np.stack(sum_motion(poses, centre_mm))
     start = np.array([[read_end(curve[::-1], end_frames)] for curve in curves])
     return np.asarray(curves - start)

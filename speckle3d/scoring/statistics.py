@@ -70,6 +70,6 @@ def holm(p_values: Sequence[float | None]) -> list[float | None]:
     """
     tests = [p for p in p_values if p is not None]
     order = np.argsort(tests)
-    grown = np.sort(tests) * np.arange(len(tests), 0, -1)
-    corrected = np.minimum(np.maximum.accumulate(grown), 1.0)[np.argsort(order)].tolist()
-    return [None if p is None else corrected.pop(0) for p in p_values]
+    products = np.sort(tests) * np.arange(len(tests), 0, -1)
+    holm_p = np.minimum(np.maximum.accumulate(products), 1.0)[np.argsort(order)].tolist()
+    return [None if p is None else holm_p.pop(0) for p in p_values]

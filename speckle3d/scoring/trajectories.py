@@ -35,7 +35,7 @@ _ROUNDING_S = 0.5e-6
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Poses on a clock, and what is known of the images at them.
+    """Poses on a clock, with the grid and the landmarks of their images.
 
     Attributes
     ----------
@@ -76,7 +76,7 @@ class PoseError:
 
 
 def kind_of(path: Path) -> str:
-    """Kind of a file by its content: "reconstruction", "sweep" or "text" (anything unknown)."""
+    """Kind of a file by its content: "reconstruction", "sweep" or "text" (anything else)."""
     try:
         return "reconstruction" if load.kind_of(path) == FORMAT else "sweep"
     except InvalidInputError:
@@ -112,19 +112,19 @@ def load_estimate(path: Path, mode: str | None = None, length_unit: LengthUnit |
 def poses_of(reconstruction: Reconstruction, mode: str) -> RigidTransform:
     """Poses of one mode, or an `InvalidInputError` that lists the modes there are."""
     if mode not in reconstruction.poses:
-        raise InvalidInputError(f"--mode: expected one of {', '.join(reconstruction.poses)}, got {mode!r}")
+        raise InvalidInputError(f"mode: expected one of {', '.join(reconstruction.poses)}, got {mode!r}")
     return reconstruction.poses[mode]
 
 
 def load_reference(
-    path: Path, wanted: str | None = None, mode: str | None = None, length_unit: LengthUnit | None = None
+    path: Path, name: str | None = None, mode: str | None = None, length_unit: LengthUnit | None = None
 ) -> Trajectory:
     """Read TUM text, a reconstruction, or the truth or tracker of a sweep.
 
     Parameters
     ----------
     path : path
-    wanted : {"tracker", "truth"}, optional
+    name : {"tracker", "truth"}, optional
         Of a sweep; by default the truth if stored, else the tracker.
     mode, length_unit
         As for `load_estimate`.
@@ -137,13 +137,17 @@ def load_reference(
     if kind_of(path) != "sweep":
         return load_estimate(path, mode, length_unit)
     sweep = load_sweep(path)
-    poses = find_reference(sweep, wanted)
-    if poses is None:
+    reference = find_reference(sweep, name)
+    if reference is None:
         raise InsufficientDataError(f"{path}: expected truth or a calibrated tracker, got neither")
-    marks = load_landmarks(path) if poses.covered.all() else None
-    times = sweep.frame_time_s[poses.covered]
-    name = f"{path.name}, {poses.name}"
-    return Trajectory(name, times, poses.world_from_image, sweep.grid, marks, recording_sha256(path))
+    return Trajectory(
+        f"{path.name}, {reference.name}",
+        sweep.frame_time_s[reference.covered],
+        reference.world_from_image,
+        sweep.grid,
+        load_landmarks(path) if reference.covered.all() else None,
+        recording_sha256(path),
+    )
 
 
 def compare_trajectories(estimate: Trajectory, reference: Trajectory) -> dict[str, Any]:
@@ -174,32 +178,32 @@ def compare_trajectories(estimate: Trajectory, reference: Trajectory) -> dict[st
     """
     grid = estimate.grid or reference.grid
     stream = TimedPoses(reference.time_s, reference.poses)
-    times = _snapped(estimate.time_s, reference.time_s)
-    shared = stream.covers(times)
-    if (common := int(shared.sum())) < 2:
+    times = _snap_times(estimate.time_s, reference.time_s)
+    mask = stream.covers(times)
+    if (count := int(mask.sum())) < 2:
         raise MismatchError(
-            f"{estimate.name} and {reference.name}: expected 2 times or more that both have, got {common}"
+            f"{estimate.name} and {reference.name}: expected 2 times or more that both have, got {count}"
         )
-    estimated, true = estimate.poses[shared], stream.at(times[shared])
-    whole = bool(shared.all()) and len(true) == len(reference.poses)
-    marks = reference.landmarks if whole else None
-    of = estimate.sweep_sha256, reference.sweep_sha256
-    errors = score_row(estimated, true, grid, marks)
+    poses, true = estimate.poses[mask], stream.at(times[mask])
+    is_whole = bool(mask.all()) and len(true) == len(reference.poses)
+    marks = reference.landmarks if is_whole else None
+    hashes = estimate.sweep_sha256, reference.sweep_sha256
+    errors = score_row(poses, true, grid, marks)
     score = challenge_score(errors, true, grid, marks) if grid and marks else None
     return {
         "estimate": estimate.name,
         "reference": reference.name,
-        "poses": len(estimated),
-        "left_out": len(shared) - common,
-        "same_sweep": of[0] == of[1] if all(of) else None,
-        "APE": PoseError.of((true[0].inv() * true).inv() * (estimated[0].inv() * estimated)),
-        "RPE": PoseError.of(relative_poses(true).inv() * relative_poses(estimated)),
+        "poses": count,
+        "left_out": len(mask) - count,
+        "same_sweep": hashes[0] == hashes[1] if all(hashes) else None,
+        "APE": PoseError.of((true[0].inv() * true).inv() * (poses[0].inv() * poses)),
+        "RPE": PoseError.of(relative_poses(true).inv() * relative_poses(poses)),
         **errors,
         "score": score,
     }
 
 
-def _snapped(time_s: FloatArray, onto_s: FloatArray) -> FloatArray:
+def _snap_times(time_s: FloatArray, onto_s: FloatArray) -> FloatArray:
     """Set times that equal a time of `onto_s` but for rounding to it, so that its ends are covered."""
     nearest = onto_s[np.rint(np.interp(time_s, onto_s, np.arange(onto_s.size))).astype(int)]
     return np.where(np.abs(nearest - time_s) <= _ROUNDING_S + np.spacing(nearest), nearest, time_s)

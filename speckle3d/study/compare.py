@@ -53,24 +53,24 @@ class StudyRequest:
         crossing = self._crossing(path)
         try:
             frames, sha256 = len(load_sweep(path)), recording_sha256(path)
-            used = [sha256_of(each) for each in (self._curves(path), *self.calibrations)]
-            used += [] if crossing is None else [recording_sha256(crossing)]
+            hashes = [sha256_of(file) for file in (self._curves(path), *self.calibrations)]
+            hashes += [] if crossing is None else [recording_sha256(crossing)]
         except Exception as error:  # noqa: BLE001 - one row that says why
-            return failed(SweepOutcome(name, path), _reason(error))
-        parts = [sha256, self.settings_toml, version("speckle3d"), self.modes, self.reference, used]
+            return SweepOutcome(name, path, _reason(error))
+        parts = [sha256, self.settings_toml, version("speckle3d"), self.modes, self.reference, hashes]
         key = hashlib.sha256(json.dumps(parts).encode()).hexdigest()
         return SweepOutcome(name, path, "", sha256, key, f"sweeps/{name}-{key[:8]}", frames)
 
-    def run(self, planned: SweepOutcome) -> SweepOutcome:
-        """Do a sweep unless it is done; whatever is wrong with it becomes the outcome's reason."""
-        folder = self.directory / planned.folder
-        skipped = (folder / RESULTS.primary).is_file()
+    def run(self, plan: SweepOutcome) -> SweepOutcome:
+        """Reconstruct a sweep unless its folder is there; an error becomes the outcome's reason."""
+        folder = self.directory / plan.folder
+        is_old = (folder / RESULTS.primary).is_file()
         try:
-            if not skipped:
-                self._reconstruct(planned.path, folder)
-            return replace(planned, skipped=skipped, summary=read_summary(folder, planned.name))
+            if not is_old:
+                self._reconstruct(plan.path, folder)
+            return replace(plan, is_old=is_old, summary=read_summary(folder, plan.name))
         except Exception as error:  # noqa: BLE001 - one broken sweep, or one bug that it reveals, stops no other
-            return failed(planned, _reason(error))
+            return failure(plan, _reason(error))
 
     def _reconstruct(self, path: Path, folder: Path) -> None:
         settings, crossing, sweep = (
@@ -78,8 +78,9 @@ class StudyRequest:
             self._crossing(path),
             load_sweep(path),
         )
-        mounted, _ = apply_calibrations(sweep, self.calibrations)
-        modes = available_modes(mounted, settings) if self.modes is None else self.modes
+        modes: Sequence[str] | None = self.modes
+        if modes is None:
+            modes = available_modes(apply_calibrations(sweep, self.calibrations)[0], settings)
         run_job(
             sweep,
             path,
@@ -102,9 +103,9 @@ class StudyRequest:
         return path.with_name(f"{name}{path.suffix}") if "crossed" in (self.modes or ()) else None
 
 
-def failed(planned: SweepOutcome, reason: str) -> SweepOutcome:
-    """What became of a sweep that failed."""
-    return replace(planned, reason=reason, folder="")
+def failure(plan: SweepOutcome, reason: str) -> SweepOutcome:
+    """Outcome of a sweep that failed."""
+    return replace(plan, reason=reason, folder="")
 
 
 def compare_sweeps(
@@ -141,38 +142,42 @@ def compare_sweeps(
     FileError
         If the folder cannot be written.
     """
-    chosen = None if modes is None else tuple(dict.fromkeys(modes))
     require_own(directory, FILES)
     if curves is not None:
         read_curves(curves)
-    settings = (config or Config()).to_toml()
-    mounted, curves = tuple(each.resolve() for each in calibrations), curves and curves.resolve()
-    request = StudyRequest(directory.resolve(), curves, settings, chosen, reference, mounted)
+    request = StudyRequest(
+        directory.resolve(),
+        curves and curves.resolve(),
+        (config or Config()).to_toml(),
+        None if modes is None else tuple(dict.fromkeys(modes)),
+        reference,
+        tuple(path.resolve() for path in calibrations),
+    )
     outcomes: dict[str, SweepOutcome] = {}
-    first: dict[str, str] = {}
-    for name, path in named(paths):
+    first_names: dict[str, str] = {}
+    for name, path in name_files(paths):
         plan = request.plan(name, path.resolve())
-        if plan.sha256 and (same := first.setdefault(plan.sha256, name)) != name:
-            plan = failed(plan, f"the same recording as {same}, which counts once")
+        if plan.sha256 and (twin := first_names.setdefault(plan.sha256, name)) != name:
+            plan = failure(plan, f"the same recording as {twin}, which counts once")
         outcomes[name] = plan
     # The longest first, so that no worker is left with it while the others have nothing to do.
-    todo = sorted((each for each in outcomes.values() if each.folder), key=lambda each: -each.frames)
+    todo = sorted((plan for plan in outcomes.values() if plan.folder), key=lambda plan: -plan.frames)
     if not todo:
-        why = "; ".join(f"{each.name}: {each.reason}" for each in outcomes.values())
+        why = "; ".join(f"{plan.name}: {plan.reason}" for plan in outcomes.values())
         raise InsufficientDataError(f"expected a sweep that can be compared, got none: {why or 'no file'}")
     make_folder(directory / "sweeps")
-    done, total, tell = 0, sum(each.frames for each in todo), progress or (lambda done, total: None)
-    tell(done, total)
-    for outcome in (scheduler or Scheduler()).run(request.run, todo, failed):
+    frames, total, tell = 0, sum(plan.frames for plan in todo), progress or (lambda frames, total: None)
+    tell(frames, total)
+    for outcome in (scheduler or Scheduler()).run(request.run, todo, failure):
         outcomes[outcome.name] = outcome
-        done += outcome.frames
-        tell(done, total)
-    study = Study(directory, list(outcomes.values()), settings)
+        frames += outcome.frames
+        tell(frames, total)
+    study = Study(directory, list(outcomes.values()), request.settings_toml)
     write_study(study)
     return study
 
 
-def named(paths: Sequence[Path]) -> list[tuple[str, Path]]:
+def name_files(paths: Sequence[Path]) -> list[tuple[str, Path]]:
     """Name each file once, by its stem, and by a hash of its path, too, if others have the same stem.
 
     Names depend on the files alone, not on their order: a study given again in another order is the same.

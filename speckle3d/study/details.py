@@ -19,7 +19,7 @@ from speckle3d.tracked import Tracked
 
 
 def recorded_doubts(path: Path, provenance: Provenance) -> tuple[Doubt, ...] | None:
-    """Doubts that ``summary.json`` beside a reconstruction holds.
+    """Read the doubts in the ``summary.json`` beside a reconstruction.
 
     Parameters
     ----------
@@ -35,11 +35,11 @@ def recorded_doubts(path: Path, provenance: Provenance) -> tuple[Doubt, ...] | N
     """
     try:
         (summary,) = json.loads((path.parent / "summary.json").read_text(encoding="utf-8"))["sweeps"]
-        made_from = summary["details"]["provenance"]["input_sha256"]
-        doubts = tuple(Doubt(**each) for each in summary["doubts"])
+        input_sha256 = summary["details"]["provenance"]["input_sha256"]
+        doubts = tuple(Doubt(**doubt) for doubt in summary["doubts"])
     except (OSError, ValueError, KeyError, TypeError):
         return None
-    return doubts if made_from == provenance.input_sha256 else None
+    return doubts if input_sha256 == provenance.input_sha256 else None
 
 
 def doubted_modes(sweep: Sweep, doubts: Sequence[Doubt], modes: Collection[str]) -> dict[str, str]:
@@ -50,9 +50,9 @@ def doubted_modes(sweep: Sweep, doubts: Sequence[Doubt], modes: Collection[str])
         about = {"" if sensor is None else sensor.label}
         if mode != TRACKER:
             about |= {"images", "curves"}
-        suspected = dict.fromkeys(d.suspect for d in doubts if d.about in about and d.suspect)
-        if suspected:
-            suspicions[mode] = ", ".join(suspected)
+        suspects = dict.fromkeys(d.suspect for d in doubts if d.about in about and d.suspect)
+        if suspects:
+            suspicions[mode] = ", ".join(suspects)
     return suspicions
 
 
@@ -61,15 +61,13 @@ def details_of(
 ) -> dict[str, Any]:
     """Everything worth keeping of a reconstruction beside its errors, by name."""
     fits: dict[str, dict[str, Any]] = {}
-    about: dict[str, Any]
-    for mode, each in corrections.items():
-        if isinstance(each, DriftCorrection):
-            parameters = dict(zip(each.names, each.fit.x.tolist(), strict=True))
-            about = {"curves": each.settings.curves, "coverage": each.coverage, "parameters": parameters}
+    for mode, fit in corrections.items():
+        if isinstance(fit, DriftCorrection):
+            parameters = dict(zip(fit.names, fit.fit.x.tolist(), strict=True))
+            fits[mode] = {"curves": fit.settings.curves, "coverage": fit.coverage, "parameters": parameters}
         else:
-            rests_on = [source.source for source in each.evidence]
-            about = {"length_over_images": each.scale, "rests_on": rests_on, **each.details}
-        fits[mode] = about
+            sources = [evidence.source for evidence in fit.evidence]
+            fits[mode] = {"length_over_images": fit.scale, "rests_on": sources, **fit.details}
     return {
         "provenance": provenance,
         "pairs": tracked.pairs,

@@ -67,7 +67,7 @@ def figure_drift(curves: SweepCurves, title: str = "") -> Figure:
     for q, axes in enumerate(figure.subplots(1, 2)):
         if curves.reference is not None:
             look = {"color": colour_of(curves.reference_name), "label": curves.reference_name}
-            axes.plot(frames, curves.reference[q], linewidth=2.4, alpha=0.5, **look)
+            axes.plot(frames, curves.reference[q], linewidth=2.4, **look)
         if curves.half_width is not None:
             middle, half = curves.modes["image"][q], curves.half_width[q]
             look = {"color": colour_of("image"), "label": "95 % interval of image"}

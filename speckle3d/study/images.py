@@ -97,9 +97,9 @@ class GreyImages:
             self._range_db = dynamic_range_db
             # One level for the whole sweep. For looking, the 99.9th percentile, so that one specular echo
             # does not darken it; for measuring an echo's place, the brightest, so that none is cut off.
-            shown = [len(sweep) // 2] if clipped else np.linspace(0, len(sweep) - 1, _GLANCES).astype(int)
-            images = [_decibel(self._extractor.intensity(read_frame(sweep.frames, int(i)))) for i in shown]
-            self._brightest = max(float(np.percentile(each, 99.9 if clipped else 100)) for each in images)
+            frames = [len(sweep) // 2] if clipped else np.linspace(0, len(sweep) - 1, _GLANCES).astype(int)
+            images = [_decibel(self._extractor.intensity(read_frame(sweep.frames, int(i)))) for i in frames]
+            self._brightest = max(float(np.percentile(image, 99.9 if clipped else 100)) for image in images)
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -171,10 +171,10 @@ def grey_images(
 def open_reconstruction(path: Path, sweep_file: Path | None = None) -> tuple[Reconstruction, Sweep]:
     """Open a reconstruction and the sweep it was made from, as `sweep_of`."""
     reconstruction = read_reconstruction(path, with_pairs=False)
-    stored = Path(reconstruction.provenance.input_path)
-    # The stored path is tried as it is, then from the reconstruction's folder and from the one above.
-    places = (stored, path.parent / stored, path.absolute().parent.parent / stored)
-    source = sweep_file or next((place for place in places if place.exists()), stored)
+    source = Path(reconstruction.provenance.input_path)
+    # As the file says, then from the reconstruction's folder and from the one above.
+    places = (source, path.parent / source, path.absolute().parent.parent / source)
+    source = sweep_file or next((place for place in places if place.exists()), source)
     return reconstruction, sweep_of(reconstruction, source)
 
 
@@ -190,15 +190,15 @@ def sweep_of(reconstruction: Reconstruction, source: Path) -> Sweep:
     MismatchError
         If the sweep's bytes are not those that were reconstructed.
     """
-    made = reconstruction.provenance
+    provenance = reconstruction.provenance
     if not source.exists():
         raise InvalidInputError(
             f"{source}: expected the sweep that was reconstructed, got none: give --sweep"
         )
-    if recording_sha256(source) != made.input_sha256:
+    if recording_sha256(source) != provenance.input_sha256:
         raise MismatchError(f"{source}: expected the sweep that was reconstructed, got another (SHA-256)")
-    mounted = [each.path for each in made.calibrations if Path(each.path).exists()]
-    return apply_calibrations(part_at(load_sweep(source), reconstruction.frame_time_s), mounted)[0]
+    calibrations = [file.path for file in provenance.calibrations if Path(file.path).exists()]
+    return apply_calibrations(part_at(load_sweep(source), reconstruction.frame_time_s), calibrations)[0]
 
 
 def part_at(sweep: Sweep, time_s: FloatArray) -> Sweep:

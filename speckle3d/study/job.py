@@ -28,11 +28,10 @@ from speckle3d.core.reconstruction import (
 )
 from speckle3d.core.shown import shown
 from speckle3d.core.sweep import Sweep
-from speckle3d.correction.crossing.pair import CrossedPair, crossed
-from speckle3d.correction.crossing.stack import ImageStack
+from speckle3d.correction.crossing.pair import CrossedPair
 from speckle3d.correction.modes import PUBLISHED, require_modes
 from speckle3d.corrections import Correction, correct
-from speckle3d.crossing_sweeps import crossing_side, curves_from, require_pair, stack_for
+from speckle3d.crossing_sweeps import cross_with, require_pair, stack_for
 from speckle3d.examine.disagreements import differing_lengths
 from speckle3d.examine.sensors import credible_sensors, repair_readings, require_credible
 from speckle3d.io.calibrations import apply_calibrations
@@ -54,7 +53,7 @@ from speckle3d.scoring.references import (
 from speckle3d.study.details import details_of, doubted_modes
 from speckle3d.study.figures import RANGE_DB, figure_drift, save_figure
 from speckle3d.study.images import GreyImages
-from speckle3d.study.posed import OpenedModes, PosedSweep, pose_mark
+from speckle3d.study.posed import PosedSweep, SweepModes, pose_mark
 from speckle3d.study.reslices.cuts import length_words
 from speckle3d.study.reslices.reslice_figures import draw_along
 from speckle3d.study.results import SUMMARY_FILES, Summary, require_own, summary_text, write_summary
@@ -65,7 +64,7 @@ from speckle3d.tracking import track
 @shown
 @dataclass(frozen=True)
 class JobResult:
-    """What a job found, and where it is.
+    """Results of a job, and the folder that holds them.
 
     Attributes
     ----------
@@ -88,7 +87,7 @@ class JobResult:
 
     @property
     def seconds(self) -> float:
-        """It took."""
+        """Run time of the job."""
         return float(self.summary.details["seconds"])
 
 
@@ -151,110 +150,90 @@ def run_job(
     FileError
         If the folder cannot be written, or another run is at work in it.
     """
-    began, settings = time.perf_counter(), config or Config()
+    start_s, settings = time.perf_counter(), config or Config()
     source, directory = Path(source), Path(directory)
     require_own(directory, RESULTS)
-    sweep, mounted = apply_calibrations(sweep, calibrations)
-    compared = require_possible(sweep, drift, reference, settings, crossing is not None)
-    sweeps, second_file = [sweep], None
+    sweep, calibration_files = apply_calibrations(sweep, calibrations)
+    reference_poses = require_possible(sweep, drift, reference, settings, crossing is not None)
+    second, second_file, stack = None, None, None
     if crossing is not None:
-        sweeps.append(apply_calibrations(crossing[0], calibrations)[0])
+        second = apply_calibrations(crossing[0], calibrations)[0]
         second_file = SourceFile(written_path(crossing[1]), recording_sha256(crossing[1]))
-        require_pair(*sweeps)
-    stacks = [] if crossing is None else [stack_for(each, settings) for each in sweeps]
-    pair, corrected, left_out = None, None, dict[str, str]()
+        require_pair(sweep, second)
+        stack = stack_for(sweep, settings)
+    pair, new_curves, left_out = None, None, dict[str, str]()
     with RESULTS.replaced(directory) as part:
-        pairs, keep = list[FramePairs](), stacks[0].keep if stacks else None
-        report = after(progress, 0, sum(map(len, sweeps)))
+        pairs, keep = list[FramePairs](), None if stack is None else stack.keep
+        report = after(progress, 0, len(sweep) + (0 if second is None else len(second)))
         tracked = track(sweep, curves, settings, report, pairs.append, keep)
-        if stacks:
+        if second is not None and stack is not None:
             try:
-                pair, corrected = _crossed(sweeps, stacks, tracked, curves, settings, progress)
+                pair, new_curves = cross_with(second, sweep, tracked, stack, curves, settings, progress)
             except (InsufficientDataError, MismatchError) as error:
                 # Said even if only `fused` was to use it: it went without.
                 left_out["crossed"] = f"{sweep.name}: drift mode crossed: {error}"
-        poses, corrections = _corrected(tracked, sweep, drift, settings, pair, left_out)
+        poses, corrections = _correct_modes(tracked, sweep, drift, settings, pair, left_out)
         provenance = Provenance(
             written_path(source),
             recording_sha256(source),
             version("speckle3d"),
-            mounted,
+            calibration_files,
             second_file,
             import_record(source),
         )
-        errors = {mode: ModeErrors(each.covariance, each.length_sigma) for mode, each in corrections.items()}
+        errors = {mode: ModeErrors(c.covariance, c.length_sigma) for mode, c in corrections.items()}
         trust = Trust(tracked.covariance, tracked.flags, tracked.shared, errors)
-        made = Reconstruction(
-            sweep.frame_time_s, sweep.grid, poses, provenance, settings.to_toml(), trust=trust
+        write_reconstruction(
+            part / RESULTS.primary,
+            Reconstruction(
+                sweep.frame_time_s, sweep.grid, poses, provenance, settings.to_toml(), trust=trust
+            ),
+            pairs,
         )
-        write_reconstruction(part / RESULTS.primary, made, pairs)
         # The tracker alone is shown beside the modes, but is none of the reconstruction's.
-        trusted = credible_sensors(sweep, tracked.doubts)
-        alone, centre = tracker_alone(trusted), sweep.grid.centre_mm
-        if reference is None and trusted.tracker is None:
-            compared = find_reference(trusted)
-        every = poses if alone is None else {**poses, TRACKER: alone}
-        shown, last = dict(every), "image"
-        if compared is not None and compared.covered.all():
-            shown[compared.name], last = compared.world_from_image, compared.name
+        credible = credible_sensors(sweep, tracked.doubts)
+        tracker_poses, centre = tracker_alone(credible), sweep.grid.centre_mm
+        if reference is None and credible.tracker is None:
+            reference_poses = find_reference(credible)
+        estimates = poses if tracker_poses is None else {**poses, TRACKER: tracker_poses}
         claims = relative_claims(poses, trust, centre)
-        doubts = (*tracked.doubts, *differing_lengths(length_claims(poses, trust, centre)))
+        doubts = (*tracked.doubts, *differing_lengths(length_claims(poses, claims, centre)))
         rows = [
             replace(row, sigma_mm=claims[row.mode] * abs(row.estimate_mm)) if row.mode in claims else row
-            for row in error_rows(every, compared, centre)
+            for row in error_rows(estimates, reference_poses, centre)
         ]
         details = details_of(tracked, corrections, provenance)
         summary = Summary(
             sweep.name,
-            "none" if compared is None else compared.name,
+            "none" if reference_poses is None else reference_poses.name,
             len(sweep),
-            0.0 if compared is None else float(compared.covered.mean()),
+            0.0 if reference_poses is None else float(reference_poses.covered.mean()),
             rows,
             details,
             doubts,
-            doubted_modes(sweep, doubts, every),
+            doubted_modes(sweep, doubts, estimates),
             left_out,
             claims,
-            _drift(every, compared, sweep, source),
+            _drift_rows(estimates, reference_poses, sweep, source),
         )
-        estimates = {mode: each for mode, each in every.items() if mode != summary.reference}
-        moved = sweep_curves(estimates, centre, compared, tracked.covariance)
-        save_figure(figure_drift(moved, _title(summary)), part / PICTURES[0])
+        motion = sweep_curves(estimates, centre, reference_poses, tracked.covariance)
+        save_figure(figure_drift(motion, _title(summary)), part / PICTURES[0])
+        panels, base = dict(estimates), "image"
+        if reference_poses is not None and reference_poses.covered.all():
+            panels[reference_poses.name], base = reference_poses.world_from_image, reference_poses.name
         posed = PosedSweep(sweep, np.arange(len(sweep)), poses["image"], "image")
-        opened = OpenedModes(posed, shown, last, {mode: pose_mark(each) for mode, each in shown.items()})
+        modes = SweepModes(posed, panels, base, {mode: pose_mark(path) for mode, path in panels.items()})
         images = GreyImages(sweep, RANGE_DB, settings=settings.intensity)
-        draw_along(opened, images, length_words(rows, last), (part / PICTURES[1], part / PICTURES[2]))
-        details["seconds"] = time.perf_counter() - began
+        draw_along(modes, images, length_words(rows, base), (part / PICTURES[1], part / PICTURES[2]))
+        details["seconds"] = time.perf_counter() - start_s
         write_summary(part, summary)
-    return JobResult(directory, summary, corrected)
-
-
-def _crossed(
-    sweeps: Sequence[Sweep],
-    stacks: Sequence[ImageStack],
-    tracked: Tracked,
-    curves: DecorrelationCurves,
-    config: Config,
-    progress: Progress | None,
-) -> tuple[CrossedPair, DecorrelationCurves]:
-    """Track the second sweep and cross it with the first, which is tracked; the curves corrected by it.
-
-    Raises
-    ------
-    MismatchError, InsufficientDataError
-        As `cross_sweeps`.
-    """
-    shown = after(progress, len(sweeps[0]), sum(map(len, sweeps)))
-    both = tracked, track(sweeps[1], curves, config, shown, images=stacks[1].keep)
-    sides = [crossing_side(*each, config) for each in zip(sweeps, both, stacks, strict=True)]
-    pair = crossed(sides[0], sides[1], config.crossing)
-    return pair, curves_from(both, pair, curves)
+    return JobResult(directory, summary, new_curves)
 
 
 def require_possible(
     sweep: Sweep, modes: Sequence[str], reference: str | None, config: Config, crossing: bool = False
 ) -> Reference | None:
-    """Check that a sweep has what is asked of it, before any work is done; returns the reference.
+    """Check that a sweep has what modes and reference need, and return the reference's poses.
 
     Parameters
     ----------
@@ -285,7 +264,7 @@ def available_modes(sweep: Sweep, config: Config) -> Sequence[str]:
     return possible
 
 
-def _corrected(
+def _correct_modes(
     tracked: Tracked,
     sweep: Sweep,
     modes: Sequence[str],
@@ -311,7 +290,7 @@ def _corrected(
             if mode in PUBLISHED and isinstance(error, InsufficientDataError):
                 raise
             left_out[mode] = str(error) if str(error).startswith(sweep.name) else f"{where}: {error}"
-    return poses | {mode: each.poses for mode, each in corrections.items()}, corrections
+    return poses | {mode: correction.poses for mode, correction in corrections.items()}, corrections
 
 
 def _title(summary: Summary) -> str:
@@ -320,20 +299,20 @@ def _title(summary: Summary) -> str:
     return f"{summary.sweep}; in doubt: {doubts}" if doubts else summary.sweep
 
 
-def _drift(
+def _drift_rows(
     poses: Mapping[str, RigidTransform], reference: Reference | None, sweep: Sweep, source: Path
 ) -> list[dict[str, Any]]:
     """Drift and displacement of every mode over the frames that have a reference."""
     if reference is None:
         return []
-    true, covered = reference.world_from_image, reference.covered
+    true, mask = reference.world_from_image, reference.covered
     # Landmarks could fall into gaps of the reference; of a part of a recording they have other numbers.
-    marks = load_landmarks(source) if covered.all() else None
+    marks = load_landmarks(source) if mask.all() else None
     marks = marks if marks is None or len(load_sweep(source)) == len(sweep) else None
     with suppress(InsufficientDataError):  # a reference at rest
         return [
-            {"mode": mode, **score_row(each[covered], true, sweep.grid, marks)}
-            for mode, each in poses.items()
+            {"mode": mode, **score_row(path[mask], true, sweep.grid, marks)}
+            for mode, path in poses.items()
             if mode != reference.name
         ]
     return []

@@ -74,22 +74,23 @@ def over_sweeps(
     intervals : list of dict
         ``quantity``, ``mode``, ``sweeps``, ``mean`` over sweeps, and ``low`` and ``high`` of its 95 %
         bootstrap interval; nothing of a mode that fewer than `FEWEST` sweeps have.
-    paired : list of dict
+    comparisons : list of dict
         ``quantity``, ``mode``, ``against``, ``sweeps`` that have both, ``difference`` (mean of mode less
         against), ``low``, ``high``, ``wilcoxon_p``, ``holm_p``, and ``better``: the mode with less error,
         None where they are not told apart.
     """
     intervals: list[dict[str, Any]] = []
-    paired: list[dict[str, Any]] = []
+    comparisons: list[dict[str, Any]] = []
     for quantity in QUANTITIES:
         values = _by_mode(quantity, rows if quantity in ERRORS else drift)
-        for mode, each in values.items():
-            intervals.append({"quantity": quantity, "mode": mode, **asdict(mean_interval([*each.values()]))})
-        paired += _pairs(quantity, values)
-    return intervals, paired
+        for mode, by_sweep in values.items():
+            interval = mean_interval([*by_sweep.values()])
+            intervals.append({"quantity": quantity, "mode": mode, **asdict(interval)})
+        comparisons += _compare_pairs(quantity, values)
+    return intervals, comparisons
 
 
-def overall_text(intervals: Sequence[Row], paired: Sequence[Row], references: Mapping[str, str]) -> str:
+def overall_text(intervals: Sequence[Row], comparisons: Sequence[Row], references: Mapping[str, str]) -> str:
     """Table of means and intervals, what they are, and the modes that are told apart; empty without any.
 
     Parameters
@@ -99,15 +100,15 @@ def overall_text(intervals: Sequence[Row], paired: Sequence[Row], references: Ma
     """
     if not intervals:
         return ""
-    shown = {row["quantity"] for row in intervals}
+    quantities = {row["quantity"] for row in intervals}
     words = [
         "[..]: 95 % interval over sweeps, by bootstrap",
-        *(f"{key.partition('_')[0]}: {meaning}" for key, meaning in MEANINGS.items() if key in shown),
-        *told_apart(paired),
+        *(f"{key.partition('_')[0]}: {meaning}" for key, meaning in MEANINGS.items() if key in quantities),
+        *better_modes(comparisons),
         reference_words({row["mode"] for row in intervals}, references),
     ]
-    filled = (textwrap.fill(each, 100, subsequent_indent="  ") for each in words if each)
-    return text_table(means_table(intervals), (0, 1, 2)) + "".join(f"{each}\n" for each in filled)
+    lines = (textwrap.fill(text, 100, subsequent_indent="  ") for text in words if text)
+    return text_table(means_table(intervals), (0, 1, 2)) + "".join(f"{line}\n" for line in lines)
 
 
 def means_table(intervals: Sequence[Row]) -> list[list[str]]:
@@ -121,28 +122,28 @@ def means_table(intervals: Sequence[Row]) -> list[list[str]]:
     ]
 
 
-def told_apart(paired: Sequence[Row]) -> list[str]:
+def better_modes(comparisons: Sequence[Row]) -> list[str]:
     """Which modes have less of what error than others, a line for each pair; one line if none has."""
     less: dict[str, list[str]] = {}
-    for row in paired:
+    for row in comparisons:
         if row["better"]:
-            other = row["against"] if row["better"] == row["mode"] else row["mode"]
+            worse = row["against"] if row["better"] == row["mode"] else row["mode"]
             name = words_of(row["quantity"]).partition(" /")[0]
-            less.setdefault(f"{row['better']} than {other}", []).append(name)
+            less.setdefault(f"{row['better']} than {worse}", []).append(name)
     if not less:
-        return ["no two modes are told apart by these sweeps"] if paired else []
-    apart = [f"less {', '.join(names)}: {modes}" for modes, names in less.items()]
-    return [*apart, f"(told apart sweep by sweep: signed-rank p <= {LEVEL:g} after Holm's correction)"]
+        return ["no two modes are told apart by these sweeps"] if comparisons else []
+    lines = [f"less {', '.join(names)}: {modes}" for modes, names in less.items()]
+    return [*lines, f"(told apart sweep by sweep: signed-rank p <= {LEVEL:g} after Holm's correction)"]
 
 
 def reference_words(modes: Collection[str], references: Mapping[str, str]) -> str:
-    """What the sweeps were compared with, and which mode was fitted to it; empty without any reference."""
+    """References of the sweeps, and the modes that were fitted to them; empty without any."""
     names = sorted({*references.values()} - {"none"})
     words = f"reference{'s' * (len(names) > 1)}: {', '.join(names)}" if names else ""
     words += "; the means mix errors against both" * (len(names) > 1)
-    fitted = sorted(FITTED_TO_TRACKER.intersection(modes))
-    if fitted and "tracker" in names:
-        words += f"; fitted to it, so that errors say how well they fit: {', '.join(fitted)}"
+    circular = sorted(FITTED_TO_TRACKER.intersection(modes))
+    if circular and "tracker" in names:
+        words += f"; fitted to it, so that errors say how well they fit: {', '.join(circular)}"
     return words
 
 
@@ -153,20 +154,24 @@ def _by_mode(quantity: str, rows: Sequence[Row]) -> dict[str, dict[str, float]]:
         value = row.get(quantity)
         if value is not None and np.isfinite(value):
             sizes.setdefault(row["mode"], {}).setdefault(row["sweep"], []).append(abs(value))
-    means = {m: {s: float(np.mean(each)) for s, each in some.items()} for m, some in sizes.items()}
-    return {mode: some for mode, some in means.items() if len(some) >= FEWEST}
+    return {
+        mode: {sweep: float(np.mean(values)) for sweep, values in by_sweep.items()}
+        for mode, by_sweep in sizes.items()
+        if len(by_sweep) >= FEWEST
+    }
 
 
-def _pairs(quantity: str, values: Mapping[str, Mapping[str, float]]) -> list[dict[str, Any]]:
+def _compare_pairs(quantity: str, values: Mapping[str, Mapping[str, float]]) -> list[dict[str, Any]]:
     rows: list[dict[str, Any]] = []
-    for (one, first), (other, second) in combinations(values.items(), 2):
+    for mode, against in combinations(values, 2):
+        first, second = values[mode], values[against]
         differences = [first[sweep] - second[sweep] for sweep in first if sweep in second]
         if len(differences) >= FEWEST:
-            found = asdict(mean_interval(differences))
-            found |= {"difference": found.pop("mean"), "wilcoxon_p": signed_rank_p(differences)}
-            rows.append({"quantity": quantity, "mode": one, "against": other, **found})
-    for row, corrected in zip(rows, holm([row["wilcoxon_p"] for row in rows]), strict=True):
-        row["holm_p"] = corrected
-        apart = corrected is not None and corrected <= LEVEL and not row["low"] <= 0 <= row["high"]
-        row["better"] = (row["mode"] if row["high"] < 0 else row["against"]) if apart else None
+            row = asdict(mean_interval(differences))
+            row |= {"difference": row.pop("mean"), "wilcoxon_p": signed_rank_p(differences)}
+            rows.append({"quantity": quantity, "mode": mode, "against": against, **row})
+    for row, holm_p in zip(rows, holm([row["wilcoxon_p"] for row in rows]), strict=True):
+        differ = holm_p is not None and holm_p <= LEVEL and not row["low"] <= 0 <= row["high"]
+        better = row["mode" if row["difference"] < 0 else "against"]
+        row |= {"holm_p": holm_p, "better": better if differ else None}
     return rows

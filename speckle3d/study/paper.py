@@ -64,7 +64,7 @@ _Input = tuple[Path, SimulationSettings]
 """File of a sweep to be simulated, and its settings."""
 
 
-def published() -> dict[tuple[str, str], dict[str, tuple[float, float]]]:
+def paper_errors() -> dict[tuple[str, str], dict[str, tuple[float, float]]]:
     """Tables 3 and 4: by data set and part (f forward, r reverse), the errors of each mode of `MODES`.
 
     An error is that of length, per cent, and of tilt, degrees.
@@ -83,7 +83,7 @@ def paper_study(
     curves: Path,
     scheduler: Scheduler | None = None,
     progress: Progress | None = None,
-    simulated: Progress | None = None,
+    simulation_progress: Progress | None = None,
 ) -> tuple[Study, str]:
     """Simulate the eleven sweeps, compare the modes, and write it all into `directory`.
 
@@ -94,7 +94,7 @@ def paper_study(
     ----------
     curves : path
         Decorrelation curves of the simulated probe.
-    simulated : callable, optional
+    simulation_progress : callable, optional
         Called with the number of sweeps simulated and their total.
 
     Returns
@@ -109,20 +109,21 @@ def paper_study(
     InvalidInputError
         If a sweep cannot be simulated.
     """
-    where, tell = scheduler or Scheduler(), simulated or (lambda done, total: None)
-    settings = "".join(each.model_dump_json() for each in SWEEPS.values())
+    runner, tell = scheduler or Scheduler(), simulation_progress or (lambda count, total: None)
+    settings = "".join(sweep.model_dump_json() for sweep in SWEEPS.values())
     key = hashlib.sha256(f"{settings}{version('speckle3d')}".encode()).hexdigest()[:8]
     folder = directory / "inputs" / key
     make_folder(folder)
     paths = [folder / f"{name}.h5" for name in SWEEPS]
-    missing = [each for each in zip(paths, SWEEPS.values(), strict=True) if not each[0].is_file()]
-    tell(len(paths) - len(missing), len(paths))
-    for done, _ in enumerate(where.run(_write_input, missing, _lost), len(paths) - len(missing) + 1):
-        tell(done, len(paths))
-    study = compare_sweeps(paths, directory, None, TRACKER, curves, scheduler=where, progress=progress)
+    missing = [job for job in zip(paths, SWEEPS.values(), strict=True) if not job[0].is_file()]
+    present = len(paths) - len(missing)
+    tell(present, len(paths))
+    for count, _ in enumerate(runner.run(_write_input, missing, _raise), present + 1):
+        tell(count, len(paths))
+    study = compare_sweeps(paths, directory, None, TRACKER, curves, scheduler=runner, progress=progress)
     rows: Rows = {
-        TRACKER: {each.sweep: each.rows for each in study.summaries},
-        "truth": {each.name: _against_truth(study.directory, each) for each in study.done},
+        TRACKER: {summary.sweep: summary.rows for summary in study.summaries},
+        "truth": {o.name: _compare_with_truth(study.directory, o) for o in study.successes},
     }
     table = text_beside(rows)
     numbers = json_text({"means": beside(rows), "rows": rows})
@@ -139,10 +140,12 @@ def beside(rows: Rows) -> list[dict[str, Any]]:
         ``mode``, ``against`` ("published", or a reference of ours), ``quantity`` and its `MeanInterval`.
         Parts, not sweeps, are the units, as there are 17 in the tables.
     """
-    errors = {"published": {mode: [each[mode] for each in published().values()] for mode in MODES}}
+    errors = {"published": {mode: [part[mode] for part in paper_errors().values()] for mode in MODES}}
     for name, by_sweep in rows.items():
-        every = [row for some in by_sweep.values() for row in some]
-        errors[name] = {mode: [_error(row) for row in every if row.mode == mode] for mode in MODES}
+        errors[name] = {
+            mode: [_error(row) for rows in by_sweep.values() for row in rows if row.mode == mode]
+            for mode in MODES
+        }
     return [
         {
             "mode": mode,
@@ -163,11 +166,12 @@ def text_beside(rows: Rows) -> str:
     Of ours, the errors against the tracker are listed part by part.
     """
     lines = [["data set", *(f"{mode} {unit}" for unit in ("%", "°") for mode in MODES)]]
-    for (name, part), theirs in published().items():
+    for (name, part), paper in paper_errors().items():
         ours = {row.mode: _error(row) for row in rows[TRACKER].get(name, ()) if row.part == part}
         cells = [
             " | ".join(
-                number(key, each[mode][k], signed=True) if mode in each else "-" for each in (theirs, ours)
+                number(key, errors[mode][k], signed=True) if mode in errors else "-"
+                for errors in (paper, ours)
             )
             for k, key in enumerate(QUANTITIES)
             for mode in MODES
@@ -192,15 +196,15 @@ def _error(row: ModeError) -> tuple[float, float]:
 def _write_input(job: _Input) -> None:
     """Simulate one sweep into its file."""
     path, settings = job
-    made = simulate(settings)[0]
-    write_sweep(path, _with_tracked_orientation(made.sweep), simulation=made.description())
+    simulation = simulate(settings)[0]
+    write_sweep(path, _with_trackers_orientation(simulation.sweep), simulation=simulation.description())
 
 
-def _lost(job: _Input, reason: str) -> None:
+def _raise(job: _Input, reason: str) -> None:
     raise InvalidInputError(f"{job[0].name}: cannot be simulated: {reason}")
 
 
-def _with_tracked_orientation(sweep: Sweep) -> Sweep:
+def _with_trackers_orientation(sweep: Sweep) -> Sweep:
     """The sweep with the tracker's orientation in place of the orientation sensor's, as in the paper."""
     tracker = sweep.tracker
     assert tracker is not None
@@ -210,9 +214,9 @@ def _with_tracked_orientation(sweep: Sweep) -> Sweep:
     return replace(sweep, orientation=OrientationSensor(readings, mounting, tracker.time_offset_s))
 
 
-def _against_truth(directory: Path, outcome: SweepOutcome) -> list[ModeError]:
+def _compare_with_truth(directory: Path, outcome: SweepOutcome) -> list[ModeError]:
     """Errors of the same poses, and of the tracker alone, against the truth."""
     sweep, path = load_sweep(outcome.path), directory / outcome.folder / "reconstruction.h5"
-    alone, poses = tracker_alone(sweep), read_reconstruction(path, with_pairs=False).poses
-    every = poses if alone is None else {**poses, TRACKER: alone}
-    return error_rows(every, find_reference(sweep, "truth"), sweep.grid.centre_mm)
+    tracker, poses = tracker_alone(sweep), read_reconstruction(path, with_pairs=False).poses
+    estimates = poses if tracker is None else {**poses, TRACKER: tracker}
+    return error_rows(estimates, find_reference(sweep, "truth"), sweep.grid.centre_mm)

@@ -16,7 +16,7 @@ from speckle3d.motion.uncertainty import joint_errors
 from speckle3d.scoring.modes import default_mode
 from speckle3d.scoring.trajectories import poses_of
 
-PICKED = 0.5
+PICKING = 0.5
 """Standard deviation of a picked point's place on each axis, over the distance of the image's vectors."""
 
 
@@ -59,11 +59,13 @@ def measure(
     mode = default_mode(reconstruction)[0] if mode is None else mode
     errors, grid = errors_of(reconstruction, mode), reconstruction.grid
     near = require_inside(points, grid, errors.world_from_image)
-    return measure_points(points, near, errors, PICKED * grid.vector_pitch_mm if pick_mm is None else pick_mm)
+    return measure_points(
+        points, near, errors, PICKING * grid.vector_pitch_mm if pick_mm is None else pick_mm
+    )
 
 
 def caution(reconstruction: Reconstruction, mode: str) -> str | None:
-    """What to say beside errors of a mode that claims none of its own; None if it does.
+    """Warning beside errors of a mode that claims none of its own; None if it does.
 
     The images' errors are taken then: too large along the sweep of a good tracker, too small across it.
     """
@@ -101,8 +103,8 @@ def errors_of(reconstruction: Reconstruction, mode: str = "image") -> PoseErrors
         )
     centre = reconstruction.grid.centre_mm
     if mode in trust.modes:
-        own = trust.modes[mode]
-        stretched = SharedErrors(0.0, own.length_sigma, np.zeros(2))
-        return joint_errors(own.covariance, poses, centre, stretched)
+        claim = trust.modes[mode]
+        stretch = SharedErrors(0.0, claim.length_sigma, np.zeros(2))
+        return joint_errors(claim.covariance, poses, centre, stretch)
     images = joint_errors(trust.covariance, reconstruction.poses["image"], centre, trust.shared)
     return replace(images, world_from_image=poses)

@@ -51,8 +51,8 @@ class PosedSweep:
         Where poses are from: a mode of the reconstruction, "tracker" or "truth".
     reconstruction : Reconstruction or None
         None where the recording itself says where its frames are.
-    range_is_known : bool
-        Whether the recording says the dynamic range of its B-mode, or it is given; levels as stored need
+    has_range : bool
+        Whether the dynamic range of its B-mode is known, from the recording or given; levels as stored need
         none.
     chosen_for : str
         Why this mode, where nobody chose it.
@@ -63,7 +63,7 @@ class PosedSweep:
     world_from_image: RigidTransform
     mode: str
     reconstruction: Reconstruction | None = None
-    range_is_known: bool = True
+    has_range: bool = True
     chosen_for: str = ""
 
     def images(self, dynamic_range_db: float = USUAL_RANGE_DB) -> tuple[Images, ImageGrid]:
@@ -71,7 +71,7 @@ class PosedSweep:
 
         Log-compressed; B-mode of unknown range as it is stored.
         """
-        source, _ = self.source("log" if self.range_is_known else "stored", dynamic_range_db)
+        source, _ = self.source("log" if self.has_range else "stored", dynamic_range_db)
         return source.images, source.grid
 
     def source(
@@ -97,34 +97,34 @@ class PosedSweep:
             If levels need the dynamic range of B-mode, and the recording does not say it; or if echoes are
             asked for as stored.
         """
-        chosen = levels or ("stored" if isinstance(self.sweep.signal, BModeSettings) else "log")
-        if not self.range_is_known and chosen != "stored":
+        levels = levels or ("stored" if isinstance(self.sweep.signal, BModeSettings) else "log")
+        if not self.has_range and levels != "stored":
             raise InvalidInputError(
-                f"{self.sweep.name}: levels {chosen}: expected the dynamic range of its B-mode, got none: "
+                f"{self.sweep.name}: levels {levels}: expected the dynamic range of its B-mode, got none: "
                 "give --dynamic-range-db (decibels from black to white, beside the image on the scanner's "
                 "screen), or take levels stored"
             )
-        every = grey_images(self.sweep, dynamic_range_db, self.reconstruction, chosen)
-        grid = replace(every.grid, skew_rad=self.skew_rad)
-        return PosedImages(ChosenImages(every, self.frames), grid, self.world_from_image), every.meaning
+        images = grey_images(self.sweep, dynamic_range_db, self.reconstruction, levels)
+        grid = replace(images.grid, skew_rad=self.skew_rad)
+        return PosedImages(ChosenImages(images, self.frames), grid, self.world_from_image), images.meaning
 
     @property
     def skew_rad(self) -> float:
-        """What the image calibration has beyond the rigid poses, which are the tracker's; else zero."""
+        """Skew of the image calibration, which rigid poses lack, at the tracker's poses; else zero."""
         tracker = self.sweep.tracker
         return 0.0 if tracker is None or self.mode != "tracker" else tracker.image_skew_rad
 
     def notes(self) -> list[str]:
         """Tell why this mode was taken, which frames are left out, and which have poses that are guesses."""
-        without = len(self.sweep) - len(self.frames)
+        lines, total = [self.chosen_for] if self.chosen_for else [], len(self.sweep)
+        if missing := total - len(self.frames):
+            lines.append(
+                f"{self.sweep.name}: {missing} of {total} frames have no valid pose and are left out"
+            )
         trust = self.reconstruction and self.reconstruction.trust
-        flagged = describe(trust.flags) if trust else []
-        left_out = f"{without} of {len(self.sweep)} frames have no valid pose and are left out"
-        return [
-            *filter(None, [self.chosen_for]),
-            *([f"{self.sweep.name}: {left_out}"] if without else []),
-            *(f"{line}: poses there are guesses" for line in flagged),
-        ]
+        if trust:
+            lines += [f"{flag}: poses there are guesses" for flag in describe(trust.flags)]
+        return lines
 
 
 MARK = "poses_mark"
@@ -133,8 +133,8 @@ MARK = "poses_mark"
 
 def pose_mark(world_from_image: RigidTransform) -> str:
     """Mark of poses, the same for the same ones to a millionth of a millimetre."""
-    rounded = np.round(world_from_image.as_matrix(), 6) + 0.0  # no negative zeros
-    return sha256(np.ascontiguousarray(rounded).tobytes()).hexdigest()[:16]
+    matrices = np.round(world_from_image.as_matrix(), 6) + 0.0  # no negative zeros
+    return sha256(np.ascontiguousarray(matrices).tobytes()).hexdigest()[:16]
 
 
 def require_made_at(mark: str, poses_mark: str, where: str) -> None:
@@ -185,11 +185,12 @@ def open_posed(
     if kind_of(path) == FORMAT:
         if calibrations or (settings is not None and settings.model_fields_set):
             raise InvalidInputError(
-                f"{path}: expected a recording with what it does not say, got a reconstruction"
+                f"{path}: expected no calibration and no settings of a recording beside a reconstruction, "
+                "whose sweep is taken as it was reconstructed"
             )
         reconstruction, sweep = open_reconstruction(path, sweep_file)
-        chosen, why = default_mode(reconstruction) if mode is None else (mode, "")
-        return replace(posed_at(sweep, chosen, reconstruction), chosen_for=why)
+        mode, why = default_mode(reconstruction) if mode is None else (mode, "")
+        return replace(posed_at(sweep, mode, reconstruction), chosen_for=why)
     if sweep_file is not None:
         raise InvalidInputError(f"{path}: expected a reconstruction beside --sweep, got a recording")
     if mode not in (None, *REFERENCES):
@@ -197,11 +198,11 @@ def open_posed(
             f"--mode: expected {' or '.join(REFERENCES)} of a recording, got {mode!r}: "
             "make its reconstruction first (speckle3d reconstruct)"
         )
-    stated = settings or ImportSettings()
-    sizes = {k: v for k, v in fitted_pixels(calibrations).items() if k not in stated.model_fields_set}
-    sweep, range_is_known = _load(path, stated.model_copy(update=sizes), dynamic_range_db)
-    mounted, _ = apply_calibrations(resized(sweep, sizes), calibrations)
-    return replace(posed_at(mounted, mode), range_is_known=range_is_known)
+    settings = settings or ImportSettings()
+    sizes = {k: v for k, v in fitted_pixels(calibrations).items() if k not in settings.model_fields_set}
+    sweep, has_range = _load(path, settings.model_copy(update=sizes), dynamic_range_db)
+    sweep, _ = apply_calibrations(resized(sweep, sizes), calibrations)
+    return replace(posed_at(sweep, mode), has_range=has_range)
 
 
 def _load(path: Path, settings: ImportSettings, dynamic_range_db: float | None) -> tuple[Sweep, bool]:
@@ -212,8 +213,8 @@ def _load(path: Path, settings: ImportSettings, dynamic_range_db: float | None) 
         if error.settings != (_RANGE,):
             lacking = tuple(name for name in error.settings if name != _RANGE)
             raise MissingSettingsError(path, lacking) from None
-    stated = settings.model_copy(update={_RANGE: dynamic_range_db or USUAL_RANGE_DB})
-    return load_sweep(path, stated), dynamic_range_db is not None
+    settings = settings.model_copy(update={_RANGE: dynamic_range_db or USUAL_RANGE_DB})
+    return load_sweep(path, settings), dynamic_range_db is not None
 
 
 def posed_at(
@@ -234,7 +235,7 @@ def posed_at(
 
 
 @dataclass(frozen=True)
-class OpenedModes:
+class SweepModes:
     """A sweep at the poses of several modes.
 
     Attributes
@@ -254,7 +255,7 @@ class OpenedModes:
     marks: dict[str, str]
 
 
-def at_modes(first: PosedSweep, modes: Sequence[str] = (), reference: str | None = None) -> OpenedModes:
+def at_modes(first: PosedSweep, modes: Sequence[str] = (), reference: str | None = None) -> SweepModes:
     """Take an opened sweep at several modes.
 
     Parameters
@@ -271,19 +272,19 @@ def at_modes(first: PosedSweep, modes: Sequence[str] = (), reference: str | None
     InvalidInputError, InsufficientDataError
         If there is no such mode.
     """
-    asked = list(dict.fromkeys(modes)) or [first.mode]
+    modes = list(dict.fromkeys(modes)) or [first.mode]
     if reference is None:
-        known = find_reference(first.sweep) if len(asked) > 1 else None
-        reference = asked[0] if known is None or not known.covered.all() else known.name
-    every = {
-        mode: posed_at(first.sweep, mode, first.reconstruction) for mode in dict.fromkeys([*asked, reference])
+        basis = find_reference(first.sweep) if len(modes) > 1 else None
+        reference = modes[0] if basis is None or not basis.covered.all() else basis.name
+    sweeps = {
+        mode: posed_at(first.sweep, mode, first.reconstruction) for mode in dict.fromkeys([*modes, reference])
     }
-    shared = reduce(np.intersect1d, [each.frames for each in every.values()])
-    if not shared.size:
+    frames = reduce(np.intersect1d, [sweep.frames for sweep in sweeps.values()])
+    if not frames.size:
         raise InsufficientDataError(
-            f"{first.sweep.name}: expected a frame that has a pose in {' and '.join(every)}, got none"
+            f"{first.sweep.name}: expected a frame that has a pose in {' and '.join(sweeps)}, got none"
         )
-    poses = {mode: each.world_from_image[np.isin(each.frames, shared)] for mode, each in every.items()}
-    posed = replace(first, frames=shared, world_from_image=poses[asked[0]], mode=asked[0])
-    marks = {mode: pose_mark(each.world_from_image) for mode, each in every.items()}
-    return OpenedModes(posed, poses, reference, marks)
+    poses = {mode: sweep.world_from_image[np.isin(sweep.frames, frames)] for mode, sweep in sweeps.items()}
+    posed = replace(first, frames=frames, world_from_image=poses[modes[0]], mode=modes[0])
+    marks = {mode: pose_mark(sweep.world_from_image) for mode, sweep in sweeps.items()}
+    return SweepModes(posed, poses, reference, marks)

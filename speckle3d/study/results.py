@@ -95,7 +95,7 @@ class Summary:
         remarks = dict.fromkeys(f"{row.mode}: {self.remark(row)}" for row in self.rows if self.remark(row))
         left_out = (f"mode {mode} is left out" for mode in self.left_out)
         words = (*(doubt.consequence for doubt in self.doubts), *left_out, *remarks)
-        return [f"{self.sweep}: {each}" for each in words]
+        return [f"{self.sweep}: {text}" for text in words]
 
     def remark(self, row: ModeError) -> str:
         """What a reader of a row must know beside its numbers; empty for nothing."""
@@ -109,14 +109,22 @@ class Summary:
         return "; ".join(words)
 
     def records(self) -> list[dict[str, Any]]:
-        """Rows with what is known beside their errors: ``sweep``, ``reference`` and ``remark``."""
-        known = {"sweep": self.sweep, "reference": self.reference}
-        return [known | asdict(row) | {"remark": self.remark(row)} for row in self.rows]
+        """Rows with ``sweep``, ``reference`` and ``remark`` beside their errors."""
+        names = {"sweep": self.sweep, "reference": self.reference}
+        return [names | asdict(row) | {"remark": self.remark(row)} for row in self.rows]
 
 
 @dataclass(frozen=True)
 class SweepOutcome:
-    """What is planned for one sweep and became of it; failed without a summary, and `reason` says why."""
+    """Plan and outcome of one sweep: a summary, or a reason why there is none.
+
+    Attributes
+    ----------
+    folder : str
+        In the study's; empty of a sweep that failed.
+    is_old : bool
+        Whether the folder was there before.
+    """
 
     name: str
     path: Path
@@ -125,7 +133,7 @@ class SweepOutcome:
     key: str = ""
     folder: str = ""
     frames: int = 0
-    skipped: bool = False
+    is_old: bool = False
     summary: Summary | None = None
 
     def record(self) -> dict[str, Any]:
@@ -138,41 +146,41 @@ class SweepOutcome:
 
 @dataclass(frozen=True)
 class Study:
-    """What a study found, and where it is."""
+    """Outcomes of a study's sweeps, and its folder."""
 
     directory: Path
     outcomes: Sequence[SweepOutcome]
     settings_toml: str
 
     @property
-    def done(self) -> list[SweepOutcome]:
+    def successes(self) -> list[SweepOutcome]:
         """Sweeps with results."""
-        return [each for each in self.outcomes if each.summary]
+        return [outcome for outcome in self.outcomes if outcome.summary]
 
     @property
-    def broken(self) -> list[SweepOutcome]:
-        """Sweeps without."""
-        return [each for each in self.outcomes if not each.summary]
+    def failures(self) -> list[SweepOutcome]:
+        """Sweeps without results."""
+        return [outcome for outcome in self.outcomes if not outcome.summary]
 
     @property
     def summaries(self) -> list[Summary]:
         """Of the sweeps with results."""
-        return [each.summary for each in self.outcomes if each.summary]
+        return [outcome.summary for outcome in self.outcomes if outcome.summary]
 
     @cached_property
     def rows(self) -> list[dict[str, Any]]:
         """Errors by sweep, part and mode."""
-        return [record for each in self.summaries for record in each.records()]
+        return [record for summary in self.summaries for record in summary.records()]
 
     @cached_property
     def drift(self) -> list[dict[str, Any]]:
         """Drift by sweep and mode."""
-        return [{"sweep": each.sweep, **row} for each in self.summaries for row in each.drift]
+        return [{"sweep": summary.sweep, **row} for summary in self.summaries for row in summary.drift]
 
     @property
     def doubts(self) -> list[dict[str, Any]]:
-        """What of the recordings is in doubt, by sweep."""
-        return [{"sweep": each.sweep, **asdict(doubt)} for each in self.summaries for doubt in each.doubts]
+        """Doubts about the recordings, by sweep."""
+        return [{"sweep": s.sweep, **asdict(doubt)} for s in self.summaries for doubt in s.doubts]
 
     @cached_property
     def statistics(self) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
@@ -182,12 +190,12 @@ class Study:
     @property
     def table(self) -> str:
         """All sweeps' errors, remarks and statistics as text."""
-        failures = [f"{each.name}  failed: {each.reason}" for each in self.broken]
-        overall = overall_text(*self.statistics, {each.sweep: each.reference for each in self.summaries})
+        failures = [f"{outcome.name}  failed: {outcome.reason}" for outcome in self.failures]
+        overall = overall_text(*self.statistics, {s.sweep: s.reference for s in self.summaries})
         return summary_text(self.summaries, failures) + (f"\n{overall}" if overall else "")
 
 
-def write_summary(directory: Path, summary: Summary) -> list[Path]:
+def write_summary(directory: Path, summary: Summary) -> None:
     """Write ``summary.json``, ``table.txt`` and ``table.csv``; each appears whole or not at all.
 
     Raises
@@ -196,39 +204,34 @@ def write_summary(directory: Path, summary: Summary) -> list[Path]:
         If the directory cannot be written.
     """
     texts = json_text({"sweeps": [summary]}), summary_text([summary]), csv_text(summary.records())
-    return write_texts(directory, dict(zip(SUMMARY_FILES, texts, strict=True)))
+    write_texts(directory, dict(zip(SUMMARY_FILES, texts, strict=True)))
 
 
-def summary_text(summaries: Sequence[Summary], more: Sequence[str] = ()) -> str:
-    """Table of some sweeps, below it what its columns are and what is in doubt, then more lines."""
-    records = [record for each in summaries for record in each.records()]
-    names = dict.fromkeys(each.reference for each in summaries)
+def summary_text(summaries: Sequence[Summary], failures: Sequence[str] = ()) -> str:
+    """Table of some sweeps, under 100 columns for names of usual length, and notes below it."""
+    records = [record for summary in summaries for record in summary.records()]
+    names = dict.fromkeys(summary.reference for summary in summaries)
     lines = [
         "part: f forward, r back; +- 95 %: of the length, mm, as the mode claims it, of tracker by its jitter"
     ]
     if set(names) - {"none"}:
         lines.append(f"reference: {', '.join(names)}; errors are estimate minus reference")
-    lines += [*(line for each in summaries for line in each.lines), *more]
-    return table_text(records) + "".join(f"{line}\n" for line in lines)
-
-
-def table_text(records: Sequence[Mapping[str, Any]]) -> str:
-    """Aligned table of `Summary.records` for reading, under 100 columns for names of usual length."""
-    lines: list[Sequence[str]] = [_HEADS]
+    lines += [*(line for summary in summaries for line in summary.lines), *failures]
+    cells: list[Sequence[str]] = [_HEADS]
     for row in records:
         half = None if row["sigma_mm"] is None else 1.96 * row["sigma_mm"]
-        signed = [
+        lengths = [number("mm", value) for value in (row["estimate_mm"], half, row["reference_mm"])]
+        errors = [
             number(key, row[key], signed=True)
             for key in ("length_error_percent", "tilt_error_deg", "yaw_error_deg", "roll_error_deg")
         ]
-        lengths = [number("mm", value) for value in (row["estimate_mm"], half, row["reference_mm"])]
-        lines.append([row["sweep"], row["part"], row["mode"], *lengths, *signed])
-    return text_table(lines, (0, 1, 2))
+        cells.append([row["sweep"], row["part"], row["mode"], *lengths, *errors])
+    return text_table(cells, (0, 1, 2)) + "".join(f"{line}\n" for line in lines)
 
 
-def csv_text(records: Sequence[Mapping[str, Any]], *more: str) -> str:
-    """`Summary.records` with full precision, and `more` columns behind."""
-    columns = ["sweep", "reference", *(f.name for f in fields(ModeError)), "remark", *more]
+def csv_text(records: Sequence[Mapping[str, Any]], *extra_columns: str) -> str:
+    """`Summary.records` with full precision."""
+    columns = ["sweep", "reference", *(f.name for f in fields(ModeError)), "remark", *extra_columns]
     text = io.StringIO(newline="")
     writer = csv.DictWriter(text, columns, restval="", lineterminator="\n")
     writer.writeheader()
@@ -246,20 +249,20 @@ def write_study(study: Study) -> None:
     FileError
         If the folder cannot be written.
     """
-    intervals, paired = study.statistics
+    intervals, comparisons = study.statistics
     contents = {
         "format": FORMAT,
         "version": VERSION,
         "settings_toml": study.settings_toml,
         "modes": list(dict.fromkeys(row["mode"] for row in study.rows)),
-        "sweeps": [each.record() for each in study.outcomes],
+        "sweeps": [outcome.record() for outcome in study.outcomes],
         "rows": study.rows,
         "doubts": study.doubts,
         "drift": study.drift,
         "intervals": intervals,
-        "paired": paired,
+        "paired": comparisons,
     }
-    lines = [*study.rows, *({"sweep": each.name, "reason": each.reason} for each in study.broken)]
+    lines = [*study.rows, *({"sweep": o.name, "reason": o.reason} for o in study.failures)]
     texts = {"study.json": json_text(contents), "table.txt": study.table}
     with FILES.replaced(study.directory) as part:
         write_texts(part, texts | {"table.csv": csv_text(lines, "reason")})
@@ -273,10 +276,12 @@ def require_own(directory: Path, files: FileSet) -> None:
     InvalidInputError
         Naming the first such file.
     """
-    taken = [name for name in files.names if (directory / name).exists()]
-    if taken and files.primary not in taken:
+    if directory.is_file():
+        raise InvalidInputError(f"{directory}: expected a folder or a new name, got a file")
+    names = [name for name in files.names if (directory / name).exists()]
+    if names and files.primary not in names:
         raise InvalidInputError(
-            f"{directory / taken[0]}: expected a new folder, or one with {files.primary} to replace, got a "
+            f"{directory / names[0]}: expected a new folder, or one with {files.primary} to replace, got a "
             "file of another origin"
         )
 
@@ -289,20 +294,19 @@ def json_text(value: Any) -> str:
 
 def read_summary(folder: Path, name: str) -> Summary:
     """Read a sweep's summary back, of its details the time alone; what was not finite is NaN again."""
-    (stored,) = json.loads((folder / "summary.json").read_text(encoding="utf-8"))["sweeps"]
-    records: list[dict[str, Any]] = [
-        {key: math.nan if value is None else value for key, value in row.items()} for row in stored["rows"]
+    (record,) = json.loads((folder / "summary.json").read_text(encoding="utf-8"))["sweeps"]
+    values: list[dict[str, Any]] = [
+        {key: math.nan if value is None else value for key, value in row.items()} for row in record["rows"]
     ]
-    rows = [ModeError(**record) for record in records]
-    doubts = [Doubt(**each) for each in stored["doubts"]]
-    details = {"seconds": stored["details"]["seconds"]}
-    return Summary(**stored | {"sweep": name, "rows": rows, "doubts": doubts, "details": details})
+    rows = [ModeError(**row) for row in values]
+    doubts = [Doubt(**doubt) for doubt in record["doubts"]]
+    details = {"seconds": record["details"]["seconds"]}
+    return Summary(**record | {"sweep": name, "rows": rows, "doubts": doubts, "details": details})
 
 
-def write_texts(directory: Path, texts: Mapping[str, str]) -> list[Path]:
+def write_texts(directory: Path, texts: Mapping[str, str]) -> None:
     """Write texts under their names; each appears whole or not at all."""
     make_folder(directory)
     for name, text in texts.items():
         with atomic_path(directory / name) as part:
             part.write_text(text, encoding="utf-8")
-    return [directory / name for name in texts]

@@ -42,9 +42,9 @@ class Scheduler:
     client: Any = None
 
     def run(
-        self, function: Callable[[Job], Result], jobs: Sequence[Job], lost: Callable[[Job, str], Result]
+        self, function: Callable[[Job], Result], jobs: Sequence[Job], failure: Callable[[Job, str], Result]
     ) -> Iterator[Result]:
-        """Yield the result of each job as it comes; of one whose worker dies what `lost` makes of it."""
+        """Yield the result of each job as it comes; of one whose worker dies what `failure` makes of it."""
         if self.client is None and self.workers == 1:
             yield from map(function, jobs)
             return
@@ -56,8 +56,8 @@ class Scheduler:
             try:
                 for future in as_completed(futures):
                     error = future.exception()
-                    died = error and f"its worker died or failed: {one_line(error)}"
-                    yield lost(futures[future], died) if died else future.result()
+                    reason = error and f"its worker died or failed: {one_line(error)}"
+                    yield failure(futures[future], reason) if reason else future.result()
             finally:
                 for future in futures:
                     future.cancel()
@@ -82,8 +82,8 @@ def scheduler_for(address: str | None, workers: int | None) -> Iterator[Schedule
     try:
         client = importlib.import_module("distributed").Client(address, timeout=CONNECT_S)
     except ImportError as error:
-        needed = "a cluster needs dask[distributed]: pip install 'speckle3d[cluster]', got none installed"
-        raise InvalidInputError(needed) from error
+        advice = "a cluster needs dask[distributed]: pip install 'speckle3d[cluster]', got none installed"
+        raise InvalidInputError(advice) from error
     except (OSError, ValueError) as error:
         raise FileError(f"{address}: expected a Dask scheduler, got none: {one_line(error)}") from error
     with client:

@@ -28,7 +28,7 @@ from speckle3d.io.curves import read_curves
 from speckle3d.io.load import load_sweep
 from speckle3d.motion.direction import settle_direction
 from speckle3d.phantom_curves import calibrate_curves
-from speckle3d.scoring.lengths import accumulated, compare_modes
+from speckle3d.scoring.lengths import compare_modes, sum_motion
 from speckle3d.simulation.presets import SimulationSettings
 from speckle3d.tracking import track
 
@@ -85,7 +85,7 @@ def measure(options, curves, folder, seed):
     tracking = track(sweep, curves, sink=pairs.append)
     poses = {"image": tracking.image}
     poses |= {mode: m.poses for mode, m in correct(tracking, sweep, MODES[1:]).items()}
-    length, true = (accumulated(p, centre).length_mm for p in (tracking.image, sweep.truth))
+    length, true = (sum_motion(p, centre).length_mm for p in (tracking.image, sweep.truth))
     return Result(
         seed,
         compare_modes(poses, sweep.truth, centre, end_frames=1),

@@ -27,7 +27,7 @@ def run(monkeypatch, capfd):
 
 
 @pytest.fixture
-def refused(run, tmp_path):
+def refuse(run, tmp_path):
     """Run the command, which must refuse its input in one line and leave no file behind; returns the line."""
 
     def call(*arguments, folder=tmp_path):
@@ -63,7 +63,7 @@ def bench(tmp_path_factory):
 
 
 @pytest.fixture(scope="session")
-def reconstructed(bench, tmp_path_factory):
+def results(bench, tmp_path_factory):
     """The folder of the small sweep's results."""
     modes = ("--drift", "orientation", "--drift", "pose")
 
@@ -75,7 +75,7 @@ def reconstructed(bench, tmp_path_factory):
 
 
 @pytest.fixture
-def changed(bench, tmp_path):
+def edit_sweep(bench, tmp_path):
     """The small sweep with something changed in it."""
 
     def change(edit):

@@ -7,8 +7,8 @@ import sys
 import pytest
 
 
-def test_the_errors_against_truth_are_in_every_table(reconstructed):
-    summary = json.loads((reconstructed / "summary.json").read_text())["sweeps"][0]
+def test_the_errors_against_truth_are_in_every_table(results):
+    summary = json.loads((results / "summary.json").read_text())["sweeps"][0]
     rows = {row["mode"]: row for row in summary["rows"]}
     assert summary["reference"] == "truth"
     # Three millimetres of a narrow image and a tracker's jitter of 0.15 mm at both ends: loose bounds, which
@@ -17,44 +17,47 @@ def test_the_errors_against_truth_are_in_every_table(reconstructed):
     assert abs(rows["orientation"]["tilt_error_deg"]) < 1
 
 
-def test_without_a_sensor_the_sign_is_said_to_be_assumed(run, changed, tmp_path):
+def test_without_a_sensor_the_command_says_that_it_assumes_the_sign(run, edit_sweep, tmp_path):
     def forget(file):
         del file["tracker"], file["orientation"], file["truth"]
 
-    code, _, err = run("reconstruct", changed(forget), "-o", tmp_path / "o")
+    code, _, err = run("reconstruct", edit_sweep(forget), "-o", tmp_path / "o")
     assert code == 0
     assert "taken as positive" in err
 
 
-def test_of_a_tracker_that_the_images_contradict_both_lengths_are_told(run, changed, tmp_path):
+def test_a_tracker_that_the_images_contradict_leaves_both_lengths(run, edit_sweep, tmp_path):
     def in_metres(file):
         file["tracker/world_from_sensor"][:, :3, 3] *= 1e-3
 
     out = tmp_path / "o"
-    code, table, err = run("reconstruct", changed(in_metres), "-o", out, "--drift", "pose")
+    code, table, err = run("reconstruct", edit_sweep(in_metres), "-o", out, "--drift", "pose")
     assert code == 0, err
     summary = json.loads((out / "summary.json").read_text())["sweeps"][0]
     assert "images and tracker" in {doubt["about"] for doubt in summary["doubts"]}
     assert "metres for millimetres" in table
     # There is no best mode: a command that needs one asks for it.
-    made = out / "reconstruction.h5"
-    code, _, err = run("volume", made, "-o", tmp_path / "v.nrrd", "--voxel-mm", "0.5")
+    reconstruction = out / "reconstruction.h5"
+    code, _, err = run("volume", reconstruction, "-o", tmp_path / "v.nrrd", "--voxel-mm", "0.5")
     assert (code, "expected --mode" in err) == (2, True)
-    assert run("volume", made, "-o", tmp_path / "v.nrrd", "--voxel-mm", "0.5", "--mode", "image")[0] == 0
+    assert (
+        run("volume", reconstruction, "-o", tmp_path / "v.nrrd", "--voxel-mm", "0.5", "--mode", "image")[0]
+        == 0
+    )
 
 
 @pytest.mark.parametrize("arguments", [(), ("reconstruct", "--help")])
 def test_help_is_no_error_and_needs_nothing_heavy(arguments):
     code = "import sys; from speckle3d.cli import main\ntry: main()\nexcept SystemExit: pass\n"
     code += "print(sorted({'numba', 'h5py', 'scipy', 'numpy', 'matplotlib'} & set(sys.modules)))"
-    done = subprocess.run([sys.executable, "-c", code, *arguments], capture_output=True, text=True)
-    assert "Usage" in done.stdout
-    assert done.stdout.splitlines()[-1] == "[]"
-    assert "Traceback" not in done.stderr
+    process = subprocess.run([sys.executable, "-c", code, *arguments], capture_output=True, text=True)
+    assert "Usage" in process.stdout
+    assert process.stdout.splitlines()[-1] == "[]"
+    assert "Traceback" not in process.stderr
 
 
-def test_files_that_are_not_there_or_not_sweeps(refused, bench, tmp_path):
+def test_files_that_are_not_there_or_not_sweeps(refuse, bench, tmp_path):
     out = tmp_path / "o"
-    assert "none.h5" in refused("reconstruct", bench / "none.h5", "-o", out)
+    assert "none.h5" in refuse("reconstruct", bench / "none.h5", "-o", out)
     curves = bench / "curves.h5"
-    assert "speckle3d.sweep" in refused("reconstruct", curves, "--curves", curves, "-o", out)
+    assert "speckle3d.sweep" in refuse("reconstruct", curves, "--curves", curves, "-o", out)

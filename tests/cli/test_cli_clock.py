@@ -22,11 +22,11 @@ def mounting_file(back, tmp_path):
 
 
 def test_a_clock_is_found_from_images_and_its_calibration_goes_over_no_input(
-    run, refused, back, mounting_file, tmp_path
+    run, refuse, back, mounting_file, tmp_path
 ):
     before = mounting_file.read_bytes()
     clock = ("calibrate", "clock", back, *IMAGES, "--calibration", mounting_file)
-    assert str(mounting_file) in refused(*clock, "-o", mounting_file)
+    assert str(mounting_file) in refuse(*clock, "-o", mounting_file)
     assert mounting_file.read_bytes() == before
     code, out, err = run(*clock, "-o", tmp_path / "c.h5")
     assert code == 0, err

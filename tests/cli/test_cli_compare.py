@@ -4,7 +4,7 @@ import pytest
 
 
 @pytest.fixture(scope="module")
-def torn(tmp_path_factory):
+def broken_file(tmp_path_factory):
     path = tmp_path_factory.mktemp("torn") / "torn.h5"
     path.write_bytes(b"nothing")
     return path
@@ -12,8 +12,8 @@ def torn(tmp_path_factory):
 
 # Figures are closed by the report itself.
 @pytest.mark.filterwarnings("default::ResourceWarning")
-def test_compare_writes_a_study_and_skips_it_the_second_time(run, bench, torn, tmp_path):
-    compare = ("compare", bench / "sweep.h5", torn, "-o", tmp_path / "study", "--drift", "pose")
+def test_compare_writes_a_study_and_skips_it_the_second_time(run, bench, broken_file, tmp_path):
+    compare = ("compare", bench / "sweep.h5", broken_file, "-o", tmp_path / "study", "--drift", "pose")
     code, out, err = run(*compare)
     assert code == 0, err
     assert [line.split()[2] for line in out.splitlines()[2:4]] == ["image", "pose"]

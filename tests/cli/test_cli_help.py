@@ -67,12 +67,22 @@ def test_every_setting_is_printed_with_its_default(run):
         ),
         (("imu", "orient", "{sweep}", "--into", "{sweep}"), "--replace replaces it"),
         (("volume", "{sweep}", "-o", "v.nrrd", "--mode", "image"), "make its reconstruction first"),
+        (("volume", "{sweep}", "-o", "v.xyz"), "v.xyz: expected a name ending in .nrrd"),
+        (("volume", "{sweep}", "-o", "v.nrrd", "--axes", "up"), "'--axes': 'up' is not one of"),
+        (("volume", "{sweep}", "-o", "v.nrrd", "--within-gb", "-1"), "--within-gb: expected enough"),
+        (("reslice", "{sweep}", "-o", "c.png", "--depth-mm", "500"), "--depth-mm: expected a value inside"),
+        (("reslice", "{sweep}", "-o", "c.png", "--pixel-mm", "0"), "--pixel-mm"),
+        (
+            ("imu", "accuracy", "{sweep}", "--optical", "a.tum", "--turns", "roll"),
+            "expected --reference with",
+        ),
+        (("compare", "{sweep}", "-o", "{sweep}"), "expected a folder or a new name, got a file"),
         (("reslice", "{sweep}", "-o", "c.png", "--state=s.nrrd"), "--state=s.nrrd was removed: "),
         (("calibrate", "images", "a", "b", "-o", "c.h5", "--scales"), "--pixel-mm takes them"),
     ],
 )
 def test_what_is_refused_is_refused_before_work(
-    refused, monkeypatch, tmp_path, data_folder, arguments, expected
+    refuse, monkeypatch, tmp_path, data_folder, arguments, expected
 ):
     from speckle3d import sensor_logs
     from speckle3d.study import job, paper
@@ -85,5 +95,5 @@ def test_what_is_refused_is_refused_before_work(
     monkeypatch.setattr(sensor_logs, "ridden_along", work)
     monkeypatch.chdir(tmp_path)
     sweep = data_folder / "phantom.h5"
-    assert expected.format(sweep=sweep) in refused(*(word.format(sweep=sweep) for word in arguments))
+    assert expected.format(sweep=sweep) in refuse(*(word.format(sweep=sweep) for word in arguments))
     assert not list(tmp_path.iterdir())

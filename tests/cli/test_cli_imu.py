@@ -45,7 +45,7 @@ def log_file(tmp_path):
     return path
 
 
-def test_an_accelerometer_in_g_is_told_wherever_the_log_is_shown_or_written(run, tmp_path):
+def test_every_command_says_that_an_accelerometer_is_in_g(run, tmp_path):
     _, log = turning()
     path = tmp_path / "g.csv"
     write_csv(path, replace(log, accelerometer_m_s2=log.accelerometer_m_s2 / 9.80665))
@@ -66,8 +66,8 @@ def test_an_orientation_goes_into_a_sweep_on_its_own_clock(run, log_file, sweep_
     stream = load_sweep(sweep_file).orientation
     assert stream.time_offset_s == 0.05
     truth, log = turning()
-    found = stream.readings.at(log.time_s[100:-100])
-    error = (truth[100:-100].inv() * found).magnitude()
+    rotation = stream.readings.at(log.time_s[100:-100])
+    error = (truth[100:-100].inv() * rotation).magnitude()
     # Exact readings: what is left is the filter's starting heading and its model of the field. Degrees.
     assert np.rad2deg(error.max()) < 2.0
 
@@ -79,21 +79,25 @@ def test_accuracy_beside_an_optical_tracker(run, tmp_path):
     truth = Rotation.from_euler("zyx", angles)
     off = Rotation.from_rotvec(np.deg2rad(0.4) * np.random.default_rng(1).standard_normal((time_s.size, 3)))
     write_csv(tmp_path / "log.csv", ImuLog(time_s, world_from_sensor=truth * off))
-    seen = (Rotation.from_euler("z", 0.7) * truth * Rotation.from_euler("xyz", [0.3, -0.5, 1.0])).as_quat()
-    np.savetxt(tmp_path / "target.txt", np.column_stack([time_s + 2.0, np.zeros((len(seen), 3)), seen]))
+    quaternions = (
+        Rotation.from_euler("z", 0.7) * truth * Rotation.from_euler("xyz", [0.3, -0.5, 1.0])
+    ).as_quat()
+    np.savetxt(
+        tmp_path / "target.txt", np.column_stack([time_s + 2.0, np.zeros((len(quaternions), 3)), quaternions])
+    )
     arguments = ("imu", "accuracy", tmp_path / "log.csv", "--method", "sensor", "--time-offset-s", "2.0")
     code, out, err = run(*arguments, "--optical", tmp_path / "target.txt", "--json")
     assert code == 0, err
-    told = {row["description"]: row["value"] for row in json.loads(out)}
+    errors = {row["description"]: row["value"] for row in json.loads(out)}
     for angle in ("roll", "yaw", "tilt"):
         # Two readings of 0.4 degrees each: 0.57; 77 of them leave 10 % open.
-        assert 0.45 < told[f"log: {angle} error, RMS"] < 0.7
+        assert 0.45 < errors[f"log: {angle} error, RMS"] < 0.7
 
 
-def test_a_stream_that_covers_no_frame_is_refused(run, refused, log_file, sweep_file):
+def test_no_stream_that_covers_no_frame_goes_into_a_sweep(run, refuse, log_file, sweep_file):
     before = sweep_file.read_bytes()
     orient = ("imu", "orient", log_file, "--into", sweep_file, "--replace", "--time-offset-s")
-    said = refused(*orient, "1e9")
-    assert re.search(r"covers 0 of \d+ frames", said)
+    line = refuse(*orient, "1e9")
+    assert re.search(r"covers 0 of \d+ frames", line)
     assert sweep_file.read_bytes() == before
     assert re.search(r"covers (\d+) of \1 frames", run(*orient, "0")[2])

@@ -17,7 +17,7 @@ from speckle3d.io.reconstructions import read_reconstruction
 from speckle3d.live.progress import Progress
 
 
-def started(*arguments):
+def start(*arguments):
     return subprocess.Popen(command(*arguments), stderr=subprocess.PIPE, text=True)
 
 
@@ -25,7 +25,7 @@ def started(*arguments):
 def player(data_folder):
     """A sweep that is played once, and its port."""
     port = free_port()
-    playing = started("play", data_folder / "phantom.h5", "--port", port)
+    playing = start("play", data_folder / "phantom.h5", "--port", port)
     read_until(playing, "waiting for a client")
     yield port
     playing.kill()
@@ -49,23 +49,23 @@ def waited_for(path, frames):
 @pytest.mark.slow
 def test_a_played_sweep_is_recorded_placed_and_reconstructed_as_off_line(player, data_folder, tmp_path):
     out, curves = tmp_path / "out", data_folder / "curves.h5"
-    running = started(
+    running = start(
         "live", f"127.0.0.1:{player}", "-o", out, "--curves", curves, "--transform", "ProbeToReference", *RF
     )
     waited_for(out / "sweep.h5", 96)
     time.sleep(1.0)
     running.send_signal(signal.SIGINT)
-    _, told = running.communicate(timeout=300)
-    assert running.returncode == 0, told
-    placed = re.search(r"96 frames in .*, (\d+) placed as they came", told)
-    assert int(placed[1]) > 0
+    _, err = running.communicate(timeout=300)
+    assert running.returncode == 0, err
+    count = re.search(r"96 frames in .*, (\d+) placed as they came", err)
+    assert int(count[1]) > 0
     whole = s3.load_sweep(data_folder / "phantom.h5")
-    kept = s3.load_sweep(out / "sweep.h5")
-    np.testing.assert_array_equal(kept.frames[95], whole.frames[95])
-    assert len(kept.tracker.readings)
-    made = read_reconstruction(out / "reconstruction.h5").poses["image"]
-    expected = s3.track(kept, s3.load_curves(curves)).image
-    np.testing.assert_allclose(made.as_matrix(), expected.as_matrix(), atol=1e-9)
+    sweep = s3.load_sweep(out / "sweep.h5")
+    np.testing.assert_array_equal(sweep.frames[95], whole.frames[95])
+    assert len(sweep.tracker.readings)
+    poses = read_reconstruction(out / "reconstruction.h5").poses["image"]
+    expected = s3.track(sweep, s3.load_curves(curves)).image
+    np.testing.assert_allclose(poses.as_matrix(), expected.as_matrix(), atol=1e-9)
 
 
 def test_progress_takes_one_line_of_a_narrow_terminal(monkeypatch, capsys):

@@ -8,35 +8,35 @@ SMALLEST = ("--preset", "phantom", "--vectors", 16, "--samples", 600, "--frames"
 
 
 @pytest.fixture
-def calls(bench, reconstructed, tmp_path):
+def calls(bench, results, tmp_path):
     """Commands by the file that each is to write."""
     shutil.copy(bench / "sweep.h5", tmp_path / "in.h5")
-    made = reconstructed / "reconstruction.h5"
+    reconstruction = results / "reconstruction.h5"
     return {
         "s.h5": lambda out: ("simulate", out, *SMALLEST),
         "c.h5": lambda out: ("convert", tmp_path / "in.h5", out),
-        "v.nrrd": lambda out: ("volume", made, "-o", out, "--voxel-mm", 1),
-        "r.png": lambda out: ("reslice", made, "-o", out),
+        "v.nrrd": lambda out: ("volume", reconstruction, "-o", out, "--voxel-mm", 1),
+        "r.png": lambda out: ("reslice", reconstruction, "-o", out),
         "o.csv": lambda out: ("imu", "orient", bench / "sweep.h5", "-o", out),
-        "p.tum": lambda out: ("trajectory", "export", made, "-o", out),
+        "p.tum": lambda out: ("trajectory", "export", reconstruction, "-o", out),
     }
 
 
-def test_other_files_and_inputs_stay_as_they_are(refused, calls, tmp_path):
+def test_other_files_and_inputs_stay_as_they_are(refuse, calls, tmp_path):
     for name, call in calls.items():
         place = tmp_path / name
         place.write_text("precious, 1, 2\n", encoding="utf-8")
-        assert str(place) in refused(*call(place))
+        assert str(place) in refuse(*call(place))
         assert place.read_text(encoding="utf-8") == "precious, 1, 2\n"
     before = (tmp_path / "in.h5").read_bytes()
-    assert "is an input" in refused(*calls["c.h5"](tmp_path / "in.h5"))
+    assert "is an input" in refuse(*calls["c.h5"](tmp_path / "in.h5"))
     assert (tmp_path / "in.h5").read_bytes() == before
-    refused(*calls["v.nrrd"](tmp_path / "w.nrrd"), "--state", tmp_path / "w.nrrd")
-    refused(*calls["r.png"](tmp_path / "cut.xyz"))
+    refuse(*calls["v.nrrd"](tmp_path / "w.nrrd"), "--state", tmp_path / "w.nrrd")
+    refuse(*calls["r.png"](tmp_path / "cut.xyz"))
 
 
 @pytest.mark.parametrize("name", ["v.nrrd", "r.png", "o.csv", "p.tum"])
-def test_what_the_command_wrote_before_is_replaced(run, calls, tmp_path, name):
+def test_a_command_replaces_its_own_output(run, calls, tmp_path, name):
     for _ in range(2):
         code, _, err = run(*calls[name](tmp_path / name))
         assert code == 0, err

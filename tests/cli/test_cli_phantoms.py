@@ -62,7 +62,7 @@ def test_a_plane_calibrates_an_orientation_sensor(run, scans, tmp_path):
     assert (np.abs(error) < [1.0, 0.2, 0.1]).all()
 
 
-def test_a_missing_motion(refused, scans, tmp_path):
-    line = refused("calibrate", "plane", scans / "untilted.h5", "-o", tmp_path / "c.h5")
+def test_a_missing_motion(refuse, scans, tmp_path):
+    line = refuse("calibrate", "plane", scans / "untilted.h5", "-o", tmp_path / "c.h5")
     assert "untilted.h5" in line
     assert "tilt" in line

@@ -22,10 +22,10 @@ def test_a_cut_in_a_frames_plane_lies_there_and_is_that_frame(run, bench, tmp_pa
     sweep = load_sweep(bench / "sweep.h5")
     for name in ("f.nrrd", "f.png"):
         assert run("reslice", bench / "sweep.h5", "-o", tmp_path / name, "--frame", 7)[0] == 0
-    shown = read_plane(tmp_path / "f.png")
+    plane = read_plane(tmp_path / "f.png")
     x, y = np.array([1.0, 3.0]), np.array([5.0, 20.0])
     expected = sweep.truth[7].apply(np.column_stack([x, y, [0, 0]]))
-    np.testing.assert_allclose(shown.world_mm(np.column_stack([x, y])), expected, atol=1e-9)
+    np.testing.assert_allclose(plane.world_mm(np.column_stack([x, y])), expected, atol=1e-9)
     volume = read_volume(tmp_path / "f.nrrd")
     assert volume.voxels.mean() > 50
     inside = sweep.truth[7].inv().as_matrix() @ volume.world_from_index
@@ -35,12 +35,12 @@ def test_a_cut_in_a_frames_plane_lies_there_and_is_that_frame(run, bench, tmp_pa
 
 
 def test_along_a_curve_and_along_one_picked_in_a_picture(run, bench, curve, tmp_path):
-    cut, top, picked = ("reslice", bench / "sweep.h5", "-o"), tmp_path / "top.png", tmp_path / "picked.csv"
-    picked.write_text("x_mm,y_mm\n0.2,1.0\n1.0,2.0\n2.0,2.5\n")
+    cut, top, picks = ("reslice", bench / "sweep.h5", "-o"), tmp_path / "top.png", tmp_path / "picked.csv"
+    picks.write_text("x_mm,y_mm\n0.2,1.0\n1.0,2.0\n2.0,2.5\n")
     for out, *options in (
         (tmp_path / "a.png", "--curve", curve, "--straight"),
         (top, "--depth-mm", "10"),
-        (tmp_path / "b.png", "--curve", picked, "--on", top),
+        (tmp_path / "b.png", "--curve", picks, "--on", top),
     ):
         code, _, err = run(*cut, out, *options)
         assert code == 0, err

@@ -11,14 +11,14 @@ DEVIATION_AND_STATE = (("deviation", ".nrrd"), ("state", ".seg.nrrd"))
 
 
 @pytest.fixture
-def made(reconstructed):
-    return reconstructed / "reconstruction.h5"
+def reconstruction(results):
+    return results / "reconstruction.h5"
 
 
-def test_a_scene_of_two_modes(run, refused, made, tmp_path):
+def test_a_scene_of_two_modes(run, refuse, reconstruction, tmp_path):
     target = tmp_path / "scene"
     options = ("--mode", "image", "--mode", "pose", "--voxel-mm", 0.5, "--deviation")
-    code, out, err = run("scene", made, "-o", target, *options)
+    code, out, err = run("scene", reconstruction, "-o", target, *options)
     assert (code, out) == (0, ""), err
     names = {node.get("name") for node in ElementTree.parse(target / "scene.mrml").getroot()}
     assert {"sweep, image", "sweep, pose", "sweep, image: outlines"} <= names
@@ -26,8 +26,8 @@ def test_a_scene_of_two_modes(run, refused, made, tmp_path):
     deviation, state = (read_volume(target / f"{name}-pose{end}") for name, end in DEVIATION_AND_STATE)
     np.testing.assert_array_equal(np.isfinite(deviation.voxels), state.voxels > 0)
     assert np.nanmin(deviation.voxels) >= 0
-    assert run("scene", made, "-o", target, "--voxel-mm", 0.5)[0] == 0
+    assert run("scene", reconstruction, "-o", target, "--voxel-mm", 0.5)[0] == 0
     assert not (target / "volume-pose.nrrd").exists()
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "mine.txt").write_text("precious")
-    assert "another folder" in refused("scene", made, "-o", tmp_path / "other")
+    assert "another folder" in refuse("scene", reconstruction, "-o", tmp_path / "other")

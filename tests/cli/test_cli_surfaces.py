@@ -24,9 +24,9 @@ def ball(tmp_path):
     return path
 
 
-def test_points_are_measured_with_what_is_claimed(run, reconstructed):
+def test_distances_have_the_errors_of_poses_and_picks(run, results):
     points = ("--point", "3,5,0.5", "--point", "3,5,2.5", "--point", "6,5,2.5", "--mode", "image")
-    measure = ("measure", reconstructed / "reconstruction.h5", *points, "--pick-mm", "0.05")
+    measure = ("measure", results / "reconstruction.h5", *points, "--pick-mm", "0.05")
     code, out, err = run(*measure, "--json")
     assert code == 0, err
     first, _, line, angle = json.loads(out)["measurements"]
@@ -35,14 +35,14 @@ def test_points_are_measured_with_what_is_claimed(run, reconstructed):
     # Curves of one small phantom sweep leave 8 % open.
     assert 0.02 < first["by_poses"] / 2.0 < 0.2
     assert (line["value"], angle["value"]) == pytest.approx((5.0, 90.0))
-    assert run(*measure)[1].startswith("distance 1 2: 2.00 +- ")
+    assert run(*measure)[1].startswith(f"distance 1 2: 2.00 +- {1.96 * first['standard_error']:.2f} mm (95 %")
 
 
 def test_a_ball_has_its_volume(run, ball, tmp_path):
     out = tmp_path / "ball.ply"
     code, text, err = run("surface", ball, "-o", out, "--level", "128", "--json")
     assert code == 0, err
-    (told,) = json.loads(text)
-    assert told["volume_mm3"] == pytest.approx(VOLUME_MM3, rel=0.01)
-    assert told["open_mm"] == 0.0
-    assert len(read_surface(out)) == told["triangles"]
+    (sizes,) = json.loads(text)
+    assert sizes["volume_mm3"] == pytest.approx(VOLUME_MM3, rel=0.01)
+    assert sizes["open_mm"] == 0.0
+    assert len(read_surface(out)) == sizes["triangles"]

@@ -61,19 +61,19 @@ def test_the_page_stands_alone(page, text):
 
 def test_every_number_is_in_the_tables_and_what_is_broken_or_in_doubt_stands_above(page, text, report_study):
     words = " ".join(page.words)
-    for each in report_study.rows:
-        if np.isfinite(each["tilt_error_deg"]):
-            assert f"{each['length_error_mm']:+.2f}" in words
-            assert f"{each['tilt_error_deg']:+.2f}" in words
+    for row in report_study.rows:
+        if np.isfinite(row["tilt_error_deg"]):
+            assert f"{row['length_error_mm']:+.2f}" in words
+            assert f"{row['tilt_error_deg']:+.2f}" in words
     assert words.index(printable(REASON)) < words.index("Errors by sweep and part")
-    for shown in ("GPE / mm", "12.3", "1.0 [0.5, 1.5]", "+11.1 [+2.1, +20.0]", "image − pose"):
-        assert shown in words
+    for text_part in ("GPE / mm", "12.3", "1.0 [0.5, 1.5]", "+11.1 [+2.1, +20.0]", "image − pose"):
+        assert text_part in words
     # What is printed is spelt out.
     assert re.search("FDR +final drift rate", words)
     place = text.index('id="doubts"')
     assert place < text.index('id="modes"')
     doubts = text[place : text.index("</table>", place)]
-    assert all(each in doubts for each in ("units &lt;in&gt; metres", "expected 3 mm, got 0.003", "refused"))
+    assert all(part in doubts for part in ("units &lt;in&gt; metres", "expected 3 mm, got 0.003", "refused"))
     assert 'href="#sweep-1"' in doubts
 
 
@@ -91,28 +91,30 @@ def test_names_and_reasons_of_others_are_text(text, page):
 
 def test_plots_hold_the_curves_and_the_tracker_alone(text, report_study):
     traces = json.loads(re.search(r'id="plot-sweep-1-curves">(.*?)</script>', text)[1])["data"]
-    view = load_view(report_study.directory, report_study.done[0])
+    view = load_view(report_study.directory, report_study.successes[0])
     for mode in ("pose", "tracker"):
         (trace,) = [t for t in traces if t["name"] == label_of(mode) and t["visible"] and t["xaxis"] == "x"]
         values = np.frombuffer(base64.b64decode(trace["y"]["bdata"]), np.dtype(trace["y"]["dtype"]))
         np.testing.assert_allclose(values, view.curves.modes[mode][0], rtol=1e-6, atol=1e-6)
     pictures = re.findall(r'<img[^>]* src="data:image/png;base64,([^"]+)"', text)
-    assert [base64.b64decode(each)[:4] for each in pictures] == [b"\x89PNG"] * 5
+    assert [base64.b64decode(picture)[:4] for picture in pictures] == [b"\x89PNG"] * 5
 
 
 def test_a_sweep_whose_file_is_gone_or_changed_is_shown_without_its_reference(page, report_study, tmp_path):
     assert str(report_study.directory / "gone.h5") in " ".join(page.words)
-    other = tmp_path / "forward.h5"
-    other.write_bytes(b"another")
-    view = load_view(report_study.directory, replace(report_study.done[0], path=other))
+    new_file = tmp_path / "forward.h5"
+    new_file.write_bytes(b"another")
+    view = load_view(report_study.directory, replace(report_study.successes[0], path=new_file))
     assert view.curves.reference is None
-    assert any(str(other) in note for note in view.notes)
+    assert any(str(new_file) in note for note in view.notes)
 
 
 def test_a_study_of_broken_sweeps_alone_is_still_a_page(report_study, tmp_path):
-    torn = report_study.broken[0]
-    lost = replace(report_study.done[0], folder="sweeps/lost-1")
-    words = " ".join(Page(write_report(Study(tmp_path, [torn, lost], "")).read_text(encoding="utf-8")).words)
-    assert printable(torn.reason) in words
+    failure = report_study.failures[0]
+    success = replace(report_study.successes[0], folder="sweeps/lost-1")
+    words = " ".join(
+        Page(write_report(Study(tmp_path, [failure, success], "")).read_text(encoding="utf-8")).words
+    )
+    assert printable(failure.reason) in words
     # The sweep whose folder is gone is told with it.
     assert str(tmp_path / "sweeps" / "lost-1") in words

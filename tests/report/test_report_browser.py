@@ -15,12 +15,12 @@ def report(report_study):
 
 @pytest.fixture(scope="module")
 def browser():
-    with chromium() as started:
-        yield started
+    with chromium() as window:
+        yield window
 
 
 @pytest.fixture(scope="module")
-def opened(browser, report):
+def page_of_study(browser, report):
     """The page in a browser, and what it complained of and asked for."""
     page = browser.new_page(viewport={"width": 1280, "height": 800})
     # Slow machines draw in software.
@@ -39,37 +39,37 @@ def shows(page, selector):
     return [element.evaluate(VISIBLE) for element in page.query_selector_all(selector)]
 
 
-def test_it_opens_without_complaint_or_network(opened, report):
-    assert opened.complaints == []
-    assert opened.requests == [report.as_uri()]
-    assert opened.locator(".lead").bounding_box()["y"] < 200
+def test_it_opens_without_complaint_or_network(page_of_study, report):
+    assert page_of_study.complaints == []
+    assert page_of_study.requests == [report.as_uri()]
+    assert page_of_study.locator(".lead").bounding_box()["y"] < 200
     # What is wider than the screen scrolls by itself.
-    assert opened.evaluate("document.documentElement.scrollWidth") <= 1280
-    assert len(opened.query_selector_all("#sweep-1 figure.drawn canvas")) > 0
+    assert page_of_study.evaluate("document.documentElement.scrollWidth") <= 1280
+    assert len(page_of_study.query_selector_all("#sweep-1 figure.drawn canvas")) > 0
 
 
-def test_clicking_chooses_sweeps_and_differences(opened):
+def test_clicking_chooses_sweeps_and_differences(page_of_study):
     curves = '#sweep-1 figure[data-plot$="curves"] .plot'
-    before = opened.eval_on_selector(curves, "plot => plot.data.map(trace => trace.visible)")
-    opened.click(f"{curves} .updatemenu-button >> text=minus truth")
-    opened.wait_for_function(f"document.querySelector('{curves}').data[0].visible === false")
-    after = opened.eval_on_selector(curves, "plot => plot.data.map(trace => trace.visible)")
+    before = page_of_study.eval_on_selector(curves, "plot => plot.data.map(trace => trace.visible)")
+    page_of_study.click(f"{curves} .updatemenu-button >> text=minus truth")
+    page_of_study.wait_for_function(f"document.querySelector('{curves}').data[0].visible === false")
+    after = page_of_study.eval_on_selector(curves, "plot => plot.data.map(trace => trace.visible)")
     assert after == [not visible for visible in before]
 
-    opened.click("#chooser button >> text=alert")
-    assert shows(opened, ".sweep") == [False, True]
-    assert any("gone.h5" in note for note in opened.locator("#sweep-2 .note").all_inner_texts())
-    assert opened.query_selector_all("#sweep-1 canvas") == []
+    page_of_study.click("#chooser button >> text=alert")
+    assert shows(page_of_study, ".sweep") == [False, True]
+    assert any("gone.h5" in note for note in page_of_study.locator("#sweep-2 .note").all_inner_texts())
+    assert page_of_study.query_selector_all("#sweep-1 canvas") == []
 
-    opened.keyboard.press("ArrowLeft")
-    assert shows(opened, ".sweep") == [True, False]
-    opened.click("#parts ~ .wide a >> text=alert >> nth=0")
-    assert shows(opened, ".sweep") == [False, True]
+    page_of_study.keyboard.press("ArrowLeft")
+    assert shows(page_of_study, ".sweep") == [True, False]
+    page_of_study.click("#parts ~ .wide a >> text=alert >> nth=0")
+    assert shows(page_of_study, ".sweep") == [False, True]
 
-    assert not opened.locator("pre").is_visible()
-    opened.click("summary")
-    assert opened.locator("pre").is_visible()
-    assert opened.complaints == []
+    assert not page_of_study.locator("pre").is_visible()
+    page_of_study.click("summary")
+    assert page_of_study.locator("pre").is_visible()
+    assert page_of_study.complaints == []
 
 
 def test_without_scripts_tables_and_pictures_are_there_and_it_says_what_is_not(browser, report):

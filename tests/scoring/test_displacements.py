@@ -39,27 +39,27 @@ def test_drift_by_hand():
     rates = drift_rates(sliding(2.0, 3) * RigidTransform.from_rotation(turn), sliding(2.0, 3), np.zeros(3))
     assert rates["EA_deg"] == pytest.approx((5.0 + 1.0) / 2)
     # A rest at the start is left out of the average rate.
-    rested = [RigidTransform.concatenate([sliding(x)[:1], sliding(x)]) for x in (105.0, 100.0)]
-    assert drift_rates(*rested, CENTRE_MM)["ADR_percent"] == pytest.approx(5.0)
+    paths = [RigidTransform.concatenate([sliding(x)[:1], sliding(x)]) for x in (105.0, 100.0)]
+    assert drift_rates(*paths, CENTRE_MM)["ADR_percent"] == pytest.approx(5.0)
 
 
 def test_errors_and_score_are_those_the_challenge_publishes(tmp_path):
-    path, _, true_tool, published = examples.write_data_set(tmp_path)
+    path, _, true_tool, landmarks = examples.write_data_set(tmp_path)
     sweep, marks = load_sweep(path), load_landmarks(path)
     true = find_reference(sweep, None).world_from_image
     poses = drifting_poses(true, np.random.default_rng(4))
     counted_from_ours = RigidTransform.from_translation([*examples.SCALE_MM, 0.0]).as_matrix()
     tool = poses.as_matrix() @ np.linalg.inv(counted_from_ours) @ np.linalg.inv(examples.TOOL_FROM_IMAGE)
-    expected = examples.published_errors(true_tool, tool, published)
+    expected = examples.published_errors(true_tool, tool, landmarks)
     assert min(expected.values()) > 0.01
     row = score_row(poses, true, sweep.grid, marks)
     assert {name: row[name] for name in expected} == pytest.approx(expected, abs=1e-9)
-    largest = examples.published_errors(true_tool, np.tile(np.eye(4), (len(true_tool), 1, 1)), published)
+    largest = examples.published_errors(true_tool, np.tile(np.eye(4), (len(true_tool), 1, 1)), landmarks)
     score = np.mean([(expected[key] - largest[key]) / (0.0 - largest[key]) for key in expected])
     assert challenge_score(row, true, sweep.grid, marks) == pytest.approx(score, abs=1e-9)
 
 
-def test_what_has_no_error_is_refused():
+def test_errors_need_a_path_and_frames_of_landmarks():
     with pytest.raises(InvalidInputError):
         point_errors(sliding(1.0), sliding(1.0), None, Landmarks(np.array([51]), np.zeros((1, 3))))
     with pytest.raises(InsufficientDataError):

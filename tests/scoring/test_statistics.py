@@ -6,12 +6,12 @@ from speckle3d.scoring.statistics import holm, mean_interval, signed_rank_p
 
 def test_the_interval_of_many_values_is_the_textbook_one():
     values = np.random.default_rng(5).normal(2.0, 0.5, size=400)
-    found = mean_interval(values)
+    interval = mean_interval(values)
     half = 1.96 * values.std() / np.sqrt(400)
     # A percentile from 9999 resamples scatters by about 0.03 standard errors: 4 of these of 1.96.
-    assert found.low == pytest.approx(values.mean() - half, abs=0.06 * half)
-    assert found.high == pytest.approx(values.mean() + half, abs=0.06 * half)
-    assert found == mean_interval(values)
+    assert interval.low == pytest.approx(values.mean() - half, abs=0.06 * half)
+    assert interval.high == pytest.approx(values.mean() + half, abs=0.06 * half)
+    assert interval == mean_interval(values)
 
 
 def test_holms_correction_by_hand():
@@ -27,9 +27,9 @@ def test_holms_correction_by_hand():
 
 def test_few_or_equal_values_have_no_interval_and_no_test():
     for values in ([1.0], [1.0, 3.0], [2.0, 2.0, 2.0, 2.0]):
-        found = mean_interval(values)
-        assert (found.low, found.high, signed_rank_p(values)) == (None, None, None)
-        assert found.mean == np.mean(values)
+        interval = mean_interval(values)
+        assert (interval.low, interval.high, signed_rank_p(values)) == (None, None, None)
+        assert interval.mean == np.mean(values)
 
 
 def test_the_signs_of_five_sweeps_alike_are_two_of_their_assignments():

@@ -38,15 +38,15 @@ def texts(pair, tmp_path_factory):
 def test_pose_errors_are_evos(texts):
     metrics = pytest.importorskip("evo.core.metrics", reason="evo is not installed")
     files = pytest.importorskip("evo.tools.file_interface", reason="evo is not installed")
-    found, true = (files.read_tum_trajectory_file(str(path)) for path in texts)
-    found.align_origin(true)
+    estimate, true = (files.read_tum_trajectory_file(str(path)) for path in texts)
+    estimate.align_origin(true)
     ours = compare_trajectories(load_estimate(texts[0]), load_reference(texts[1]))
     for name, metric, extra in (("APE", metrics.APE, ()), ("RPE", metrics.RPE, (1, metrics.Unit.frames))):
         for relation, scale, unit in (("translation_part", 1000.0, "mm"), ("rotation_angle_deg", 1.0, "deg")):
-            theirs = metric(metrics.PoseRelation[relation], *extra)
-            theirs.process_data((true, found))
+            error = metric(metrics.PoseRelation[relation], *extra)
+            error.process_data((true, estimate))
             for statistic in ("rmse", "mean", "max"):
-                expected = scale * theirs.get_statistic(metrics.StatisticsType[statistic])
+                expected = scale * error.get_statistic(metrics.StatisticsType[statistic])
                 # Of 20 mm, printed in metres and back.
                 assert getattr(ours[name], f"{statistic}_{unit}") == pytest.approx(expected, abs=1e-9)
                 assert expected > 1e-3
@@ -57,16 +57,16 @@ def test_a_reconstruction_is_scored_against_a_sweep(tmp_path):
     write_sweep(tmp_path / "s.h5", sweep)
     rng = np.random.default_rng(2)
     poses = {"image": drifting_poses(sweep.truth, rng), "pose": sweep.truth}
-    made = Provenance("s.h5", "ab", "0.1.0")
-    write_reconstruction(tmp_path / "r.h5", Reconstruction(sweep.frame_time_s, sweep.grid, poses, made))
+    provenance = Provenance("s.h5", "ab", "0.1.0")
+    write_reconstruction(tmp_path / "r.h5", Reconstruction(sweep.frame_time_s, sweep.grid, poses, provenance))
     reference = load_reference(tmp_path / "s.h5")
-    found = compare_trajectories(load_estimate(tmp_path / "r.h5"), reference)
+    scores = compare_trajectories(load_estimate(tmp_path / "r.h5"), reference)
     expected = score_row(poses["image"], sweep.truth, sweep.grid)
-    assert {key: found[key] for key in expected if expected[key] is not None} == pytest.approx(
+    assert {key: scores[key] for key in expected if expected[key] is not None} == pytest.approx(
         {key: value for key, value in expected.items() if value is not None}, abs=1e-9
     )
     # Its provenance names other bytes.
-    assert found["same_sweep"] is False
+    assert scores["same_sweep"] is False
     with pytest.raises(InvalidInputError):
         load_estimate(tmp_path / "r.h5", "orientation")
 
@@ -77,6 +77,6 @@ def test_poses_meet_by_time_and_those_without_a_reference_are_left_out():
     line = RigidTransform.from_translation(np.column_stack([0 * z, 0 * z, z]))
     # Every 0.01 s against readings every 0.04 s that begin later and end earlier.
     reference = Trajectory("r", times[10:91:4], line[10:91:4])
-    found = compare_trajectories(Trajectory("e", times, line), reference)
-    assert (found["poses"], found["left_out"]) == (81, 20)
-    assert found["APE"].max_mm == pytest.approx(0.0, abs=1e-9)
+    scores = compare_trajectories(Trajectory("e", times, line), reference)
+    assert (scores["poses"], scores["left_out"]) == (81, 20)
+    assert scores["APE"].max_mm == pytest.approx(0.0, abs=1e-9)

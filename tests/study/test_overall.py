@@ -40,11 +40,11 @@ def of(records, quantity, *modes):
 
 
 def test_modes_that_differ_in_every_sweep_are_told_apart_and_like_ones_not():
-    _, paired = over_sweeps(*study(11))
-    pair = of(paired, "length_error_percent", "image", "pose")
+    _, comparisons = over_sweeps(*study(11))
+    pair = of(comparisons, "length_error_percent", "image", "pose")
     assert (pair["better"], pair["sweeps"]) == ("pose", 11)
     assert 2.5 < pair["low"] < pair["difference"] < pair["high"] < 3.5
     # All eleven signs alike: 2 of 2**11 assignments; the smallest of three p values counts three times.
     assert pair["wilcoxon_p"] == pytest.approx(2 / 2**11)
     assert pair["holm_p"] >= 2 * pair["wilcoxon_p"]
-    assert of(paired, "length_error_percent", "image", "twin")["better"] is None
+    assert of(comparisons, "length_error_percent", "image", "twin")["better"] is None

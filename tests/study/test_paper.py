@@ -8,14 +8,14 @@ import pytest
 from speckle3d.io.load import load_sweep
 from speckle3d.simulation.presets import SimulationSettings
 from speckle3d.study import paper
-from speckle3d.study.paper import MODES, published
+from speckle3d.study.paper import MODES, paper_errors
 
 
 def test_the_published_means_are_those_of_its_tables():
     # Added up by hand: the 17 absolute length errors of six DOF correction make 29.41 per cent (27.81 for the
     # 15 parts of beef, 1.9 on average), the tilt errors 0.72 degrees, those of orientation correction 0.67.
-    assert len(published()) == 17
-    sums = {mode: np.abs([each[mode] for each in published().values()]).sum(axis=0) for mode in MODES}
+    assert len(paper_errors()) == 17
+    sums = {mode: np.abs([part[mode] for part in paper_errors().values()]).sum(axis=0) for mode in MODES}
     assert sums["pose"] == pytest.approx([29.41, 0.72], abs=0.001)
     assert sums["orientation"][1] == pytest.approx(0.67, abs=0.001)
 
@@ -29,22 +29,24 @@ def tiny(monkeypatch):
 
 @pytest.mark.slow
 def test_the_study_simulates_once_and_compares_with_the_tracker_and_the_truth(tiny, data_folder, tmp_path):
-    told = []
-    _, table = paper.paper_study(tmp_path, data_folder / "curves.h5", simulated=lambda *at: told.append(at))
-    assert told == [(0, 1), (1, 1)]
+    calls = []
+    _, table = paper.paper_study(
+        tmp_path, data_folder / "curves.h5", simulation_progress=lambda *at: calls.append(at)
+    )
+    assert calls == [(0, 1), (1, 1)]
     assert "beef-1 f" in table
-    held = json.loads((tmp_path / "paper.json").read_text())
+    numbers = json.loads((tmp_path / "paper.json").read_text())
     for reference in ("tracker", "truth"):
-        assert {each["mode"] for each in held["rows"][reference]["beef-1"]} >= set(MODES)
+        assert {mean["mode"] for mean in numbers["rows"][reference]["beef-1"]} >= set(MODES)
     sweep = load_sweep(next(tmp_path.glob("inputs/*/beef-1.h5")))
     # As published, the orientation is the tracker's.
-    turned = sweep.orientation.world_from_image(sweep.frame_time_s).inv()
-    tracked = sweep.tracker.world_from_image(sweep.frame_time_s).rotation
-    assert np.rad2deg((turned * tracked).magnitude().max()) < 1e-4
-    told.clear()
+    image_from_world = sweep.orientation.world_from_image(sweep.frame_time_s).inv()
+    rotations = sweep.tracker.world_from_image(sweep.frame_time_s).rotation
+    assert np.rad2deg((image_from_world * rotations).magnitude().max()) < 1e-4
+    calls.clear()
     study, again = paper.paper_study(
-        tmp_path, data_folder / "curves.h5", simulated=lambda *at: told.append(at)
+        tmp_path, data_folder / "curves.h5", simulation_progress=lambda *at: calls.append(at)
     )
-    assert told == [(1, 1)]
-    assert all(each.skipped for each in study.outcomes)
+    assert calls == [(1, 1)]
+    assert all(outcome.is_old for outcome in study.outcomes)
     assert again == table

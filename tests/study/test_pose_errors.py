@@ -19,15 +19,15 @@ IMAGE = RigidTransform.from_translation(np.column_stack([0 * Z_MM, 0 * Z_MM, Z_M
 WORLD = RigidTransform.from_components([90.0, 0.0, 7.0], Rotation.from_euler("x", 0.9))
 
 
-def made(modes=("fused",), trust=True):
+def reconstruction(modes=("fused",), has_trust=True):
     covariance = shared_covariance(IMAGE, GRID.centre_mm, SHARED)
-    own = np.zeros((N, 6, 6))
-    own[:, 2, 2] = (0.004 * Z_MM) ** 2 + 1e-4 * Z_MM
+    claim = np.zeros((N, 6, 6))
+    claim[:, 2, 2] = (0.004 * Z_MM) ** 2 + 1e-4 * Z_MM
     poses = {"image": IMAGE} | dict.fromkeys(modes, WORLD * IMAGE)
-    claims = {"fused": ModeErrors(own, 0.004)} if "fused" in modes else {}
-    held = Trust(covariance, np.zeros(N, dtype=np.int64), SHARED, claims) if trust else None
+    claims = {"fused": ModeErrors(claim, 0.004)} if "fused" in modes else {}
+    trust = Trust(covariance, np.zeros(N, dtype=np.int64), SHARED, claims) if has_trust else None
     provenance = Provenance("sweep.h5", "", "")
-    return Reconstruction(np.arange(N) / 20.0, GRID, poses, provenance, Config().to_toml(), None, held)
+    return Reconstruction(np.arange(N) / 20.0, GRID, poses, provenance, Config().to_toml(), None, trust)
 
 
 def along(errors, i, j):
@@ -36,18 +36,18 @@ def along(errors, i, j):
 
 
 def test_an_images_length_is_as_sure_as_the_file_claims():
-    held = made()
-    errors = errors_of(held)
-    assert along(errors, 0, N - 1) == pytest.approx(np.sqrt(held.trust.covariance[-1, 2, 2]), rel=1e-3)
+    file = reconstruction()
+    errors = errors_of(file)
+    assert along(errors, 0, N - 1) == pytest.approx(np.sqrt(file.trust.covariance[-1, 2, 2]), rel=1e-3)
 
 
 def test_a_mode_with_claims_of_its_own_has_these():
-    errors = errors_of(made(), "fused")
+    errors = errors_of(reconstruction(), "fused")
     assert along(errors, 0, N - 1) == pytest.approx(np.sqrt((0.004 * 20) ** 2 + 1e-4 * 20), rel=1e-3)
 
 
-def test_what_claims_nothing_is_refused():
+def test_errors_need_a_claim_and_a_mode():
     with pytest.raises(InsufficientDataError):
-        errors_of(made(trust=False))
+        errors_of(reconstruction(has_trust=False))
     with pytest.raises(InvalidInputError):
-        errors_of(made(modes=()), "fused")
+        errors_of(reconstruction(modes=()), "fused")

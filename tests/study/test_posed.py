@@ -31,24 +31,24 @@ def sequence(folder, matrix=PIXELS, invalid=(), frames=4):
 
 
 def test_bmode_as_it_is_stored_needs_no_dynamic_range(tmp_path):
-    posed = open_posed(sequence(tmp_path))
-    source, meaning = posed.source()
+    sweep = open_posed(sequence(tmp_path))
+    source, meaning = sweep.source()
     assert meaning == "B-mode as stored, 0 to 255"
-    stored = source.images[2]
-    assert stored.dtype == np.uint8
-    np.testing.assert_array_equal(stored, grey(4)[2].T)
+    image = source.images[2]
+    assert image.dtype == np.uint8
+    np.testing.assert_array_equal(image, grey(4)[2].T)
     for levels in ("log", "linear"):
         with pytest.raises(InvalidInputError):
-            posed.source(levels)
+            sweep.source(levels)
 
 
-def test_frames_without_a_valid_pose_are_left_out_and_counted(tmp_path):
-    posed = open_posed(sequence(tmp_path, invalid=(0, 3)))
-    np.testing.assert_array_equal(posed.frames, [1, 2])
-    source, _ = posed.source()
+def test_notes_count_the_frames_without_a_valid_pose(tmp_path):
+    sweep = open_posed(sequence(tmp_path, invalid=(0, 3)))
+    np.testing.assert_array_equal(sweep.frames, [1, 2])
+    source, _ = sweep.source()
     assert len(source) == 2
     np.testing.assert_array_equal(source.images[0], grey(4)[1].T)
-    assert posed.notes() == ["a: 2 of 4 frames have no valid pose and are left out"]
+    assert sweep.notes() == ["a: 2 of 4 frames have no valid pose and are left out"]
     assert open_posed(sequence(tmp_path)).notes() == []
 
 
@@ -60,9 +60,9 @@ def test_a_reconstruction_is_opened_with_the_calibrations_it_was_made_with(tmp_p
         9.0, FramesUsed(3, (0, 1, 2)),
     )  # fmt: skip
     write_calibration(tmp_path / "c.h5", calibration)
-    used = tuple(CalibrationFile("tracker", str(tmp_path / name), "") for name in ("c.h5", "gone.h5"))
-    made = Provenance("", recording_sha256(tmp_path / "s.h5"), "1", used)
-    opened = sweep_of(
-        Reconstruction(sweep.frame_time_s, sweep.grid, {"image": sweep.truth}, made), tmp_path / "s.h5"
+    files = tuple(CalibrationFile("tracker", str(tmp_path / name), "") for name in ("c.h5", "gone.h5"))
+    provenance = Provenance("", recording_sha256(tmp_path / "s.h5"), "1", files)
+    again = sweep_of(
+        Reconstruction(sweep.frame_time_s, sweep.grid, {"image": sweep.truth}, provenance), tmp_path / "s.h5"
     )
-    np.testing.assert_allclose(opened.tracker.sensor_from_image.as_matrix(), mounting.as_matrix())
+    np.testing.assert_allclose(again.tracker.sensor_from_image.as_matrix(), mounting.as_matrix())

@@ -31,15 +31,15 @@ def row(mode="image", **changes):
     return ModeError(**{**values, **changes})
 
 
-def summary(reference="tracker", rows=None, **more):
-    return Summary("beef, 1", reference, 100, 0.95, rows or [row(), row("orientation")], **more)
+def summary(reference="tracker", rows=None, **fields):
+    return Summary("beef, 1", reference, 100, 0.95, rows or [row(), row("orientation")], **fields)
 
 
-def test_a_doubt_is_of_the_modes_that_rest_on_what_is_doubted():
+def test_a_doubt_is_of_the_modes_that_rest_on_its_sensor():
     images = Doubt("images", "frozen", "...", False)
     modes = ["image", "orientation", "pose", "tracker"]
-    doubted = doubted_modes(sweep_examples.rf_sweep(), [SPIKES, METRES, images], modes)
-    assert doubted == {
+    suspects = doubted_modes(sweep_examples.rf_sweep(), [SPIKES, METRES, images], modes)
+    assert suspects == {
         "image": "frozen", "orientation": "spikes, frozen", "pose": "units, frozen", "tracker": "units",
     }  # fmt: skip
 
@@ -50,14 +50,14 @@ def test_what_is_in_doubt_and_left_out_stands_below_the_table_and_is_read_back(t
     rows = [row(sigma_mm=1.0)]
     of = Summary("s", "truth", 9, 1.0, rows, details, doubts, {"image": "x"}, left_out, {"image": 0.1})
     write_summary(tmp_path, of)
-    made = Provenance("s.h5", "ab12", "1.0")
-    assert recorded_doubts(tmp_path / "reconstruction.h5", made) == (METRES, SPIKES)
-    assert recorded_doubts(tmp_path / "reconstruction.h5", replace(made, input_sha256="cd34")) is None
+    provenance = Provenance("s.h5", "ab12", "1.0")
+    assert recorded_doubts(tmp_path / "reconstruction.h5", provenance) == (METRES, SPIKES)
+    assert recorded_doubts(tmp_path / "reconstruction.h5", replace(provenance, input_sha256="cd34")) is None
     assert "s: mode pose is left out" in (tmp_path / "table.txt").read_text()
     again = read_summary(tmp_path, "s")
     assert replace(again, drift=(), details=details) == of
     study = Study(tmp_path, [SweepOutcome("s", tmp_path, folder=".", summary=again)], "")
     write_study(study)
     doubts = json.loads((tmp_path / "study.json").read_text())["doubts"]
-    assert [(each["sweep"], each["suspect"]) for each in doubts] == [("s", "units"), ("s", "spikes")]
+    assert [(doubt["sweep"], doubt["suspect"]) for doubt in doubts] == [("s", "units"), ("s", "spikes")]
     assert "mode pose is left out" in study.table

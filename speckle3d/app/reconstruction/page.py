@@ -25,9 +25,9 @@ from speckle3d.imaging.images import Images
 from speckle3d.report.figures import plot_curves, plot_outlines
 from speckle3d.scoring.references import find_reference, sweep_curves
 from speckle3d.study.figures import RANGE_DB, label_of
-from speckle3d.study.pose_errors import PICKED, caution, measure
-from speckle3d.study.posed import OpenedModes, PosedSweep, at_modes
-from speckle3d.study.reslices.cuts import cut_posed
+from speckle3d.study.pose_errors import PICKING, caution, measure
+from speckle3d.study.posed import PosedSweep, SweepModes, at_modes
+from speckle3d.study.reslices.cuts import cut_at_modes
 from speckle3d.study.reslices.places import along_sweep, in_frame
 
 KEPT_BYTES = 600_000_000
@@ -95,7 +95,7 @@ class ReconstructionPage:
         """Cuts, trajectories and what is measured in them."""
         return _Viewer(self).layout()
 
-    def _at_modes(self, mode: str, overlay: str | None) -> OpenedModes:
+    def _at_modes(self, mode: str, overlay: str | None) -> SweepModes:
         return at_modes(self._sweep, [mode, *([overlay] if overlay else [])], mode)
 
     @cached_property
@@ -248,7 +248,7 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
                 place = in_frame(posed, grid, self.frame, reach_mm=reach_mm)
             else:
                 place = along_sweep(posed, grid, **self._slider(name))
-            picture = cut_posed(posed, place, RANGE_DB, (images, grid), reach_mm=reach_mm)
+            picture = cut_at_modes(posed, place, RANGE_DB, (images, grid), reach_mm=reach_mm)
         except Speckle3DError as error:
             plot.plot.title.text = str(error).split(";")[0]
             return
@@ -305,10 +305,9 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
         if len(points) > 1:
             try:
                 lines += [row.line for row in measure(page.reconstruction, points, self.mode)]
-                picked_mm = PICKED * self._grid.vector_pitch_mm
+                half_mm = 1.96 * PICKING * self._grid.vector_pitch_mm
                 lines.append(
-                    f"mode {self.mode}; points picked to {picked_mm:.2g} mm per axis; "
-                    "+- a standard error, 95 % in brackets"
+                    f"mode {self.mode}; points are picked to +- {half_mm:.2g} mm per axis; every +- is 95 %"
                 )
                 lines += filter(None, [caution(page.reconstruction, self.mode)])
                 command = code(measure_command(page.source, self.mode, list(points)))

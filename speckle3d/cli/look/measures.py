@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from speckle3d.cli.common import MaybeNumber, MaybePath, MaybeText, Out, Result, note, notes
+from speckle3d.cli.common import MaybeNumber, MaybePath, MaybeText, Out, Result, notes
 from speckle3d.cli.outputs import require_own_place
-from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.errors import InvalidInputError, naming
 
 if TYPE_CHECKING:
     from speckle3d.core.grid import ImageGrid
@@ -27,10 +27,10 @@ def measure(
     mode: MaybeText = None,
     pick_mm: Annotated[MaybeNumber, typer.Option(min=0.0)] = None,
 ) -> Result:
-    """Say how long it is between points, and how sure that is: distances, the line's length, angles.
+    """Measure distances, a line's length and angles between points, and how sure they are.
 
-    One of --point or --points. Standard errors are those of the poses of the frames on either side of each
-    point, jointly, and of the picking.
+    One of --point or --points. Errors are those of the poses of the frames on either side of each point,
+    jointly, and of the picking.
 
     Parameters
     ----------
@@ -50,54 +50,48 @@ def measure(
 
     Examples
     --------
-    $ speckle3d measure out/reconstruction.h5 --point 3,10,1 --point 3,12,9
+    $ speckle3d measure out --mode image --point 3,10,1 --point 3,12,9
     """
-    from speckle3d.io.load import kind_of
     from speckle3d.io.points import PICTURE, WORLD, parse_places, read_places
-    from speckle3d.io.reconstructions import FORMAT, read_reconstruction
+    from speckle3d.io.reconstructions import read_reconstruction
     from speckle3d.scoring.modes import default_mode
     from speckle3d.scoring.trajectories import poses_of
-    from speckle3d.study.pose_errors import PICKED, caution
+    from speckle3d.study.pose_errors import PICKING, caution
     from speckle3d.study.pose_errors import measure as measure_points
     from speckle3d.study.posed import pose_mark, require_made_at
     from speckle3d.study.reslices.cut_geometry import read_plane
 
     columns = WORLD if on is None else PICTURE
     places = read_places(points, columns) if points is not None else parse_places(point or [], columns)
-    if (kind := kind_of(reconstruction_file)) != FORMAT:
-        raise InvalidInputError(
-            f"{reconstruction_file}: expected reconstruction.h5 of a results folder, with its errors, "
-            f"got {kind}: `speckle3d reconstruct` makes one of a sweep"
-        )
-    made, why = read_reconstruction(reconstruction_file, with_pairs=False), ""
+    reconstruction, why = read_reconstruction(reconstruction_file, with_pairs=False), ""
     if on is not None:
-        shown = read_plane(on, mode)
-        require_made_at(shown.mark, pose_mark(poses_of(made, shown.mode)), str(on))
-        places, mode = shown.world_mm(places), shown.mode
+        plane = read_plane(on, mode)
+        require_made_at(plane.mark, pose_mark(poses_of(reconstruction, plane.mode)), str(on))
+        places, mode = plane.world_mm(places), plane.mode
     elif mode is None:
-        mode, why = default_mode(made)
-    picked = PICKED * made.grid.vector_pitch_mm if pick_mm is None else pick_mm
-    measured = measure_points(made, places, mode, picked)
-    notes(filter(None, (why, caution(made, mode))))
-    how = f"mode {mode}; points picked to {picked:.2g} mm per axis; +- a standard error, 95 % in brackets"
-    numbers = {"mode": mode, "pick_mm": picked, "measurements": [_plain(each) for each in measured]}
-    return numbers, "\n".join([*(each.line for each in measured), how])
+        mode, why = default_mode(reconstruction)
+    pick_mm = PICKING * reconstruction.grid.vector_pitch_mm if pick_mm is None else pick_mm
+    notes(filter(None, (why, caution(reconstruction, mode))))
+    measurements = measure_points(reconstruction, places, mode, pick_mm)
+    how = f"mode {mode}; points are picked to +- {1.96 * pick_mm:.2g} mm per axis; every +- is 95 %"
+    numbers = {"mode": mode, "pick_mm": pick_mm, "measurements": [_record(m) for m in measurements]}
+    return numbers, "\n".join([*(measurement.line for measurement in measurements), how])
 
 
-def _plain(measured: Measurement) -> dict[str, Any]:
+def _record(measurement: Measurement) -> dict[str, Any]:
     """A measurement as JSON has it, angles in degrees."""
-    scale, unit = measured.shown_in
+    scale, unit = measurement.shown_in
     numbers = {
-        "value": measured.value,
-        "standard_error": measured.sigma,
-        "by_poses": measured.pose_sigma,
-        "by_picking": measured.pick_sigma,
+        "value": measurement.value,
+        "standard_error": measurement.sigma,
+        "by_poses": measurement.pose_sigma,
+        "by_picking": measurement.pick_sigma,
     }
     return {
-        "kind": measured.kind,
-        "points": [number + 1 for number in measured.points],
+        "kind": measurement.kind,
+        "points": [number + 1 for number in measurement.points],
         **{name: value * scale for name, value in numbers.items()},
-        "interval_95": [end * scale for end in measured.interval],
+        "interval_95": [end * scale for end in measurement.interval],
         "unit": unit,
     }
 
@@ -157,27 +151,25 @@ def surface(
         surface_of,
         surfaces_of_labels,
     )
-    from speckle3d.io.hdf5 import require_suffix
-    from speckle3d.io.shapes.surfaces import SUFFIXES, write_surface
+    from speckle3d.io.shapes.surfaces import write_surface
     from speckle3d.io.voxels.volumes import read_states, read_volume
 
-    suffix = require_suffix(out, SUFFIXES)
     volume = read_volume(volume_file)
     errors = _errors(reconstruction, mode, volume, volume_file)
-    known = None if state is None else read_states(state, volume) != EMPTY
+    mask = None if state is None else read_states(state, volume) != EMPTY
     if level is not None:
-        surfaces = {out: surface_of(volume, level, "below" if below else "above", known)}
+        surfaces = {out: surface_of(volume, level, "below" if below else "above", mask)}
     else:
         by_label = surfaces_of_labels(volume).items()
-        surfaces = {out.with_name(f"{out.stem}-{label}{suffix}"): each for label, each in by_label}
+        surfaces = {out.with_stem(f"{out.stem}-{label}"): surface for label, surface in by_label}
         for place in surfaces:
             require_own_place(place, "surface")
     sizes = []
-    for place, rough in surfaces.items():
-        whole = largest_part(rough) if largest else rough
-        final = smooth_surface(whole, smooth) if smooth else whole
-        write_surface(place, final)
-        sizes.append(_sizes(place, final, *(errors or ())))
+    for place, mesh in surfaces.items():
+        mesh = largest_part(mesh) if largest else mesh
+        mesh = smooth_surface(mesh, smooth) if smooth else mesh
+        write_surface(place, mesh)
+        sizes.append(_sizes(place, mesh, *(errors or ())))
     return sizes, "\n".join(map(_line, sizes))
 
 
@@ -190,20 +182,21 @@ def _errors(
     from speckle3d.study.pose_errors import caution, errors_of
     from speckle3d.study.posed import MARK, pose_mark, require_made_at
 
-    made_at = volume.fields.get("poses", mode or "image")
-    if mode is not None and mode != made_at:
-        raise InvalidInputError(f"--mode: expected {made_at}, at whose poses VOLUME was made, got {mode}")
+    volume_mode = volume.fields.get("poses", mode or "image")
+    if mode is not None and mode != volume_mode:
+        raise InvalidInputError(f"--mode: expected {volume_mode}, at whose poses VOLUME was made, got {mode}")
     if path is None:
         return None
-    made = read_reconstruction(path, with_pairs=False)
-    require_made_at(volume.fields.get(MARK, ""), pose_mark(poses_of(made, made_at)), str(where))
-    if (words := caution(made, made_at)) is not None:
-        note(words)
-    return errors_of(made, made_at), made.grid
+    reconstruction = read_reconstruction(path, with_pairs=False)
+    with naming(f"{where}: made at the poses of {volume_mode}"):
+        poses = poses_of(reconstruction, volume_mode)
+    require_made_at(volume.fields.get(MARK, ""), pose_mark(poses), str(where))
+    notes(filter(None, [caution(reconstruction, volume_mode)]))
+    return errors_of(reconstruction, volume_mode), reconstruction.grid
 
 
 def _sizes(place: Path, surface: Surface, *errors: Any) -> dict[str, Any]:
-    """What is said of one surface."""
+    """Measures of one surface, by name."""
     from dataclasses import asdict
 
     import numpy as np

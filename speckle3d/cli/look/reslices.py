@@ -5,14 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from speckle3d.cli.common import MaybeNumber, MaybePath, MaybeText, Out
-from speckle3d.cli.look.volumes import Imported, Statement, open_sweep_at
+from speckle3d.cli.common import MaybeNumber, MaybePath, MaybePositive, MaybeText, Out, Positive
+from speckle3d.cli.look.volumes import ImportOptions, SweepOptions, open_sweep_at
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.progress import progress_bar
 
 if TYPE_CHECKING:
     from speckle3d.core.arrays import FloatArray
-    from speckle3d.study.posed import OpenedModes
+    from speckle3d.study.posed import SweepModes
 
 
 def reslice(
@@ -30,11 +30,11 @@ def reslice(
     curve: MaybePath = None,
     on: MaybePath = None,
     straight: bool = False,
-    pixel_mm: float = 0.2,
-    reach_mm: float = 0.5,
-    stated: Statement,
-    dynamic_range_db: MaybeNumber = None,
-    imported: Imported,
+    pixel_mm: Positive = 0.2,
+    reach_mm: Positive = 0.5,
+    choice: SweepOptions,
+    dynamic_range_db: MaybePositive = None,
+    recording: ImportOptions,
 ) -> None:
     """Cut a plane or along a curve, straight from the frames at the poses of one or more modes.
 
@@ -70,9 +70,9 @@ def reslice(
     straight
         Join the curve's points by straight lines, not by a spline.
     pixel_mm
-        Side of a pixel (0.2).
+        Side of a pixel.
     reach_mm
-        Frames farther from a pixel do not count (0.5).
+        Frames farther from a pixel do not count.
     dynamic_range_db
         Range of log-compressed grey levels (60).
     region, sweep_file, calibration, tracker_transform
@@ -82,45 +82,43 @@ def reslice(
     $ speckle3d reslice out/reconstruction.h5 -o cut.png --mode image --mode pose
     """
     from speckle3d.imaging.cuts.oblique import spanned_plane
-    from speckle3d.io.hdf5 import require_suffix
     from speckle3d.io.points import parse_places
-    from speckle3d.io.voxels.volume_writer import SUFFIXES, write_volume
+    from speckle3d.io.voxels.volume_writer import write_volume
     from speckle3d.study.figures import RANGE_DB
     from speckle3d.study.posed import at_modes
-    from speckle3d.study.reslices.cuts import cut_as_volume, cut_posed
+    from speckle3d.study.reslices.cuts import cut_as_volume, cut_at_modes
     from speckle3d.study.reslices.places import along_curve, along_sweep, in_frame, in_world
     from speckle3d.study.reslices.reslice_figures import save_reslices
 
-    is_picture = require_suffix(out, (".png", *SUFFIXES)) == ".png"
     plane = None
     if points is not None:
         corners = parse_places(points.split(), option="--points")
         if len(corners) != 3:
             raise InvalidInputError(f"--points: expected three, got {len(corners)}")
         plane = spanned_plane(corners[0], *(corners[1:] - corners[0]))
-    modes = mode[:1] if mode else [None]
-    (first,), part = open_sweep_at(modes, input_file, imported, stated, dynamic_range_db)
-    opened = at_modes(first, mode or (), difference_to)
+    first_mode = mode[:1] if mode else [None]
+    (first,), part = open_sweep_at(first_mode, input_file, recording, choice, dynamic_range_db)
+    modes = at_modes(first, mode or (), difference_to)
     range_db = dynamic_range_db or RANGE_DB
-    images, grid = opened.posed.images(range_db)
+    images, grid = modes.posed.images(range_db)
     if curve is not None:
-        points_mm = _curve(curve, on, opened)
-        place = along_curve(opened, grid, points_mm, down, not straight, pixel_mm)
+        points_mm = _curve(curve, on, modes)
+        place = along_curve(modes, grid, points_mm, down, not straight, pixel_mm)
     elif plane is not None:
-        place = in_world(opened, grid, plane, pixel_mm, reach_mm)
+        place = in_world(modes, grid, plane, pixel_mm, reach_mm)
     elif frame is not None:
-        place = in_frame(opened, grid, frame, angle_deg, lateral_mm, pixel_mm, reach_mm)
+        place = in_frame(modes, grid, frame, angle_deg, lateral_mm, pixel_mm, reach_mm)
     else:
-        place = along_sweep(opened, grid, lateral_mm, depth_mm, pixel_mm)
+        place = along_sweep(modes, grid, lateral_mm, depth_mm, pixel_mm)
     with progress_bar(f"reslicing {out.name}"):
-        picture = cut_posed(opened, place, range_db, (images, grid), part, reach_mm)
-    if is_picture:
+        picture = cut_at_modes(modes, place, range_db, (images, grid), part, reach_mm)
+    if out.suffix.lower() == ".png":
         save_reslices(picture, out)
     else:
         write_volume(out, cut_as_volume(picture))
 
 
-def _curve(path: Path, picture: Path | None, opened: OpenedModes) -> FloatArray:
+def _curve(path: Path, picture: Path | None, modes: SweepModes) -> FloatArray:
     """Points of a curve in the world, read as such or as points of a picture of the mode that is cut."""
     from speckle3d.io.points import PICTURE, WORLD, read_places
     from speckle3d.study.posed import require_made_at
@@ -128,6 +126,6 @@ def _curve(path: Path, picture: Path | None, opened: OpenedModes) -> FloatArray:
 
     if picture is None:
         return read_places(path, WORLD)
-    shown = read_plane(picture, opened.reference)
-    require_made_at(shown.mark, opened.marks[opened.reference], str(picture))
-    return shown.world_mm(read_places(path, PICTURE))
+    plane = read_plane(picture, modes.reference)
+    require_made_at(plane.mark, modes.marks[modes.reference], str(picture))
+    return plane.world_mm(read_places(path, PICTURE))

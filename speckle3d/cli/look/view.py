@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 import typer
 
 from speckle3d.cli.commands import Fields
-from speckle3d.cli.common import MaybeNumber, MaybePath, Written, note
+from speckle3d.cli.common import MaybeNumber, MaybePath, WritablePath, note
 from speckle3d.core.extras import require_extra
 
 _SETTINGS = "speckle3d.calibrating.settings"
@@ -22,7 +22,7 @@ def view(
     *,
     reconstruction: MaybePath = None,
     sweep_file: MaybePath = None,
-    record: Written = None,
+    record: WritablePath = None,
     calibrate: Literal["plane", "orientation", "wires"] | None = None,
     scan: Annotated[Any, Fields(f"{_SETTINGS}:WireSettings", _SCAN)],
     plane: Annotated[Any, Fields(f"{_SETTINGS}:OrientationSettings", ("sensor", "level"))],
@@ -84,18 +84,18 @@ def view(
     with ExitStack() as running:
         if calibrate is None:
             column_mm, row_mm = scan.pixel_mm or (None, None)
-            stated = {"column_pitch_mm": column_mm, "row_spacing_mm": row_mm}
-            settings = validated(
-                stated | {"dynamic_range_db": dynamic_range_db},
-                "--pixel-mm, --dynamic-range-db",
-                ImportSettings,
-            )
+            values = {
+                "column_pitch_mm": column_mm,
+                "row_spacing_mm": row_mm,
+                "dynamic_range_db": dynamic_range_db,
+            }
+            settings = validated(values, "--pixel-mm, --dynamic-range-db", ImportSettings)
             pages = running.enter_context(
                 open_pages(file, record, reconstruction=reconstruction, sweep=sweep_file, settings=settings)
             )
         else:
-            chosen = scan.model_dump(exclude_unset=True) | plane.model_dump(exclude_unset=True)
-            page = PhantomPage(file, validated(chosen, f"--calibrate {calibrate}", model_of(calibrate)))
+            values = scan.model_dump(exclude_unset=True) | plane.model_dump(exclude_unset=True)
+            page = PhantomPage(file, validated(values, f"--calibrate {calibrate}", model_of(calibrate)))
             pages = [page]
         server = AppServer(pages, file.name, port)
         note(server.address)

@@ -15,7 +15,7 @@ from speckle3d.cli.common import (
     MaybeText,
     Out,
     Result,
-    Written,
+    WritablePath,
     load_settings,
     note,
     notes,
@@ -36,42 +36,42 @@ _IMPORTED = (
     "row_spacing_mm",
     "frame_rate_hz",
 )
-Imported = Annotated[Any, Fields("speckle3d.io.import_settings:ImportSettings", _IMPORTED)]
+ImportOptions = Annotated[Any, Fields("speckle3d.io.import_settings:ImportSettings", _IMPORTED)]
 """Options of what a recording does not say; the range of its grey levels is that of the levels made."""
 _SETTINGS = "speckle3d.imaging.voxels.settings:CompoundingSettings"
 _SCENE = ("voxel_mm", "splat", "rule", "fill_radius", "dynamic_range_db")
 
 
 @dataclass(frozen=True)
-class Stated:
-    """What options say of a sweep at poses, and of what counts of it."""
+class SweepChoice:
+    """Options of a sweep at poses: which file, with which calibrations, and what part of its images."""
 
     region: str | None = None
     sweep_file: Path | None = None
     calibration: list[Path] | None = None
 
 
-Statement = Annotated[Any, Fields("speckle3d.cli.look.volumes:Stated")]
+SweepOptions = Annotated[Any, Fields("speckle3d.cli.look.volumes:SweepChoice")]
 
 
 def compounding_settings(config_file: Path | None, options: CompoundingSettings) -> CompoundingSettings:
     """Group `volume` of a configuration, with the options that were given in its place."""
     from speckle3d.io.toml import validated
 
-    base, stated = load_settings(config_file).volume, options.model_dump(exclude_unset=True)
-    return validated(base.model_dump() | stated, "volume", type(base))
+    base, values = load_settings(config_file).volume, options.model_dump(exclude_unset=True)
+    return validated(base.model_dump() | values, "volume", type(base))
 
 
 def open_sweep_at(
     modes: Sequence[str | None],
     source: Path,
-    imported: ImportSettings,
-    stated: Stated,
+    settings: ImportSettings,
+    choice: SweepChoice,
     range_db: float | None,
 ) -> tuple[list[PosedSweep], Region | None]:
-    """Open a sweep at the poses of each mode (None: the best), and say on stderr which frames have none.
+    """Open a sweep at the poses of each mode (None: the best), and note on stderr which frames have none.
 
-    Of a recording it is told what was assumed of its images; nothing where a calibration gives its pixels.
+    Of a recording what was assumed of its images is noted, unless a calibration gives its pixels.
     The second result is the part of the images that counts: as asked for, else that to which a device set of
     PLUS clips volumes.
     """
@@ -81,21 +81,20 @@ def open_sweep_at(
     from speckle3d.io.load import open_recording
     from speckle3d.study.posed import open_posed
 
-    require_unsaid(source, imported)
-    more = stated.sweep_file, imported, stated.calibration or (), range_db
-    opened = [open_posed(source, mode, *more) for mode in modes]
-    if opened[0].reconstruction is None:
+    require_unsaid(source, settings)
+    options = choice.sweep_file, settings, choice.calibration or (), range_db
+    sweeps = [open_posed(source, mode, *options) for mode in modes]
+    first = sweeps[0]
+    if first.reconstruction is None:
         # Grey levels as stored need no dynamic range.
-        ranged = imported.model_copy(update={"dynamic_range_db": 60.0})
+        with_range = settings.model_copy(update={"dynamic_range_db": 60.0})
         with suppress(MissingSettingsError):
-            notes(
-                line for line in open_recording(source, ranged).notes if not line.startswith("dynamic range")
-            )
-    notes(opened[0].notes())
-    region = stated.region or clip_of(
-        settings_for(source, imported).plus_config, opened[0].sweep.grid, opened[0].skew_rad
-    )
-    return opened, None if region is None else Region(region)
+            recording = open_recording(source, with_range)
+            notes(line for line in recording.notes if not line.startswith("dynamic range"))
+    notes(first.notes())
+    clip = clip_of(settings_for(source, settings).plus_config, first.sweep.grid, first.skew_rad)
+    region = choice.region or clip
+    return sweeps, None if region is None else Region(region)
 
 
 def volume(
@@ -105,10 +104,10 @@ def volume(
     mode: MaybeText = None,
     settings: Annotated[Any, Fields(_SETTINGS)],
     grid: Annotated[Any, Fields("speckle3d.study.scenes.voxels:GridRequest")],
-    stated: Statement,
-    state: Annotated[Written, "volume"] = None,
-    deviation: Annotated[Written, "volume"] = None,
-    imported: Imported,
+    choice: SweepOptions,
+    state: Annotated[WritablePath, "volume labels"] = None,
+    deviation: Annotated[WritablePath, "volume"] = None,
+    recording: ImportOptions,
     config_file: MaybePath = None,
 ) -> Result:
     """Compound the frames into voxels, at the poses of one mode or of the recording itself.
@@ -161,15 +160,14 @@ def volume(
     from speckle3d.study.pose_errors import caution
     from speckle3d.study.scenes.voxels import VolumeRequest, write_voxels
 
-    checked = compounding_settings(config_file, settings)
+    compounding = compounding_settings(config_file, settings)
     range_db = settings.model_dump(exclude_unset=True).get("dynamic_range_db")
-    (posed,), part = open_sweep_at([mode], input_file, imported, stated, range_db)
-    request = VolumeRequest(checked, grid, part)
+    (posed,), part = open_sweep_at([mode], input_file, recording, choice, range_db)
+    request = VolumeRequest(compounding, grid, part)
     with progress_bar(f"compounding {out.name}"):
         report = write_voxels(posed, request, out, state, deviation)
-    made = posed.reconstruction
-    if deviation is not None and made is not None and (words := caution(made, posed.mode)) is not None:
-        note(words)
+    if deviation is not None and posed.reconstruction is not None:
+        notes(filter(None, [caution(posed.reconstruction, posed.mode)]))
     note(report.line)
     return report.summary(), ""
 
@@ -182,8 +180,8 @@ def scene(
     images: bool = False,
     deviation: bool = False,
     settings: Annotated[Any, Fields(_SETTINGS, _SCENE)],
-    stated: Statement,
-    imported: Imported,
+    choice: SweepOptions,
+    recording: ImportOptions,
     config_file: MaybePath = None,
 ) -> None:
     """Write a folder that opens in 3D Slicer: volumes, labels of voxels, outlines and poses of frames.
@@ -212,12 +210,13 @@ def scene(
     from speckle3d.study.scenes.scene import require_scene_place, write_scene
     from speckle3d.study.scenes.voxels import VolumeRequest
 
-    require_scene_place(out, input_file, stated.sweep_file, *(stated.calibration or ()))
-    checked = compounding_settings(config_file, settings)
+    require_scene_place(out, input_file, choice.sweep_file, *(choice.calibration or ()))
+    compounding = compounding_settings(config_file, settings)
     range_db = settings.model_dump(exclude_unset=True).get("dynamic_range_db")
-    posed, part = open_sweep_at(mode or [None], input_file, imported, stated, range_db)
-    request = VolumeRequest(checked, region=part)
+    modes = list(dict.fromkeys(mode)) if mode else [None]
+    sweeps, part = open_sweep_at(modes, input_file, recording, choice, range_db)
+    request = VolumeRequest(compounding, region=part)
     with progress_bar(f"writing {out.name}") as progress:
-        reports = write_scene(out, posed, request, images, deviation, progress)
+        reports = write_scene(out, sweeps, request, images, deviation, progress)
     for report in reports:
         note(report.line)

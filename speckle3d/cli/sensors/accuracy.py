@@ -12,11 +12,11 @@ from speckle3d.cli.common import (
     MaybePath,
     Paths,
     Result,
-    Written,
+    WritablePath,
     note,
     rows_of,
 )
-from speckle3d.cli.sensors.imu import Method, World, orientation_of, read, tell
+from speckle3d.cli.sensors.imu import Method, World, note_gaps, orientation_of, read
 from speckle3d.core.errors import naming
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ def accuracy(
     time_offset_s: float = 0.0,
     method: Method = "smoother",
     magnetometer: bool = True,
-    figure: Annotated[Written, "picture"] = None,
+    figure: Annotated[WritablePath, "picture"] = None,
     rate_hz: MaybeNumber = None,
     world: World = None,
 ) -> Result:
@@ -60,11 +60,11 @@ def accuracy(
     Other Parameters
     ----------------
     turns
-        The mechanism's axes from its base to the probe.
+        With --reference: the mechanism's axes from its base to the probe.
     fit_mounting
-        The target's axes on the probe: found from the motion, or those of the image.
+        With --optical: the target's axes on the probe: found from the motion, or those of the image.
     time_offset_s
-        A reading of the sensor at t belongs to the tracker's time t + this.
+        With --optical: a reading of the sensor at t belongs to the tracker's time t + this.
     magnetometer, rate_hz, world
 
     Examples
@@ -80,20 +80,20 @@ def accuracy(
     from xsens.accuracy.mechanism import read_mechanism_csv, readings_at
 
     log = read(log_file, rate_hz, world)
-    tell(log)
+    note_gaps(log)
     mountings = Rotation.identity(1)
     if calibration:
         mountings = Rotation.concatenate([read_calibration(path).rotation for path in calibration])
     else:
         note("no --calibration: the sensor's axes are taken for the image's")
+    mechanism = None if reference is None else read_mechanism_csv(reference, turns)
     with naming(str(log_file)):
         rotations, _ = orientation_of(log, method, magnetometer)
-        if reference is not None:
-            settings = read_mechanism_csv(reference, turns)
-            measured, right = readings_at(rotations, settings), settings.base_from_image
+        if mechanism is not None:
+            readings, truth = readings_at(rotations, mechanism), mechanism.base_from_image
         elif optical is not None:
-            measured, right = _beside_tracker(rotations, optical, time_offset_s, fit_mounting, mountings)
-        errors = pair_errors(measured, right, mountings)
+            readings, truth = _beside_tracker(rotations, optical, time_offset_s, fit_mounting, mountings)
+        errors = pair_errors(readings, truth, mountings)
     table = AccuracyTable.of({log_file.stem: errors})
     if figure is not None:
         save_figure(figure_turns({log_file.stem: errors}, log_file.name), figure)
@@ -111,13 +111,13 @@ def _beside_tracker(
 
     if is_tum(optical):
         poses = read_tum(optical)
-        tracked = TimedRotations(poses.time_s, poses.world_from_sensor.rotation)
+        target_stream = TimedRotations(poses.time_s, poses.world_from_sensor.rotation)
     else:
         log = read(optical)
-        tell(log)
-        tracked = log.rotations()
-    measured, target = common_readings(rotations, tracked, time_offset_s)
+        note_gaps(log)
+        target_stream = log.rotations()
+    readings, target = common_readings(rotations, target_stream, time_offset_s)
     if not fit_mounting:
-        return measured, target
+        return readings, target
     note("the target's mounting is found from the motion: constant errors of calibration do not show")
-    return measured, target * mounting_from_motion(measured * mountings.mean(), target)
+    return readings, target * mounting_from_motion(readings * mountings.mean(), target)

@@ -12,6 +12,7 @@ from speckle3d.cli.commands import Fields
 from speckle3d.cli.common import (
     MaybeNumber,
     MaybePath,
+    MaybePositive,
     OptionalOut,
     OutArgument,
     Result,
@@ -36,22 +37,22 @@ def read(path: Path, rate_hz: float | None = None, world: str | None = None) -> 
     from xsens.logs.parts import Hints
     from xsens.logs.read import read_log
 
-    held = held_log(path)
-    if held is None:
+    log = held_log(path)
+    if log is None:
         return read_log(path, Hints(rate_hz=rate_hz, world=world))
     if rate_hz is not None or world is not None:
         flag = "--world" if rate_hz is None else "--rate-hz"
         raise InvalidInputError(f"{flag}: expected a log with it, got {path.name}, which says it itself")
-    return held
+    return log
 
 
-def tell(log: ImuLog) -> None:
+def note_gaps(log: ImuLog) -> None:
     """Report on stderr what a log lacks, and what was assumed in its place."""
     notes([*log.notes, *other_unit(log)])
     if log.gaps:
         longest = max(gap.duration_s for gap in log.gaps)
-        lost = f"{log.lost} samples lost in {len(log.gaps)} gaps" if log.lost else f"{len(log.gaps)} pauses"
-        note(f"{lost}, the longest of {longest:.3f} s; nothing filled in")
+        text = f"{log.lost} samples lost in {len(log.gaps)} gaps" if log.lost else f"{len(log.gaps)} pauses"
+        note(f"{text}, the longest of {longest:.3f} s; nothing filled in")
 
 
 def other_unit(log: ImuLog) -> list[str]:
@@ -71,7 +72,7 @@ def other_unit(log: ImuLog) -> list[str]:
 def orientation_of(
     log: ImuLog, method: Method, magnetometer: bool
 ) -> tuple[TimedRotations, Orientation | None]:
-    """Find the orientation of a log; the second result is None for the sensor's own orientation."""
+    """Orientation of a log, and how it was estimated; None for the sensor's own."""
     from xsens.logs.contradictions import contradictions
 
     readings = log.gyroscope_rad_s is not None or log.accelerometer_m_s2 is not None
@@ -85,12 +86,12 @@ def orientation_of(
                 f"{against['own orientation']} The accelerometer agrees with the gyroscope"
             )
         return log.rotations(), None
-    from xsens.fusion.orient import orient
+    from xsens.fusion.orient import orient as estimate
     from xsens.fusion.settings import FusionSettings
 
-    found = orient(log, FusionSettings(use_magnetometer=magnetometer), method)
-    notes(found.notes)
-    return found.rotations, found
+    orientation = estimate(log, FusionSettings(use_magnetometer=magnetometer), method)
+    notes(orientation.notes)
+    return orientation.rotations, orientation
 
 
 def info(log_file: Path, rate_hz: MaybeNumber = None, world: World = None) -> Result:
@@ -121,12 +122,12 @@ def info(log_file: Path, rate_hz: MaybeNumber = None, world: World = None) -> Re
         ("own orientation", str(int(log.oriented.sum())), "samples"),
     ]
     for name, unit in zip(INERTIAL, ("m/s^2", "rad/s", "a.u."), strict=True):
-        values, spoken = getattr(log, name), name.split("_")[0]
+        values, noun = getattr(log, name), name.split("_")[0]
         if values is None or np.isnan(values).all():
-            rows.append((spoken, "none", ""))
+            rows.append((noun, "none", ""))
         else:
             norm = np.nanmedian(np.linalg.norm(values, axis=1))
-            rows.append((f"{spoken}, median norm", f"{norm:.4f}", unit))
+            rows.append((f"{noun}, median norm", f"{norm:.4f}", unit))
     notes = [*log.notes, *filter(None, contradictions(log).values()), *other_unit(log)]
     return rows_of([*rows, *(("note", text, "") for text in notes)])
 
@@ -151,7 +152,7 @@ def convert(
 
     log = read(log_file, rate_hz, world)
     write_csv(out, log)
-    tell(log)
+    note_gaps(log)
 
 
 def orient(
@@ -203,32 +204,33 @@ def orient(
         raise InvalidInputError(
             f"{into}: expected no orientation sensor's stream, got one: --replace replaces it"
         )
-    own = ridden_along(log_file)
+    sensor = ridden_along(log_file)
     log = read(log_file, rate_hz, world)
     with naming(str(log_file)):
-        rotations, found = orientation_of(log, method, magnetometer)
+        rotations, orientation = orientation_of(log, method, magnetometer)
     if into is not None:
         # As options say, else the calibration, else the sweep that the log is from.
-        known = None if calibration is None else read_calibration(calibration)
-        mounting = None if own is None else own.sensor_from_image
-        stated = [time_offset_s, *(source.time_offset_s for source in (known, own) if source is not None)]
-        offset_s = next((value for value in stated if value is not None), 0.0)
-        mounting = mounting if known is None else known.rotation
-        covered = attach_log(into, log, rotations, mounting, offset_s, replace_stream)
-        note(f"orientation of {len(rotations)} samples in {into}{covered}")
+        file = None if calibration is None else read_calibration(calibration)
+        mounting = None if sensor is None else sensor.sensor_from_image
+        offsets = [time_offset_s, *(source.time_offset_s for source in (file, sensor) if source is not None)]
+        offset_s = next((value for value in offsets if value is not None), 0.0)
+        mounting = mounting if file is None else file.rotation
+        coverage = attach_log(into, log, rotations, mounting, offset_s, replace_stream)
+        note(f"orientation of {len(rotations)} samples in {into}{coverage}")
     if out is not None:
         write_csv(out, with_orientation(log, rotations))
-    tell(log)
-    rows = _orientation_rows(log, "sensor" if found is None else method, rotations, found)
-    shown = [(name, v if isinstance(v, str) else f"{v:.5g}", unit) for name, v, unit in rows]
-    return {name: value for name, value, _ in rows}, rows_of(shown)[1]
+    note_gaps(log)
+    name = "sensor" if orientation is None else method
+    rows = _orientation_rows(log, name, rotations, orientation)
+    lines = [(key, v if isinstance(v, str) else f"{v:.5g}", unit) for key, v, unit in rows]
+    return {key: value for key, value, _ in rows}, rows_of(lines)[1]
 
 
 def record(
     port: str,
     out: OutArgument,
     settings: Annotated[Any, Fields("xsens.live.device:DeviceSettings")],
-    duration_s: MaybeNumber = None,
+    duration_s: MaybePositive = None,
     append: bool = False,
 ) -> None:
     """Record a sensor on a serial port; every byte is in the file as soon as it has come.
@@ -277,7 +279,7 @@ def record(
 
 
 def _orientation_rows(
-    log: ImuLog, method: str, rotations: TimedRotations, found: Orientation | None
+    log: ImuLog, method: str, rotations: TimedRotations, orientation: Orientation | None
 ) -> list[tuple[str, float | str, str]]:
     import numpy as np
 
@@ -286,13 +288,15 @@ def _orientation_rows(
         ("samples", float(len(rotations)), ""),
         ("duration", log.duration_s, "s"),
     ]
-    if found is None:
+    if orientation is None:
         return rows
-    sigma = np.rad2deg(found.standard_deviation_rad)
+    sigma = np.rad2deg(orientation.standard_deviation_rad)
     inclination = np.linalg.norm(sigma[:, :2], axis=1) / np.sqrt(2.0)
-    of = "heading" if found.magnetic else "heading relative to the start"
-    for name, values in (("inclination", inclination), (of, sigma[:, 2])):
+    heading = "heading" if orientation.magnetic else "heading relative to the start"
+    for name, values in (("inclination", inclination), (heading, sigma[:, 2])):
         rows.append((f"{name}, standard deviation, median", float(np.median(values)), "deg"))
-    if found.magnetic:
-        rows.append(("magnetic field disturbed", 100.0 * float(np.mean(found.disturbed)), "% of samples"))
+    if orientation.magnetic:
+        rows.append(
+            ("magnetic field disturbed", 100.0 * float(np.mean(orientation.disturbed)), "% of samples")
+        )
     return rows

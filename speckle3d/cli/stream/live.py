@@ -24,7 +24,7 @@ from speckle3d.cli.common import (
     note,
 )
 from speckle3d.cli.reconstruction import reconstruct
-from speckle3d.cli.signals import ENDS, handled
+from speckle3d.cli.signals import ENDS, handle_signals
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.extras import require_extra
 from speckle3d.core.printable import printable
@@ -241,7 +241,7 @@ def _run(session: Session, duration_s: float | None, connection: Connection, nam
 
     interval_s = sys.getswitchinterval()
     sys.setswitchinterval(_SWITCH_S)
-    with handled(end, *ENDS), Live(console=console, transient=True) as line:
+    with handle_signals(end, *ENDS), Live(console=console, transient=True) as line:
         try:
             session.run(duration_s, show)
         finally:

@@ -58,13 +58,13 @@ class Measurement:
 
     @property
     def line(self) -> str:
-        """The value with its standard error, its 95 % interval, and what the error is made of."""
+        """The value and the half width of its 95 % interval, by poses and by picking."""
         scale, unit = self.shown_in
-        low, high = (end * scale for end in self.interval)
         numbers = " ".join(str(number + 1) for number in self.points)
-        errors = f"poses {self.pose_sigma * scale:.2f}, picking {self.pick_sigma * scale:.2f}"
-        value, sigma = self.value * scale, self.sigma * scale
-        return f"{self.kind} {numbers}: {value:.2f} +- {sigma:.2f} {unit} [{low:.2f}, {high:.2f}] ({errors})"
+        sigmas = (self.sigma, self.pose_sigma, self.pick_sigma)
+        half, by_poses, by_picking = (f"{NORMAL_95 * scale * sigma:.2f}" for sigma in sigmas)
+        errors = f"95 %; poses {by_poses}, picking {by_picking}"
+        return f"{self.kind} {numbers}: {self.value * scale:.2f} +- {half} {unit} ({errors})"
 
 
 def measure_points(

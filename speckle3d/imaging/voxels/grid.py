@@ -106,7 +106,7 @@ def grid_around(
 def spacing_within(
     grid: ImageGrid,
     world_from_image: RigidTransform,
-    max_gb: float,
+    within_gb: float,
     world_from_axes: Rotation | None = None,
     voxel_type: VoxelType = "uint8",
     origin_mm: npt.ArrayLike | None = None,
@@ -121,7 +121,7 @@ def spacing_within(
     ----------
     grid, world_from_image, world_from_axes, origin_mm, size_mm
         As of `grid_around`.
-    max_gb : float
+    within_gb : float
         Of the voxels: what a file, unpacked, and a viewer hold.
     voxel_type : {"uint8", "int16", "uint16", "float32"}
 
@@ -133,11 +133,11 @@ def spacing_within(
     Raises
     ------
     InvalidInputError
-        If `max_gb` is not enough for any spacing up to 800 mm, or there are no poses.
+        If `within_gb` is not enough for any spacing up to 800 mm, or there are no poses.
 
     Examples
     --------
-    >>> spacing_within(ImageGrid(400, 400, 0.1, 0.1), RigidTransform.identity(1), max_gb=1e-4)
+    >>> spacing_within(ImageGrid(400, 400, 0.1, 0.1), RigidTransform.identity(1), within_gb=1e-4)
     0.15
     """
     finest = min(grid.vector_pitch_mm, grid.sample_spacing_mm) * (1 - 1e-9)
@@ -145,9 +145,9 @@ def spacing_within(
     for spacing in (float(f"{step}e{power}") for power in range(-6, 3) for step in _ROUND_SPACINGS):
         if spacing >= finest:
             place = grid, world_from_image, spacing, world_from_axes
-            if grid_around(*place, origin_mm=origin_mm, size_mm=size_mm).size_gb(voxel_type) <= max_gb:
+            if grid_around(*place, origin_mm=origin_mm, size_mm=size_mm).size_gb(voxel_type) <= within_gb:
                 return spacing
-    raise InvalidInputError(f"max_gb: expected enough for some voxels, got {max_gb:g} GB")
+    raise InvalidInputError(f"within_gb: expected enough for some voxels, got {within_gb:g} GB")
 
 
 def _three(values: npt.ArrayLike, name: str, above: float = 0.0) -> list[float]:

@@ -73,7 +73,8 @@ def read_plane(path: PathLike, mode: str | None = None) -> PicturedPlane:
     try:
         with reading(path), open_regular(path) as stream:
             text = dict(getattr(Image.open(stream, formats=["PNG"]), "text", {}))
-        planes = [_plane(each) for each in json.loads(text[KEYWORD])["cuts"] if each["kind"] == "plane"]
+        cuts = json.loads(text[KEYWORD])["cuts"]
+        planes = [_plane(cut) for cut in cuts if cut["kind"] == "plane"]
     except (UnidentifiedImageError, SyntaxError, KeyError, TypeError, ValueError, RecursionError) as error:
         raise InvalidInputError(
             f"{path}: expected a PNG that `speckle3d reslice` wrote, got another or a damaged one"
@@ -81,11 +82,12 @@ def read_plane(path: PathLike, mode: str | None = None) -> PicturedPlane:
     for plane in planes:
         if mode in (None, plane.mode):
             return plane
-    modes = ", ".join(each.mode for each in planes) or "none"
+    modes = ", ".join(plane.mode for plane in planes) or "none"
     raise InvalidInputError(f"{path}: expected a plane of mode {mode!r}, got {modes}")
 
 
 def _plane(record: Any) -> PicturedPlane:
-    (placed,) = transforms_from_matrices([record["world_from_plane"]], KEYWORD)
-    begin = RigidTransform.from_translation([*np.negative(record["first_mm"]), 0.0])
-    return PicturedPlane(str(record["mode"]), str(record.get("mark", "")), placed * begin)
+    (world_from_plane,) = transforms_from_matrices([record["world_from_plane"]], KEYWORD)
+    plane_from_picture = RigidTransform.from_translation([*np.negative(record["first_mm"]), 0.0])
+    mark = str(record.get("mark", ""))
+    return PicturedPlane(str(record["mode"]), mark, world_from_plane * plane_from_picture)

@@ -20,7 +20,7 @@ from speckle3d.imaging.images import Images
 from speckle3d.scoring.lengths import ModeError
 from speckle3d.scoring.references import Reference, error_rows
 from speckle3d.study.figures import RANGE_DB
-from speckle3d.study.posed import OpenedModes
+from speckle3d.study.posed import SweepModes
 from speckle3d.study.reslices.places import REACH_MM, AnyCut, Place
 
 
@@ -65,7 +65,7 @@ class CutPicture:
     marks : mapping of str to str
         Of the poses of each mode, by `pose_mark`.
     lengths : mapping of str to str
-        How long each mode is, in words.
+        Length of each mode, in words.
     """
 
     cuts: Mapping[str, DrawnCut]
@@ -78,11 +78,11 @@ class CutPicture:
     lengths: Mapping[str, str] = field(default_factory=dict)
 
 
-def cut_posed(
-    opened: OpenedModes,
+def cut_at_modes(
+    modes: SweepModes,
     place: Place,
     dynamic_range_db: float = RANGE_DB,
-    made: tuple[Images, ImageGrid] | None = None,
+    source: tuple[Images, ImageGrid] | None = None,
     region: Region | None = None,
     reach_mm: float = REACH_MM,
 ) -> CutPicture:
@@ -90,12 +90,12 @@ def cut_posed(
 
     Parameters
     ----------
-    opened : OpenedModes
+    modes : SweepModes
     place : Place
         Of these modes.
     dynamic_range_db : float
-    made : tuple of Images and ImageGrid, optional
-        What `opened.posed.images` gives, by those who have it.
+    source : tuple of Images and ImageGrid, optional
+        As `modes.posed.images` gives them, where they are at hand.
     region : Region, optional
         Of the images; samples outside it do not count.
     reach_mm : float
@@ -106,26 +106,27 @@ def cut_posed(
     InvalidInputError
         If the cut shows nothing.
     """
-    images, grid = made or opened.posed.images(dynamic_range_db)
-    poses, there = opened.poses, opened.poses[opened.reference]
+    images, grid = source or modes.posed.images(dynamic_range_db)
+    poses = modes.poses
     unit, limits = "dB, 0: maximum", (-dynamic_range_db, 0.0)
     mask = None if region is None else region.mask(grid)
     levels = reslice_at(
         images, grid, [(poses[mode], cut) for mode, cut in place.cuts.items()], reach_mm, mask
     )
-    if opened.posed.range_is_known:
-        levels = [((each - 255) * (dynamic_range_db / 255)).astype(np.float32) for each in levels]
+    if modes.posed.has_range:
+        levels = [((image - 255) * (dynamic_range_db / 255)).astype(np.float32) for image in levels]
     else:
-        unit, limits = "level", (0.0, getattr(opened.posed.sweep.signal, "full_scale", 255.0))
-    if not any(np.isfinite(each).any() for each in levels):
+        unit, limits = "level", (0.0, getattr(modes.posed.sweep.signal, "full_scale", 255.0))
+    if not any(np.isfinite(image).any() for image in levels):
         raise InvalidInputError("cut: expected one that meets the sweep, got one that shows nothing")
     cuts = {
         mode: DrawnCut(image, cut, frame_lines(cut, grid, poses[mode]))
         for (mode, cut), image in zip(place.cuts.items(), levels, strict=True)
     }
-    rows = error_rows(poses, Reference.over_all(opened.reference, there), grid.centre_mm)
-    lengths, name = length_words(rows, opened.reference), opened.posed.sweep.name
-    return CutPicture(cuts, place.axes, place.words, unit, limits, name, opened.marks, lengths)
+    reference = Reference.over_all(modes.reference, poses[modes.reference])
+    lengths = length_words(error_rows(poses, reference, grid.centre_mm), modes.reference)
+    name = modes.posed.sweep.name
+    return CutPicture(cuts, place.axes, place.words, unit, limits, name, modes.marks, lengths)
 
 
 def frame_lines(cut: AnyCut, grid: ImageGrid, world_from_image: RigidTransform) -> FloatArray:
@@ -137,7 +138,7 @@ def frame_lines(cut: AnyCut, grid: ImageGrid, world_from_image: RigidTransform) 
 
 
 def length_words(rows: Sequence[ModeError], reference: str) -> dict[str, str]:
-    """How long each mode is by its rows, and how far from the reference; of all parts of the sweep."""
+    """Length of each mode, part by part, and its error in per cent, in words."""
     words: dict[str, dict[str, str]] = {}
     for row in rows:
         percent = "" if np.isnan(row.length_error_percent) else f" {row.length_error_percent:+.1f} %"
@@ -158,13 +159,13 @@ def cut_as_volume(picture: CutPicture) -> Volume:
     """
     if len(picture.cuts) > 1:
         raise InvalidInputError(f"expected one mode for a volume file, got {', '.join(picture.cuts)}")
-    ((mode, drawn),) = picture.cuts.items()
-    if isinstance(drawn.cut, CurvedSheet):
+    ((mode, panel),) = picture.cuts.items()
+    if isinstance(panel.cut, CurvedSheet):
         raise InvalidInputError("expected a picture (.png) of a curved cut, which lies in no one plane")
     low, high = picture.levels
-    level = 1 + np.rint(254 * np.clip((drawn.image - low) / (high - low), 0, 1))
+    level = 1 + np.rint(254 * np.clip((panel.image - low) / (high - low), 0, 1))
     fields = {"cut": picture.place, "of": picture.name, "mode": mode}
     unit = picture.unit.partition(",")[0]
     fields["levels"] = f"1 to 255: {low:g} to {high:g} {unit}; 0 where nothing was seen"
     voxels = np.nan_to_num(level, nan=0.0).astype(np.uint8)
-    return Volume(voxels[None].T, (drawn.cut.pixel_mm,) * 3, drawn.cut.world_from_plane, fields)
+    return Volume(voxels[None].T, (panel.cut.pixel_mm,) * 3, panel.cut.world_from_plane, fields)

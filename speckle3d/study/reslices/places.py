@@ -21,7 +21,7 @@ from speckle3d.imaging.cuts.planes import (
     lateral_line,
     planes_from_first_frame,
 )
-from speckle3d.study.posed import OpenedModes
+from speckle3d.study.posed import SweepModes
 
 AnyCut = ReslicePlane | CurvedSheet
 Vector = FloatArray | tuple[float, float, float]
@@ -56,7 +56,7 @@ class Place:
 
 
 def along_sweep(
-    opened: OpenedModes,
+    modes: SweepModes,
     grid: ImageGrid,
     lateral_mm: float | None = None,
     depth_mm: float | None = None,
@@ -70,12 +70,12 @@ def along_sweep(
     line, across, words = lateral_line(grid, lateral_mm), "depth", f"at lateral {lateral_mm:.4g} mm"
     if depth_mm is not None:
         line, across, words = depth_line(grid, depth_mm), "lateral", f"at depth {depth_mm:g} mm"
-    planes = planes_from_first_frame(opened.poses, line, pixel_mm, _LARGEST_MM)
+    planes = planes_from_first_frame(modes.poses, line, pixel_mm, _LARGEST_MM)
     return Place(planes, ("along the sweep", across), words)
 
 
 def in_frame(
-    opened: OpenedModes,
+    modes: SweepModes,
     grid: ImageGrid,
     frame: int,
     angle_deg: float = 0.0,
@@ -90,36 +90,36 @@ def in_frame(
     InvalidInputError
         If the frame has no pose.
     """
-    numbers, there = opened.posed.frames, opened.poses[opened.reference]
-    at = np.flatnonzero(numbers == frame)
-    if not at.size:
+    numbers, poses = modes.posed.frames, modes.poses[modes.reference]
+    if frame not in numbers:
         raise InvalidInputError(
             f"--frame: expected one with a pose, of {numbers[0]} to {numbers[-1]}, got {frame}"
         )
+    index = int(np.searchsorted(numbers, frame))
     lateral = float(grid.extent_mm[:, 0].mean()) if lateral_mm is None else lateral_mm
-    placed = turned_frame_plane(there[at[0]], lateral_line(grid, lateral)[0, 0], angle_deg)
-    plane = covering_plane(placed, grid, there, reach_mm, pixel_mm)
+    world_from_plane = turned_frame_plane(poses[index], lateral_line(grid, lateral)[0, 0], angle_deg)
+    plane = covering_plane(world_from_plane, grid, poses, reach_mm, pixel_mm)
     # In a frame itself x counts from the first vector.
     left = 0.0 if angle_deg else lateral
     plane = replace(plane, first_mm=(plane.first_mm[0] + left, plane.first_mm[1]))
-    turned = f", turned by {angle_deg:g}°" if angle_deg else ""
-    return _carried(opened, plane, f"plane of frame {frame}{turned}", at[0])
+    turn = f", turned by {angle_deg:g}°" if angle_deg else ""
+    return _move_to_modes(modes, plane, f"plane of frame {frame}{turn}", index)
 
 
 def in_world(
-    opened: OpenedModes,
+    modes: SweepModes,
     grid: ImageGrid,
     plane: RigidTransform,
     pixel_mm: float,
     reach_mm: float,
 ) -> Place:
     """Cut in a plane of the reference's world: x and y of the picture are its own."""
-    cut = covering_plane(plane, grid, opened.poses[opened.reference], reach_mm, pixel_mm)
-    return _carried(opened, cut, f"plane from {vector_words(plane.translation)} mm")
+    cut = covering_plane(plane, grid, modes.poses[modes.reference], reach_mm, pixel_mm)
+    return _move_to_modes(modes, cut, f"plane from {vector_words(plane.translation)} mm")
 
 
 def along_curve(
-    opened: OpenedModes,
+    modes: SweepModes,
     grid: ImageGrid,
     curve_mm: FloatArray,
     down: Vector | None = None,
@@ -135,7 +135,7 @@ def along_curve(
     smooth : bool
         Join the points by a spline.
     """
-    poses = opened.poses[opened.reference]
+    poses = modes.poses[modes.reference]
     axis = np.asarray(_mean_directions(poses)[1] if down is None else down)
     # As far along its columns as there is something.
     along = (frame_outlines(grid, poses) - curve_mm[0]) @ axis / max(float(np.linalg.norm(axis)), 1e-9)
@@ -145,13 +145,13 @@ def along_curve(
         at = poses.inv().apply(curve_mm[0])
         depth = float(at[np.argmin(np.abs(at[:, 2])), 1])
         sheet = replace(sheet, first_mm=(0.0, sheet.first_mm[1] + depth))
-    return _carried(opened, sheet, f"along a curve through {len(curve_mm)} points")
+    return _move_to_modes(modes, sheet, f"along a curve through {len(curve_mm)} points")
 
 
-def _carried(opened: OpenedModes, cut: AnyCut, words: str, frame: int = 0) -> Place:
-    """A cut of the reference's world at the poses of every mode, by the frame it hangs on."""
-    poses = opened.poses[opened.reference]
-    moves = {mode: each[frame] * poses[frame].inv() for mode, each in opened.poses.items()}
+def _move_to_modes(modes: SweepModes, cut: AnyCut, words: str, frame: int = 0) -> Place:
+    """Take a cut of the reference's world to the poses of every mode, by the frame it hangs on."""
+    poses = modes.poses[modes.reference]
+    moves = {mode: path[frame] * poses[frame].inv() for mode, path in modes.poses.items()}
     if isinstance(cut, CurvedSheet):
         sheets = {
             mode: replace(cut, base_mm=move.apply(cut.base_mm), down=move.rotation.apply(cut.down))
@@ -172,9 +172,9 @@ def _mean_directions(world_from_image: RigidTransform) -> FloatArray:
 
 
 def _name(direction: FloatArray, world_from_image: RigidTransform) -> str:
-    """Direction of the sweep that another one follows."""
-    alike = _mean_directions(world_from_image) @ direction
-    best = int(np.argmax(np.abs(alike)))
-    if abs(alike[best]) <= _SAME_DIRECTION:
+    """Name of the sweep's direction that an axis follows."""
+    cosines = _mean_directions(world_from_image) @ direction
+    best = int(np.argmax(np.abs(cosines)))
+    if abs(cosines[best]) <= _SAME_DIRECTION:
         return "in the plane"
-    return ("lateral", "depth", "along the sweep")[best] + ", backwards" * bool(alike[best] < 0)
+    return ("lateral", "depth", "along the sweep")[best] + ", backwards" * bool(cosines[best] < 0)

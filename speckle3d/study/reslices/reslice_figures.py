@@ -27,9 +27,9 @@ from speckle3d.study.figures import (
     spread_frames,
 )
 from speckle3d.study.images import GreyImages
-from speckle3d.study.posed import OpenedModes
+from speckle3d.study.posed import SweepModes
 from speckle3d.study.reslices.cut_geometry import KEYWORD, picture_text
-from speckle3d.study.reslices.cuts import CutPicture, cut_posed
+from speckle3d.study.reslices.cuts import CutPicture, cut_at_modes
 from speckle3d.study.reslices.places import along_sweep
 
 _PIXEL_MM = 0.1
@@ -45,7 +45,7 @@ _ACROSS_IN, _DOWN_IN = 11.0, 6.0
 
 
 def draw_along(
-    opened: OpenedModes, images: GreyImages, lengths: Mapping[str, str], paths: tuple[Path, Path]
+    modes: SweepModes, images: GreyImages, lengths: Mapping[str, str], paths: tuple[Path, Path]
 ) -> None:
     """Cut a sweep along its middle at the poses of every mode; write the whole cut and a part enlarged.
 
@@ -53,33 +53,30 @@ def draw_along(
 
     Parameters
     ----------
-    opened : OpenedModes
+    modes : SweepModes
         Of all frames.
     images : GreyImages
         Over `RANGE_DB`.
     lengths : mapping of str to str
-        How long each mode is, in words.
+        Length of each mode, in words.
     paths : tuple of path
         Of the two PNGs.
     """
     # A reach of two of the longest steps, so that no gaps show between frames.
-    steps = [(each[0].inv() * each).translation[:, 2] for each in opened.poses.values()]
-    reach_mm = max(0.3, *(2.0 * float(np.percentile(np.abs(np.diff(each)), 99)) for each in steps))
-    place = along_sweep(opened, images.grid, pixel_mm=_PIXEL_MM)
-    picture = cut_posed(opened, place, RANGE_DB, (images, images.grid), reach_mm=reach_mm)
+    elevations = [(path[0].inv() * path).translation[:, 2] for path in modes.poses.values()]
+    reach_mm = max(0.3, *(2.0 * float(np.percentile(np.abs(np.diff(z)), 99)) for z in elevations))
+    place = along_sweep(modes, images.grid, pixel_mm=_PIXEL_MM)
+    picture = cut_at_modes(modes, place, RANGE_DB, (images, images.grid), reach_mm=reach_mm)
     picture = replace(picture, lengths=lengths)
     save_reslices(picture, paths[0])
-    drawn = picture.cuts[opened.reference]
-    left, right, bottom, top = drawn.cut.extent_mm
-    top += _PIXEL_MM * busiest_rows(drawn.image, round(_DEEP_MM / _PIXEL_MM))
+    panel = picture.cuts[modes.reference]
+    left, right, bottom, top = panel.cut.extent_mm
+    top += _PIXEL_MM * busiest_rows(panel.image, round(_DEEP_MM / _PIXEL_MM))
     part = left, min(right, left + _LONG_MM), min(bottom, top + _DEEP_MM), top
-    enlarged = replace(picture, place="part of the cut along the sweep, enlarged")
-    save_reslices(enlarged, paths[1], 3.0 * len(picture.cuts), part)
+    save_reslices(replace(picture, place="part of the cut along the sweep, enlarged"), paths[1], part)
 
 
-def save_reslices(
-    picture: CutPicture, path: Path, across_in: float = _ACROSS_IN, part_mm: Extent | None = None
-) -> Path:
+def save_reslices(picture: CutPicture, path: Path, part_mm: Extent | None = None) -> Path:
     """Draw cuts, as `draw_cuts`, and write them as a PNG that says where they lie.
 
     Raises
@@ -87,46 +84,46 @@ def save_reslices(
     FileError
         If the file cannot be written.
     """
-    text = picture_text({mode: each.cut for mode, each in picture.cuts.items()}, picture.marks)
-    return save_figure(draw_cuts(picture, across_in, part_mm), path, {KEYWORD: text})
+    text = picture_text({mode: panel.cut for mode, panel in picture.cuts.items()}, picture.marks)
+    return save_figure(draw_cuts(picture, part_mm), path, {KEYWORD: text})
 
 
-def draw_cuts(picture: CutPicture, across_in: float = _ACROSS_IN, part_mm: Extent | None = None) -> Figure:
+def draw_cuts(picture: CutPicture, part_mm: Extent | None = None) -> Figure:
     """Draw cuts of several modes under one grey scale.
 
     Parameters
     ----------
-    across_in : float
-        Width that the cuts share.
     part_mm : tuple of float, optional
         Left, right, bottom and top of what is shown, by the cuts' axes; by default all.
     """
     cuts = picture.cuts
     left, right, bottom, top = part_mm or next(iter(cuts.values())).cut.extent_mm
     size = right - left, bottom - top
-    # Cuts in a row or in a column, whichever shows them larger.
-    grids = [(1, len(cuts)), (len(cuts), 1)]
-    scales = [min(across_in / (c * size[0]), _DOWN_IN / (r * size[1])) for r, c in grids]
-    scale, (down, across) = max(zip(scales, grids, strict=True))
+    # In as many rows as show the cuts largest.
+    grids = [(rows, -(-len(cuts) // rows)) for rows in range(1, len(cuts) + 1)]
+    scales = [min(_ACROSS_IN / (c * size[0]), _DOWN_IN / (r * size[1])) for r, c in grids]
+    scale, (down, across) = max(zip(scales, grids, strict=True), key=lambda pair: pair[0])
     wide = max(across * (scale * size[0] + 0.6) + 1.6, 5.0)
     figure = new_figure(wide, down * (scale * size[1] + 0.7) + 0.7)
+    figure.set_layout_engine("compressed")
     places = figure.subplots(down, across, squeeze=False).ravel()
     greys = colormaps["gray"].with_extremes(bad=UNSEEN)
-    for (mode, drawn), panel in zip(cuts.items(), places, strict=True):
-        look = {"cmap": greys, "interpolation": "nearest", "extent": drawn.cut.extent_mm}
+    for (mode, panel), axes in zip(cuts.items(), places, strict=False):
+        look = {"cmap": greys, "interpolation": "nearest", "extent": panel.cut.extent_mm}
         low, high = picture.levels
-        image = panel.imshow(drawn.image, vmin=low, vmax=high, **look)
+        image = axes.imshow(panel.image, vmin=low, vmax=high, **look)
         title = "\n".join(filter(None, [label_of(mode), picture.lengths.get(mode, "")]))
-        panel.set_title(title, fontsize="small", color=colour_of(mode), parse_math=False)
-        lines = list(drawn.frames[spread_frames(len(drawn.frames), 8)])
-        panel.add_collection(
-            LineCollection(lines, colors="#FFD700", linewidths=0.6, alpha=0.6), autolim=False
-        )
-        panel.set(xlim=(left, right), ylim=(bottom, top))
-        panel.tick_params(labelsize="small")
-    places[0].set_ylabel(f"{picture.axes[1]} / mm")
+        axes.set_title(title, fontsize="small", color=colour_of(mode), parse_math=False)
+        lines = list(panel.frames[spread_frames(len(panel.frames), 8)])
+        axes.add_collection(LineCollection(lines, colors="#FFD700", linewidths=0.6, alpha=0.6), autolim=False)
+        axes.set(xlim=(left, right), ylim=(bottom, top))
+        axes.tick_params(labelsize="small")
+    for axes in places[len(cuts) :]:
+        axes.remove()
+    for axes in places[: len(cuts) : across]:
+        axes.set_ylabel(f"{picture.axes[1]} / mm")
     figure.supxlabel(f"{picture.axes[0]} / mm", fontsize="medium")
-    figure.colorbar(image, ax=list(places), label=picture.unit, shrink=0.8)
+    figure.colorbar(image, ax=list(places[: len(cuts)]), label=picture.unit, shrink=0.8)
     name_figure(figure, ": ".join(filter(None, [picture.name, picture.place])))
     return figure
 
@@ -135,8 +132,8 @@ def busiest_rows(image: Float32Array, count: int) -> int:
     """First of `count` rows in which structures along the sweep stand out most from speckle."""
     if len(image) <= count or not np.isfinite(image).any():
         return 0
-    filled = np.nan_to_num(image, nan=float(np.nanmedian(image)))
-    sums = np.convolve(uniform_filter1d(filled, 15, axis=1).var(axis=1), np.ones(count), mode="valid")
+    levels = np.nan_to_num(image, nan=float(np.nanmedian(image)))
+    sums = np.convolve(uniform_filter1d(levels, 15, axis=1).var(axis=1), np.ones(count), mode="valid")
     # Near the face the probe's own echo would win.
     first = min(count // 3, len(sums) - 1)
     return first + int(np.argmax(sums[first:]))

@@ -77,26 +77,26 @@ def write_scene(
     FileError
         If the folder cannot be written.
     """
-    asked, modes, target = request or VolumeRequest(), [each.mode for each in posed], Path(folder)
-    wanted = {"deviation": with_deviation, "images": with_images, "poses": with_images}
-    kinds = [what for what in _NAMES if wanted.get(what, True)]
-    names = [_NAMES[what].format(mode) for mode in modes for what in kinds]
-    every = {name.format(mode) for mode in (*MODES, *REFERENCES) for name in _NAMES.values()}
+    request, target = request or VolumeRequest(), Path(folder)
+    choices = {"deviation": with_deviation, "images": with_images, "poses": with_images}
+    kinds = [kind for kind in _NAMES if choices.get(kind, True)]
+    names = {_NAMES[kind].format(sweep.mode) for sweep in posed for kind in kinds}
+    old_names = {name.format(mode) for mode in (*MODES, *REFERENCES) for name in _NAMES.values()} - names
     scene: list[dict[str, Any]] = []
     reports = []
-    with FileSet(SCENE, tuple(names), tuple(every.difference(names))).replaced(target) as part:
-        for each in posed:
-            files = {what: _NAMES[what].format(each.mode) for what in kinds}
-            report = _write_mode({what: part / name for what, name in files.items()}, each, asked)
+    with FileSet(SCENE, tuple(names), tuple(old_names)).replaced(target) as part:
+        for sweep in posed:
+            files = {kind: _NAMES[kind].format(sweep.mode) for kind in kinds}
+            report = _write_mode({kind: part / name for kind, name in files.items()}, sweep, request)
             reports.append(replace(report, path=target / report.path.name))
-            seconds = max(float(np.ptp(each.sweep.frame_time_s[each.frames])), 1e-3)
+            seconds = max(float(np.ptp(sweep.sweep.frame_time_s[sweep.frames])), 1e-3)
             scene.append(
                 {
-                    "name": printable(f"{each.sweep.name}, {each.mode}"),
+                    "name": printable(f"{sweep.sweep.name}, {sweep.mode}"),
                     "files": files,
-                    "is_bytes": asked.settings.voxel_type == "uint8",
-                    "colour": " ".join(f"{share:.3g}" for share in to_rgb(colour_of(each.mode))),
-                    "frames_per_s": f"{len(each.frames) / seconds:g}",
+                    "is_bytes": request.settings.voxel_type == "uint8",
+                    "colour": " ".join(f"{share:.3g}" for share in to_rgb(colour_of(sweep.mode))),
+                    "frames_per_s": f"{len(sweep.frames) / seconds:g}",
                 }
             )
             if progress is not None:
@@ -104,7 +104,7 @@ def write_scene(
         # Everything that comes from outside is escaped.
         environment = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
         template = environment.from_string(_TEMPLATE.read_text(encoding="utf-8"))
-        segments = ", ".join(each.name for each in STATE_SEGMENTS)
+        segments = ", ".join(segment.name for segment in STATE_SEGMENTS)
         (part / SCENE).write_text(template.render(modes=scene, segments=segments), encoding="utf-8")
     return reports
 
@@ -119,7 +119,7 @@ def require_scene_place(folder: Path, *inputs: Path | None) -> None:
     """
     if not folder.is_dir():
         return
-    if any(each is not None and each.resolve().parent == folder.resolve() for each in inputs):
+    if any(path is not None and path.resolve().parent == folder.resolve() for path in inputs):
         raise InvalidInputError(f"{folder}: holds an input: give another name")
     if any(folder.iterdir()) and not (folder / SCENE).is_file():
         raise InvalidInputError(f"{folder}: expected a new name or a scene to replace, got another folder")

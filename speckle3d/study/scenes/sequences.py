@@ -54,8 +54,8 @@ def slicer_sequence(
         where its axes lead.
     """
     source, _ = posed.source(None, dynamic_range_db)
-    grid, own = source.grid, posed.sweep.signal
-    signal = own if isinstance(own, BModeSettings) else BModeSettings(dynamic_range_db)
+    grid, signal = source.grid, posed.sweep.signal
+    signal = signal if isinstance(signal, BModeSettings) else BModeSettings(dynamic_range_db)
     times, name = posed.sweep.frame_time_s[posed.frames], posed.sweep.name
     sweep = Sweep(_Bytes(source), grid, signal, times, name=name, probe=posed.sweep.probe)
     thick_mm = (grid.vector_pitch_mm + grid.sample_spacing_mm) / 2

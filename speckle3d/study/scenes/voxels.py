@@ -35,7 +35,7 @@ Axes = Literal["sweep", "world", "principal"]
 
 @dataclass(frozen=True)
 class GridRequest:
-    """Where voxels are asked to lie.
+    """Grid of voxels, or what to choose it by.
 
     Attributes
     ----------
@@ -98,7 +98,7 @@ class GridRequest:
 
 @dataclass(frozen=True)
 class VolumeRequest:
-    """How a volume is to be made of a sweep.
+    """Settings of the compounding, grid and region of a volume.
 
     Attributes
     ----------
@@ -122,7 +122,7 @@ class VolumeReport:
     counts : ndarray of int, shape (3,)
         Voxels that are empty, measured and filled.
     seconds : float
-        It took.
+        Run time.
     """
 
     path: Path
@@ -153,9 +153,9 @@ class VolumeReport:
     @property
     def line(self) -> str:
         """File, size, voxels, and the share of each state in one line."""
-        named = ", ".join(f"{100 * share:.1f} % {word}" for word, share in self.shares.items())
+        shares = ", ".join(f"{100 * share:.1f} % {word}" for word, share in self.shares.items())
         size = f"{self.path.stat().st_size / 1e6:.3g} MB"
-        return f"{self.path}: {size}, mode {self.mode}, {self.grid}: {named}; {self.seconds:.1f} s"
+        return f"{self.path}: {size}, mode {self.mode}, {self.grid}: {shares}; {self.seconds:.1f} s"
 
 
 def write_voxels(
@@ -241,11 +241,11 @@ def confidence(posed: PosedSweep, grid: VoxelGrid) -> FloatArray:
 
 
 def fields_of(posed: PosedSweep, settings: CompoundingSettings, meaning: str) -> dict[str, str]:
-    """What a volume's file says of it."""
+    """Fields of a volume's file."""
     method = {"method": f"between the nearest images, up to {settings.backward_mm:g} mm away"}
     if settings.backward_mm == 0:
-        filled = f"{settings.fill_mm:g} mm" if settings.fill_mm > 0 else f"{settings.fill_radius} voxels"
-        method = {"splat": settings.splat, "rule": settings.rule, "fill_radius": filled}
+        radius = f"{settings.fill_mm:g} mm" if settings.fill_mm > 0 else f"{settings.fill_radius} voxels"
+        method = {"splat": settings.splat, "rule": settings.rule, "fill_radius": radius}
     return {
         "levels": meaning,
         "poses": posed.mode,

@@ -12,8 +12,10 @@ from speckle3d.study.reslices.cut_geometry import read_plane
 from speckle3d.study.reslices.cuts import CutPicture, DrawnCut, length_words
 from speckle3d.study.reslices.reslice_figures import draw_cuts, save_reslices
 
-PLACED = RigidTransform.from_components([3.0, -40.0, 12.0], Rotation.from_euler("ZYX", [0.4, -0.7, 1.0]))
-PLANE = ReslicePlane(PLACED, 15.0, 20.0, 0.5, (-1.0, 2.5))
+WORLD_FROM_PLANE = RigidTransform.from_components(
+    [3.0, -40.0, 12.0], Rotation.from_euler("ZYX", [0.4, -0.7, 1.0])
+)
+PLANE = ReslicePlane(WORLD_FROM_PLANE, 15.0, 20.0, 0.5, (-1.0, 2.5))
 
 
 def picture_of(modes, **words):
@@ -29,22 +31,30 @@ def test_cuts_share_one_scale_true_axes_and_the_lengths_of_the_table():
     words = length_words(rows, "truth")
     assert words == {"image": "11.91 mm +1.6 %", "truth": "11.73 mm"}
     panels = draw_cuts(picture_of(["image", "truth"], lengths=words)).axes[:2]
-    drawn = [panel.images[0] for panel in panels]
-    assert [each.get_clim() for each in drawn] == [(-50.0, 0.0)] * 2
+    images = [panel.images[0] for panel in panels]
+    assert [image.get_clim() for image in images] == [(-50.0, 0.0)] * 2
     # Half a pixel of 0.5 mm around the first and the last centre.
-    assert [tuple(each.get_extent()) for each in drawn] == [(-1.25, 14.25, 22.75, 2.25)] * 2
+    assert [tuple(image.get_extent()) for image in images] == [(-1.25, 14.25, 22.75, 2.25)] * 2
     titles = [panel.get_title() for panel in panels]
     assert titles == [f"{mode}\n{length}" for mode, length in words.items()]
+
+
+def test_many_cuts_stand_in_rows_that_show_them_large():
+    figure = draw_cuts(picture_of("abcdefg"), (-1.0, 12.0, 14.5, 2.5))
+    figure.draw_without_rendering()
+    widths = [axes.get_position().width * figure.get_figwidth() for axes in figure.axes[:7]]
+    # In one row of 11 inches each had 1.6.
+    assert min(widths) > 2.2
 
 
 def test_where_a_plane_lies_comes_back_from_the_file(tmp_path):
     sheet = curved_sheet([[0, 0, 0], [5, 0, 0], [5, 7, 0]], [0, 0, 2.0], (-1.0, 4.0), 0.5, smooth=False)
     cuts = {"truth": sheet, "pose": PLANE}
-    drawn = {mode: DrawnCut(np.zeros(cut.shape, np.float32), cut) for mode, cut in cuts.items()}
-    path = save_reslices(CutPicture(drawn, marks={"pose": "a mark"}), tmp_path / "cut.png")
-    shown = read_plane(path)
-    assert (shown.mode, shown.mark) == ("pose", "a mark")
-    picked = np.array([[-1.0, 2.5], [2.0, 3.5]])
-    np.testing.assert_allclose(shown.world_mm(picked), PLANE.world_from_mm(*picked.T), atol=1e-9)
+    panels = {mode: DrawnCut(np.zeros(cut.shape, np.float32), cut) for mode, cut in cuts.items()}
+    path = save_reslices(CutPicture(panels, marks={"pose": "a mark"}), tmp_path / "cut.png")
+    plane = read_plane(path)
+    assert (plane.mode, plane.mark) == ("pose", "a mark")
+    picks = np.array([[-1.0, 2.5], [2.0, 3.5]])
+    np.testing.assert_allclose(plane.world_mm(picks), PLANE.world_from_mm(*picks.T), atol=1e-9)
     with pytest.raises(InvalidInputError):
         read_plane(path, "truth")

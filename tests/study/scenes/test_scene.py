@@ -25,9 +25,9 @@ def posed_sweep(mode="image", frames=8):
     images = rng.integers(30, 200, (frames, 12, 20)).astype(np.uint8)
     images[5, 4, 9] = 255  # alone in the sweep
     sweep = Sweep(images, grid, BModeSettings(60.0), 1.0 + 0.04 * np.arange(frames), name=NAME)
-    turned = Rotation.from_euler("yx", [20.0, -35.0], degrees=True)
+    rotation = Rotation.from_euler("yx", [20.0, -35.0], degrees=True)
     along = RigidTransform.from_translation(np.outer(np.arange(frames), [0.0, 0.0, 0.6]))
-    poses = RigidTransform.from_components([40.0, -30.0, 20.0], turned) * along
+    poses = RigidTransform.from_components([40.0, -30.0, 20.0], rotation) * along
     return PosedSweep(sweep, np.arange(frames), poses, mode)
 
 
@@ -37,14 +37,14 @@ REQUEST = VolumeRequest(CompoundingSettings(voxel_mm=0.25, splat="nearest"))
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     target = tmp_path_factory.mktemp("scene") / "a scene"
-    other = replace(posed_sweep("pose"), world_from_image=posed_sweep().world_from_image.inv())
-    write_scene(target, [posed_sweep(), other], REQUEST, with_images=True)
+    pose = replace(posed_sweep("pose"), world_from_image=posed_sweep().world_from_image.inv())
+    write_scene(target, [posed_sweep(), pose], REQUEST, with_images=True)
     return target
 
 
 def test_volume_labels_outlines_and_pose_are_at_one_place(folder):
-    posed = posed_sweep()
-    mark = posed.world_from_image[5].apply([4 * 0.5, 1.0 + 9 * 0.25, 0.0])
+    sweep = posed_sweep()
+    mark = sweep.world_from_image[5].apply([4 * 0.5, 1.0 + 9 * 0.25, 0.0])
     volume = SimpleITK.ReadImage(str(folder / "volume-image.nrrd"))
     at = volume.TransformPhysicalPointToIndex(mark.tolist())
     # Nearest and mean: the mark shares its voxel with no other sample of twice the voxel's size.
@@ -53,7 +53,7 @@ def test_volume_labels_outlines_and_pose_are_at_one_place(folder):
     index = np.rint(np.linalg.solve(labels["ijkToLPS"], [*mark, 1.0])[:3]).astype(int)
     assert tuple(index) == at
     assert labels["voxels"][tuple(index)] == 1
-    assert [each["name"] for each in labels["segments"]] == ["measured", "filled"]
+    assert [segment["name"] for segment in labels["segments"]] == ["measured", "filled"]
     pose = SimpleITK.ReadTransform(str(folder / "first-frame-image.tfm"))
-    inside = pose.TransformPoint(posed.world_from_image[0].apply([1.0, 2.0, 0.0]).tolist())
+    inside = pose.TransformPoint(sweep.world_from_image[0].apply([1.0, 2.0, 0.0]).tolist())
     np.testing.assert_allclose(inside, [1.0, 2.0, 0.0], atol=1e-9)

@@ -12,32 +12,32 @@ COARSE = CompoundingSettings(voxel_mm=1.0)
 
 
 @pytest.fixture(scope="module")
-def posed(data_folder):
+def sweep(data_folder):
     return open_posed(data_folder / "phantom.h5")
 
 
-def written(posed, path, **request):
-    write_voxels(posed, VolumeRequest(COARSE, **request), path)
+def write_image(sweep, path, **request):
+    write_voxels(sweep, VolumeRequest(COARSE, **request), path)
     return pytest.importorskip("SimpleITK").ReadImage(path)
 
 
-def test_spacing_origin_and_shape_are_in_the_file_to_the_last_bit(posed, tmp_path):
+def test_spacing_origin_and_shape_are_in_the_file_to_the_last_bit(sweep, tmp_path):
     name = "v.mha"
-    asked = GridRequest("world", SPACING, ORIGIN, SHAPE)
-    image = written(posed, tmp_path / name, grid=asked)
+    request = GridRequest("world", SPACING, ORIGIN, SHAPE)
+    image = write_image(sweep, tmp_path / name, grid=request)
     assert (image.GetSpacing(), image.GetOrigin(), image.GetSize()) == (SPACING, ORIGIN, SHAPE)
     assert image.GetDirection() == (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
-    again = written(posed, tmp_path / "like.nrrd", grid=GridRequest(like=tmp_path / name))
+    again = write_image(sweep, tmp_path / "like.nrrd", grid=GridRequest(like=tmp_path / name))
     assert (again.GetSpacing(), again.GetOrigin(), again.GetSize()) == (SPACING, ORIGIN, SHAPE)
 
 
-def test_a_region_bounds_the_grid_and_what_is_in_it(posed, tmp_path):
+def test_a_region_bounds_the_grid_and_what_is_in_it(sweep, tmp_path):
     region = Region("rectangle 3,10 9,20")
-    image = written(posed, tmp_path / "v.nrrd", region=region)
+    image = write_image(sweep, tmp_path / "v.nrrd", region=region)
     # Images are nearly parallel: the region's 6 x 10 mm, and a voxel or two more that their tilt takes.
     assert image.GetSize()[0] in (7, 8, 9)
     assert image.GetSize()[1] in (11, 12, 13)
     # Voxels of the middle lie in the region as the image beside them has it.
     points = [image.TransformIndexToPhysicalPoint((4, y, 5)) for y in range(2, 9)]
-    inside = [posed.world_from_image[len(posed.frames) // 2].inv().apply(point)[:2] for point in points]
+    inside = [sweep.world_from_image[len(sweep.frames) // 2].inv().apply(point)[:2] for point in points]
     assert all(3 < x < 9 and 10 < y < 20 for x, y in inside)
