@@ -229,8 +229,13 @@ def _check(flag: str, option: inspect.Parameter, value: Any, flags: Mapping[str,
             is_server = re.fullmatch(r"[^/]+:[0-9]+", str(item))
             live = f"; a server's sweep: speckle3d live {item} --view" if is_server else ""
             raise FileError(f"{where}{item}: expected a file, got none{live}")
-    is_results = isinstance(value, Path) and not info.writable and (value / "reconstruction.h5").is_file()
-    return value / "reconstruction.h5" if is_results else value
+    if isinstance(value, Path) and not info.writable and (value / "reconstruction.h5").is_file():
+        return value / "reconstruction.h5"
+    if option.name == "reconstruction_file" and value.is_dir():
+        raise FileError(
+            f"{value}: expected a results folder, which `speckle3d reconstruct` makes, got another"
+        )
+    return value
 
 
 def _option(name: str, kind: Any, default: Any, info: Any, words: Words) -> inspect.Parameter:

@@ -85,7 +85,10 @@ def convert(
         Any recording that holds a sweep: a file, or a folder.
     out
         Sweep file (.h5, .hdf5), or sequence of PLUS (.mha, .nrrd), to write; or -o OUT.
-    calibration, mode, sampling_rate_hz, vector_pitch_mm, plus_config
+    calibration
+    mode
+        Which poses of a reconstruction (by default those that claim the smallest error of length).
+    sampling_rate_hz, vector_pitch_mm, plus_config
 
     Other Parameters
     ----------------

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from speckle3d.correction.modes import sensor_of
 from speckle3d.corrections import Correction
 from speckle3d.matching.quality import describe
 from speckle3d.scoring.lengths import TRACKER
+from speckle3d.study.results import read_summary
 from speckle3d.tracked import Tracked
 
 
@@ -34,12 +34,11 @@ def recorded_doubts(path: Path, provenance: Provenance) -> tuple[Doubt, ...] | N
         None if no summary of this reconstruction is there.
     """
     try:
-        (summary,) = json.loads((path.parent / "summary.json").read_text(encoding="utf-8"))["sweeps"]
-        input_sha256 = summary["details"]["provenance"]["input_sha256"]
-        doubts = tuple(Doubt(**doubt) for doubt in summary["doubts"])
+        summary = read_summary(path.parent, "")
+        input_sha256 = summary.details["provenance"]["input_sha256"]
     except (OSError, ValueError, KeyError, TypeError):
         return None
-    return doubts if input_sha256 == provenance.input_sha256 else None
+    return tuple(summary.doubts) if input_sha256 == provenance.input_sha256 else None
 
 
 def doubted_modes(sweep: Sweep, doubts: Sequence[Doubt], modes: Collection[str]) -> dict[str, str]:

@@ -293,15 +293,14 @@ def json_text(value: Any) -> str:
 
 
 def read_summary(folder: Path, name: str) -> Summary:
-    """Read a sweep's summary back, of its details the time alone; what was not finite is NaN again."""
+    """Read a sweep's summary back, its details as JSON has them; what was not finite in rows is NaN again."""
     (record,) = json.loads((folder / "summary.json").read_text(encoding="utf-8"))["sweeps"]
     values: list[dict[str, Any]] = [
         {key: math.nan if value is None else value for key, value in row.items()} for row in record["rows"]
     ]
     rows = [ModeError(**row) for row in values]
     doubts = [Doubt(**doubt) for doubt in record["doubts"]]
-    details = {"seconds": record["details"]["seconds"]}
-    return Summary(**record | {"sweep": name, "rows": rows, "doubts": doubts, "details": details})
+    return Summary(**record | {"sweep": name, "rows": rows, "doubts": doubts})
 
 
 def write_texts(directory: Path, texts: Mapping[str, str]) -> None:

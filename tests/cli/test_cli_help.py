@@ -73,7 +73,7 @@ def test_every_setting_is_printed_with_its_default(run):
         (("reslice", "{sweep}", "-o", "c.png", "--depth-mm", "500"), "--depth-mm: expected a value inside"),
         (("reslice", "{sweep}", "-o", "c.png", "--pixel-mm", "0"), "--pixel-mm"),
         (
-            ("imu", "accuracy", "{sweep}", "--optical", "a.tum", "--turns", "roll"),
+            ("imu", "accuracy", "{sweep}", "--optical", "{sweep}", "--turns", "roll"),
             "expected --reference with",
         ),
         (("compare", "{sweep}", "-o", "{sweep}"), "expected a folder or a new name, got a file"),

@@ -138,7 +138,7 @@ def frame_lines(cut: AnyCut, grid: ImageGrid, world_from_image: RigidTransform) 
 
 
 def length_words(rows: Sequence[ModeError], reference: str) -> dict[str, str]:
-    """Length of each mode, part by part, and its error in per cent, in words."""
+    """Length of each mode and its error in per cent, a line for each part."""
     words: dict[str, dict[str, str]] = {}
     for row in rows:
         percent = "" if np.isnan(row.length_error_percent) else f" {row.length_error_percent:+.1f} %"
@@ -146,7 +146,7 @@ def length_words(rows: Sequence[ModeError], reference: str) -> dict[str, str]:
     for row in rows:
         if np.isfinite(row.reference_mm):
             words.setdefault(reference, {}).setdefault(row.part, f"{row.reference_mm:.2f} mm")
-    return {mode: ", ".join(parts.values()) for mode, parts in words.items()}
+    return {mode: "\n".join(parts.values()) for mode, parts in words.items()}
 
 
 def cut_as_volume(picture: CutPicture) -> Volume:
