@@ -109,6 +109,4 @@ def save_figure(figure: Figure, path: Path, words: Mapping[str, str] | None = No
 
 def new_figure(width_in: float, height_in: float) -> Figure:
     """Make a figure that needs no window system."""
-    figure = Figure(figsize=(width_in, height_in), layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure
+    return Figure(figsize=(width_in, height_in), layout="constrained")

@@ -248,7 +248,7 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
                 place = in_frame(posed, grid, self.frame, reach_mm=reach_mm)
             else:
                 place = along_sweep(posed, grid, **self._slider(name))
-            picture = cut_at_modes(posed, place, RANGE_DB, (images, grid), reach_mm=reach_mm)
+            picture = cut_at_modes(posed, place, images, grid, RANGE_DB, reach_mm=reach_mm)
         except Speckle3DError as error:
             plot.plot.title.text = str(error).split(";")[0]
             return

@@ -111,7 +111,7 @@ def reslice(
     else:
         place = along_sweep(modes, grid, lateral_mm, depth_mm, pixel_mm)
     with progress_bar(f"reslicing {out.name}"):
-        picture = cut_at_modes(modes, place, range_db, (images, grid), part, reach_mm)
+        picture = cut_at_modes(modes, place, images, grid, range_db, part, reach_mm)
     if out.suffix.lower() == ".png":
         save_reslices(picture, out)
     else:

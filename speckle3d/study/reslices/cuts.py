@@ -81,8 +81,9 @@ class CutPicture:
 def cut_at_modes(
     modes: SweepModes,
     place: Place,
+    images: Images,
+    grid: ImageGrid,
     dynamic_range_db: float = RANGE_DB,
-    source: tuple[Images, ImageGrid] | None = None,
     region: Region | None = None,
     reach_mm: float = REACH_MM,
 ) -> CutPicture:
@@ -93,9 +94,10 @@ def cut_at_modes(
     modes : SweepModes
     place : Place
         Of these modes.
+    images, grid
+        As `modes.posed.images` gives them.
     dynamic_range_db : float
-    source : tuple of Images and ImageGrid, optional
-        As `modes.posed.images` gives them, where they are at hand.
+        Of the images.
     region : Region, optional
         Of the images; samples outside it do not count.
     reach_mm : float
@@ -106,7 +108,6 @@ def cut_at_modes(
     InvalidInputError
         If the cut shows nothing.
     """
-    images, grid = source or modes.posed.images(dynamic_range_db)
     poses = modes.poses
     unit, limits = "dB, 0: maximum", (-dynamic_range_db, 0.0)
     mask = None if region is None else region.mask(grid)

@@ -17,7 +17,6 @@ from scipy.ndimage import uniform_filter1d
 
 from speckle3d.core.arrays import Float32Array
 from speckle3d.study.figures import (
-    RANGE_DB,
     UNSEEN,
     colour_of,
     label_of,
@@ -66,7 +65,7 @@ def draw_along(
     elevations = [(path[0].inv() * path).translation[:, 2] for path in modes.poses.values()]
     reach_mm = max(0.3, *(2.0 * float(np.percentile(np.abs(np.diff(z)), 99)) for z in elevations))
     place = along_sweep(modes, images.grid, pixel_mm=_PIXEL_MM)
-    picture = cut_at_modes(modes, place, RANGE_DB, (images, images.grid), reach_mm=reach_mm)
+    picture = cut_at_modes(modes, place, images, images.grid, reach_mm=reach_mm)
     picture = replace(picture, lengths=lengths)
     save_reslices(picture, paths[0])
     panel = picture.cuts[modes.reference]
