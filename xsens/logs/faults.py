@@ -58,10 +58,10 @@ _TURNS_APART = 5.0
 """Of rows in turn of several sensors, how much farther neighbours are apart than rows of one sensor."""
 
 _NOISY = 10.0
-"""Last digits by which readings change that are not repeated by chance; usual changes in a jump."""
+"""Last digits: readings that change by more are not repeated by chance. Usual changes: more is a jump."""
 
 _WRAPS = 1.5
-"""Change between two readings, in largest ones, that is an overflow: twice as much, less what it turned."""
+"""Least change of an overflow, in largest readings: one changes by two, less what the sensor turned."""
 
 _ENOUGH = 50
 _MOST_SENSORS = 8
@@ -215,13 +215,13 @@ def at_ends(rows: FloatArray) -> BoolArray:
 
 
 def _overflows(rows: FloatArray) -> BoolArray:
-    """Rows in which an axis is beyond its range: it has gone on from its one end at the other."""
+    """Rows in which an axis has overflowed: readings wrap round from one end of the range to the other."""
     bad = np.zeros(len(rows), dtype=bool)
     for axis in rows.T:
         steps = np.diff(axis)
         jumps = (np.flatnonzero(np.abs(steps) > _WRAPS * np.fmax.reduce(np.abs(axis))) + 1).tolist()
         spans, ends = list[tuple[int, int]](), set[int]()
-        # The log may begin or end beyond the range, which shows if a jump has no other.
+        # A jump without another shows that the log begins or ends beyond the range.
         for i, k in (*pairwise(jumps), (0, *jumps[:1]), (*jumps[-1:], len(axis))) if jumps else ():
             opposite = i == 0 or k == len(axis) or steps[i - 1] * steps[k - 1] < 0.0
             if opposite and not ends & {i, k} and (axis[i:k] * axis[i] > 0.0).all():

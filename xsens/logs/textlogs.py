@@ -122,19 +122,20 @@ def _samples(table: TextTable, rate_hz: float | None) -> Parts:
             notes.append(f"{key}: the same in every line, left out")
             del columns[key]
     if "time" in columns and table.names and "time" not in table.with_unit:
-        unit = _unit_of(columns["time"], TIMES)
-        if unit is None:  # steps of one: milliseconds, or the samples' numbers
-            if np.isnan(period_s):
-                raise InvalidInputError(
-                    "expected a time with its unit, as time_s or time_ms, got steps of 1: if they count "
-                    "samples, give --rate-hz"
-                )
-            columns.setdefault("counter", columns.pop("time"))
-            notes.append("times without a unit in steps of 1: taken for the samples' numbers")
-        else:
-            columns["time"] = columns["time"] * TIMES[unit]
+        times = columns.pop("time")
+        unit = _unit_of(times, TIMES)
+        if unit is not None:
+            columns["time"] = times * TIMES[unit]
             if unit != "s":
                 notes.append(f"times without a unit: taken as in {unit}, by their steps")
+        elif np.isnan(period_s) or np.nanmax(times % 1.0) > 0.0:
+            raise InvalidInputError(
+                f"expected a time with its unit, as time_s or time_ms, got steps of {_usual_step(times):g}: "
+                "if they count samples, give --rate-hz"
+            )
+        else:
+            columns.setdefault("counter", times)
+            notes.append("times without a unit: taken for the samples' numbers")
     if not columns.keys() & {"time", "ticks"} and (utc_s := _utc_s(columns)) is not None:
         columns["time"] = utc_s
     timely = np.ones(len(next(iter(columns.values()), ())), dtype=bool)
@@ -189,24 +190,21 @@ def _samples(table: TextTable, rate_hz: float | None) -> Parts:
     return Parts(stamps, (force, rate, field), orientation, claim, (*odd, *notes))
 
 
-def _unit_of(times: FloatArray, units: dict[str, float]) -> str | None:
-    """The unit of times that makes their steps a sensor's, or steps of one those of an epoch."""
+def _usual_step(times: FloatArray) -> float:
+    """Median of the steps forward; of a single time a sensor's."""
     steps = np.diff(times)
-    usual = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else 0.01
-    for unit, scale in units.items():
-        if usual != 1.0 and SHORTEST_S <= usual * scale <= 1.0 / _SLOWEST_HZ:
-            return unit
-        if usual == 1.0 and _EPOCH_S[0] < times[0] * scale < _EPOCH_S[1]:
-            return unit
-    if usual != 1.0 and units is TIMES:
-        raise InvalidInputError(
-            f"expected a time with its unit, as time_s or time_ms, got steps of {usual:g}"
-        )
-    return None
+    return float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else 0.01
+
+
+def _unit_of(times: FloatArray, units: dict[str, float]) -> str | None:
+    """Unit in which the steps of times are a sensor's, or those of one are of an epoch; None if in none."""
+    usual = _usual_step(times)
+    value, low, high = (times[0], *_EPOCH_S) if usual == 1.0 else (usual, SHORTEST_S, 1.0 / _SLOWEST_HZ)
+    return next((unit for unit, scale in units.items() if low <= value * scale <= high), None)
 
 
 def _degrees(angles: FloatArray, force: FloatArray | None) -> float:
-    """Degrees in the unit of angles that names none; gravity tells small degrees from radians."""
+    """Scale to degrees of angles without a unit: gravity tells small degrees from radians."""
     if np.nanmax(np.abs(angles), initial=0.0) > _HALF_TURN:
         return 1.0
     if force is None:
