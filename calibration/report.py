@@ -139,6 +139,9 @@ def json_report(calibration: Calibration, beam: Sequence[BeamBias] = ()) -> dict
         "translation_mm": translation,
         "pixel_mm": pixel,
         "standard_errors": np.sqrt(np.diag(calibration.covariance)).tolist(),
+        "standard_errors_of": ["tilt_rad", "yaw_rad", "roll_rad", "x_mm", "y_mm", "z_mm"][
+            : len(calibration.covariance)
+        ],
         "frames_given": calibration.frames.given,
         "frames_used": list(calibration.frames.used),
         "frames_dropped": {str(frame): why for frame, why in calibration.frames.dropped.items()},

@@ -18,6 +18,7 @@ from speckle3d.core.sweep import Sweep
 SENSORS = ("tracker", "orientation")
 
 _ANGLES = {"alpha": "roll (alpha)", "beta": "yaw (beta)", "gamma": "tilt (gamma)"}
+_PIXELS = {"s_x": ", columns", "s_y": ", rows"}
 _LONGEST_REASONS = 6
 """How many reasons for dropped frames rows tell."""
 
@@ -41,7 +42,9 @@ class Parameter:
     def row(self) -> tuple[str, str, str]:
         """Name, value with its 95 % interval, and unit, for people."""
         value, unit = readable(self.value, self.unit)
-        return self.name, f"{value} +- {readable(1.96 * self.standard_error, self.unit)[0]} (95 %)", unit
+        place = ", phantom" if self.name.endswith("_c") else _PIXELS.get(self.name, "")
+        half = readable(1.96 * self.standard_error, self.unit)[0]
+        return self.name + place, f"{value} +- {half} (95 %)", unit
 
 
 @dataclass(frozen=True)
@@ -159,7 +162,7 @@ class Calibration:
             ("frames used", f"{len(self.frames.used)} of {self.frames.given}", ""),
         ]
         reasons = list(self.frames.reasons().items())[:_LONGEST_REASONS]
-        rows += [(f"dropped: {reason}", str(count), "frames") for reason, count in reasons]
+        rows += [(f"dropped: {reason}", str(count), "frame" + "s" * (count > 1)) for reason, count in reasons]
         if self.time_offset_s is not None:
             rows.append(("sensor clock offset", f"{self.time_offset_s:+.4f}", "s"))
         return [*rows, ("verdict", self.verdict, "")]
