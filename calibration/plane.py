@@ -385,7 +385,8 @@ def angle_starts(
         axes = np.linalg.eigh(np.swapaxes(weights * rows, 1, 2) @ rows)[1][..., :1]
         sines = np.abs(rows @ axes)[..., 0]
     across = axes.reshape(-1, 3, 2)
-    lengths = np.linalg.norm(across, axis=1)
+    # Lines all along one axis of the image say nothing of the other.
+    lengths = np.maximum(np.linalg.norm(across, axis=1), np.finfo(float).tiny)
     turns = nearest_rotation(across / lengths[:, None])
     if pixel_mm is None:
         sizes[:, 0] = np.clip(lengths[:, 0] / lengths[:, 1], 1.0 / OBLONG, OBLONG)

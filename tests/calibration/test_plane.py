@@ -111,6 +111,14 @@ def test_a_missing_motion_is_in_the_message(options, motion):
     assert not any(name in str(error.value) for name in motions)
 
 
+def test_lines_that_are_all_level_in_the_image_are_refused():
+    level = lines(count=30)
+    pixels = level.pixels.copy()
+    pixels[1::2, 1] = pixels[::2, 1]
+    with pytest.raises(InsufficientDataError):
+        calibrate_plane(ImagePoints(pixels, level.frame, level.world_from_sensor))
+
+
 def test_lines_against_a_wrong_pixel_size():
     # Determined to 0.2 % by 100 lines.
     np.testing.assert_allclose(calibrate_plane(lines(), 1.3 * PIXEL_MM).chain.pixel_mm, PIXEL_MM, rtol=0.01)
