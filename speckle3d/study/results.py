@@ -138,10 +138,9 @@ class SweepOutcome:
 
     def record(self) -> dict[str, Any]:
         """The outcome as ``study.json`` has it."""
-        names = ("name", "path", "reason", "sha256", "key", "folder", "frames")
+        values = {name: value for name, value in vars(self).items() if name not in ("is_old", "summary")}
         seconds = self.summary.details["seconds"] if self.summary else 0.0
-        status = "done" if self.summary else "failed"
-        return {name: getattr(self, name) for name in names} | {"status": status, "seconds": seconds}
+        return values | {"status": "done" if self.summary else "failed", "seconds": seconds}
 
 
 @dataclass(frozen=True)

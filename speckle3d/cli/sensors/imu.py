@@ -210,11 +210,14 @@ def orient(
         rotations, orientation = orientation_of(log, method, magnetometer)
     if into is not None:
         # As options say, else the calibration, else the sweep that the log is from.
-        file = None if calibration is None else read_calibration(calibration)
+        solution = None if calibration is None else read_calibration(calibration)
         mounting = None if sensor is None else sensor.sensor_from_image
-        offsets = [time_offset_s, *(source.time_offset_s for source in (file, sensor) if source is not None)]
+        offsets = [
+            time_offset_s,
+            *(source.time_offset_s for source in (solution, sensor) if source is not None),
+        ]
         offset_s = next((value for value in offsets if value is not None), 0.0)
-        mounting = mounting if file is None else file.rotation
+        mounting = mounting if solution is None else solution.rotation
         coverage = attach_log(into, log, rotations, mounting, offset_s, replace_stream)
         note(f"orientation of {len(rotations)} samples in {into}{coverage}")
     if out is not None:

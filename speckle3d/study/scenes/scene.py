@@ -80,23 +80,23 @@ def write_scene(
     request, target = request or VolumeRequest(), Path(folder)
     choices = {"deviation": with_deviation, "images": with_images, "poses": with_images}
     kinds = [kind for kind in _NAMES if choices.get(kind, True)]
-    names = {_NAMES[kind].format(sweep.mode) for sweep in posed for kind in kinds}
+    names = {_NAMES[kind].format(posed_sweep.mode) for posed_sweep in posed for kind in kinds}
     old_names = {name.format(mode) for mode in (*MODES, *REFERENCES) for name in _NAMES.values()} - names
     scene: list[dict[str, Any]] = []
     reports = []
     with FileSet(SCENE, tuple(names), tuple(old_names)).replaced(target) as part:
-        for sweep in posed:
-            files = {kind: _NAMES[kind].format(sweep.mode) for kind in kinds}
-            report = _write_mode({kind: part / name for kind, name in files.items()}, sweep, request)
+        for posed_sweep in posed:
+            files = {kind: _NAMES[kind].format(posed_sweep.mode) for kind in kinds}
+            report = _write_mode({kind: part / name for kind, name in files.items()}, posed_sweep, request)
             reports.append(replace(report, path=target / report.path.name))
-            seconds = max(float(np.ptp(sweep.sweep.frame_time_s[sweep.frames])), 1e-3)
+            seconds = max(float(np.ptp(posed_sweep.sweep.frame_time_s[posed_sweep.frames])), 1e-3)
             scene.append(
                 {
-                    "name": printable(f"{sweep.sweep.name}, {sweep.mode}"),
+                    "name": printable(f"{posed_sweep.sweep.name}, {posed_sweep.mode}"),
                     "files": files,
                     "is_bytes": request.settings.voxel_type == "uint8",
-                    "colour": " ".join(f"{share:.3g}" for share in to_rgb(colour_of(sweep.mode))),
-                    "frames_per_s": f"{len(sweep.frames) / seconds:g}",
+                    "colour": " ".join(f"{share:.3g}" for share in to_rgb(colour_of(posed_sweep.mode))),
+                    "frames_per_s": f"{len(posed_sweep.frames) / seconds:g}",
                 }
             )
             if progress is not None:
