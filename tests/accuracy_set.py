@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 from crossing_tissue import GRID, PairCase, tissue_pair
+from sweep_examples import frames_of
 
 from speckle3d.config import Config
 from speckle3d.core.streams import TimedPoses, TimedRotations
@@ -118,7 +119,7 @@ def backwards(sweep):
 
     return replace(
         sweep,
-        frames=np.stack([sweep.frames[i] for i in range(len(sweep))])[::-1],
+        frames=frames_of(sweep)[::-1],
         frame_time_s=span_s - sweep.frame_time_s[::-1],
         truth=sweep.truth[::-1],
         orientation=reversed_stream(OrientationSensor, TimedRotations, sweep.orientation),

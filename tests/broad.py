@@ -37,11 +37,11 @@ def read_trial(folder, name):
     return ImuLog(time_s, *vectors, source=name), trial["opt_quat"], moving
 
 
-def estimate(log, method, settings=None):
+def estimate(log, method):
     """Orientation by a method of `ONLINE` or `OFFLINE`, or any that `orient` knows."""
     if method.startswith("VQF"):
         return Estimate(by_vqf(log, method), np.full((len(log), 3), np.nan))
-    orientation = orient(log, settings, method)
+    orientation = orient(log, method=method)
     north, west, up = orientation.standard_deviation_rad.T
     return Estimate(east_first(orientation.rotations.world_from_sensor), np.column_stack([west, north, up]))
 

@@ -143,9 +143,9 @@ def sensor_text(sensor):
     return "---\n".join(documents)
 
 
-def sensor_of(rotations, time_s, seed=0):
+def sensor_of(rotations, time_s):
     """Stream of a sensor that turns so in the package's world, with the vectors that it measures."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     shape = (len(rotations), 3)
     into = rotations.inv()
     turns = (rotations[:-1].inv() * rotations[1:]).as_rotvec() / np.diff(time_s)[:, None]

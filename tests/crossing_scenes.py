@@ -54,16 +54,8 @@ def grey_of(rng, level, sheets, elevation_axis):
     return 10.0 * np.log10(gaussian_filter(power, blur / VOXEL_MM, truncate=3.0) + 1e-3)
 
 
-def crossing_sweeps(
-    seed=0,
-    frames=60,
-    grid=None,
-    jitter=(0.1, 0.05),
-    speckle=True,
-    fan_deg=FAN_DEG,
-    crossing_deg=90.0,
-):
-    """Two sweeps of one scene, and the true sensor_from_image; jitter in mm and degrees."""
+def crossing_sweeps(seed=0, frames=60, grid=None, fan_deg=FAN_DEG, crossing_deg=90.0):
+    """Two sweeps of one scene, and the true sensor_from_image."""
     rng = np.random.default_rng(seed)
     grid = grid or ImageGrid(64, 240, 0.45, 0.14)
     side = max(LENGTH_MM, grid.width_mm) + 14.0 + grid.depth_mm * np.tan(np.deg2rad(fan_deg / 2.0))
@@ -71,10 +63,10 @@ def crossing_sweeps(
     level, sheets = tissue(rng, size)
     sweeps = []
     for number in range(2):
-        grey = grey_of(rng, level, sheets, 2 - 2 * number) if speckle else level
+        grey = grey_of(rng, level, sheets, 2 - 2 * number)
         poses = _path(rng, frames, fan_deg, crossing_deg * number, grid, size)
         images = _frames(grey, poses, grid)
-        sensor = poses * MOUNTING.inv() * _jitter(rng, frames, jitter)
+        sensor = poses * MOUNTING.inv() * _jitter(rng, frames)
         time_s = np.arange(frames) * 0.04
         sweeps.append(Recording(images, grid, time_s, TimedPoses(time_s, sensor), name=f"sweep {number + 1}"))
     return sweeps[0], sweeps[1], MOUNTING
@@ -116,6 +108,7 @@ def _frames(grey, poses, grid):
     return images
 
 
-def _jitter(rng, frames, size):
-    turn = Rotation.from_rotvec(np.deg2rad(size[1]) * rng.standard_normal((frames, 3)))
-    return RigidTransform.from_components(size[0] * rng.standard_normal((frames, 3)), turn)
+def _jitter(rng, frames):
+    """Of 0.1 mm and 0.05 degrees."""
+    turn = Rotation.from_rotvec(np.deg2rad(0.05) * rng.standard_normal((frames, 3)))
+    return RigidTransform.from_components(0.1 * rng.standard_normal((frames, 3)), turn)

@@ -58,12 +58,12 @@ def drifting_poses(truth, rng):
     return accumulate(about_centre * RigidTransform.from_translation(-CENTRE_MM))
 
 
-def tracker_poses(truth, rng, noise_mm=0.15, noise_deg=0.1, outliers=0.0):
-    """Tracker readings: Gaussian noise per axis at the image origin, a share of poses off by 2 mm."""
+def tracker_poses(truth, rng, outliers=0.0):
+    """Tracker readings: noise of 0.15 mm and 0.1 degrees per axis, a share of poses off by 2 mm."""
     n = len(truth)
-    offset = rng.normal(0.0, noise_mm, (n, 3))
+    offset = rng.normal(0.0, 0.15, (n, 3))
     direction = rng.normal(size=(n, 3))
     direction *= 2.0 / np.linalg.norm(direction, axis=1, keepdims=True)
     offset += np.where(rng.uniform(size=(n, 1)) < outliers, direction, 0.0)
-    turn = Rotation.from_rotvec(np.deg2rad(rng.normal(0.0, noise_deg, (n, 3))))
+    turn = Rotation.from_rotvec(np.deg2rad(rng.normal(0.0, 0.1, (n, 3))))
     return truth * RigidTransform.from_components(offset, turn)

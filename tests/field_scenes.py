@@ -62,15 +62,15 @@ def with_readings(log, **changes):
 # -- motions
 
 
-def simulate_motion(rng, seconds, rate_hz=100.0, period_s=2.0):
-    """The motion of a hand, in waves of a period and longer: at rest for 3 s, then turning and shifting."""
-    time_s = np.arange(0.0, seconds, 1.0 / rate_hz)
+def simulate_motion(rng, seconds):
+    """A hand at 100 Hz: at rest for 3 s, then turning and shifting in waves of 2 s and longer."""
+    time_s = np.arange(0.0, seconds, 0.01)
     fade = np.clip((time_s - 3.0) / 1.0, 0.0, 1.0)[:, None]
-    turns = Rotation.from_euler("ZYX", fade * wandering(time_s, rng, [0.9, 0.5, 0.5], period_s))
-    shift_m = fade * wandering(time_s, rng, 0.1, period_s)
+    turns = Rotation.from_euler("ZYX", fade * wandering(time_s, rng, [0.9, 0.5, 0.5], 2.0))
+    shift_m = fade * wandering(time_s, rng, 0.1, 2.0)
     acceleration_m_s2 = np.gradient(np.gradient(shift_m, time_s, axis=0), time_s, axis=0)
     force = turns.inv().apply(acceleration_m_s2 + np.array([0.0, 0.0, 9.81]))
-    rate = (turns[:-1].inv() * turns[1:]).as_rotvec() * rate_hz
+    rate = (turns[:-1].inv() * turns[1:]).as_rotvec() * 100.0
     rate = np.vstack([rate[:1], rate]) + np.deg2rad(rng.normal(0.0, 0.3, 3))
     log = ImuLog(
         time_s,

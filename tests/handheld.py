@@ -31,6 +31,6 @@ def handheld(sweep):
     return replace(sweep, frame_time_s=times, orientation=inside, tracker=None, truth=None)
 
 
-def write_handheld(path, sweep, element_mm=PITCH_MM):
+def write_handheld(path, sweep):
     """Write the sweep's package, packed, under the file's own name."""
-    return write_package(path, handheld(sweep), lzop=True, element_mm=element_mm, name=path.stem)
+    return write_package(path, handheld(sweep), lzop=True, element_mm=PITCH_MM, name=path.stem)

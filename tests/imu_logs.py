@@ -76,9 +76,9 @@ def mt9_bin(s, unit, first=0):
     return encode(calibration_message(unit)) + records[0][-15:] + b"".join(records)
 
 
-def configuration(layout, period=1152):
+def configuration(layout):
     """The answer to a request for the configuration."""
-    return encode(configuration_message([(layout.mode, layout.settings)], period))
+    return encode(configuration_message([(layout.mode, layout.settings)]))
 
 
 def legacy_values(s, layout, first=0):

@@ -4,13 +4,23 @@ from types import SimpleNamespace
 
 import numpy as np
 
+from speckle3d.core.curves import TiltResponse
+from speckle3d.core.grid import ImageGrid
 from speckle3d.kernels.plane_misfit import EchoModels
+from speckle3d.matching.patches import lay_patches
 from speckle3d.matching.schedule import TrajectorySettings
 from speckle3d.matching.table import CorrelationTable
 from speckle3d.motion.planes import MotionProblem, PairPlanes, PlaneSettings, fully_developed, pair_planes
 
+GRID = ImageGrid(vectors=127, samples=640, vector_pitch_mm=0.3, sample_spacing_mm=0.06)
+PATCHES = lay_patches(GRID)
+AT = PATCHES.centre_mm - GRID.centre_mm[:2]
+"""Centres of the patches about the image's."""
+TILT = TiltResponse(np.array([-9.0, 8.0]), np.array([2.0, 6.0]))
+"""As a linear probe's: turning is about a point near the focus, some seven millimetres off at either end."""
 
-def problem_of(curves, patches, grid, frames=2, **settings):
+
+def problem_of(curves, patches=PATCHES, grid=GRID, frames=2, **settings):
     return MotionProblem(
         curves, patches, grid.centre_mm, frames, PlaneSettings(**settings), TrajectorySettings()
     )
@@ -43,7 +53,7 @@ def fit(problem, rho, shift_mm=(0.0, 0.0), share=None, gain=None, **priors):
     return SimpleNamespace(offset_mm=offset, slope_x=slope_x, slope_y=slope_y, **fields)
 
 
-def from_coefficients(first, second, coefficients, covariance, patches=1):
+def from_coefficients(first, second, coefficients, covariance):
     """Planes given by their coefficients, (e, 3), and covariances, (e, 3, 3) or one for all."""
     coefficients = np.asarray(coefficients, float).reshape(-1, 3)
     pairs = len(coefficients)
@@ -53,5 +63,5 @@ def from_coefficients(first, second, coefficients, covariance, patches=1):
         np.broadcast_to(second, pairs),
         coefficients,
         np.array(np.broadcast_to(covariance, (pairs, 3, 3)), float),
-        np.ones((pairs, patches), bool),
+        np.ones((pairs, 1), bool),
     )

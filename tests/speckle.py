@@ -4,6 +4,8 @@ Written for the tests alone and independent of the package's simulator: complex 
 the Fourier domain on a fine periodic grid, read at any point by quintic splines.
 """
 
+from dataclasses import replace
+
 import numpy as np
 from scipy import fft, ndimage
 
@@ -35,7 +37,8 @@ def triangle_correlation(d, sigma_mm):
 class Speckle:
     """A plane of speckle, `margin_mm` wider than an image on every side."""
 
-    def __init__(self, rng, spectrum=gaussian, grid=GRID, sigmas_mm=(LATERAL_MM, AXIAL_MM), margin_mm=6.0):
+    def __init__(self, rng, spectrum=gaussian, grid=GRID, margin_mm=6.0):
+        sigmas_mm = LATERAL_MM, AXIAL_MM
         self.grid = grid
         # 3.5 samples to a standard deviation: quintic splines are then right to about 1e-4.
         self.step = np.array(sigmas_mm) / 3.5
@@ -83,6 +86,7 @@ RF = RFSettings(
     sampling_rate_hz=40e6, speed_of_sound_m_s=1540.0, centre_frequency_hz=7e6, bandwidth_hz=(4e6, 10e6)
 )
 KEY = CurveKey(RF, GRID.vector_pitch_mm, 3.6, 3.0, 2.0)
+ECHO = replace(KEY, correlation_of="echo")
 
 
 def gaussian_correlation(d, sigma_mm):
@@ -90,11 +94,11 @@ def gaussian_correlation(d, sigma_mm):
     return np.exp(-(np.asarray(d) ** 2) / (2 * sigma_mm**2))
 
 
-def curves(correlation=gaussian_correlation, sigma_mm=0.45, cells=25.0, depth_mm=(5.0, 30.0), largest_mm=2.0):
-    """Decorrelation curves of a known law, its width the same (or given) at each depth."""
+def curves(sigma_mm=0.45, cells=25.0, depth_mm=(5.0, 30.0), largest_mm=2.0, key=KEY):
+    """Curves of a Gaussian beam, its width the same (or given) at each depth."""
     distance = np.linspace(0.0, largest_mm, 201)
-    widths = np.broadcast_to(sigma_mm, (len(depth_mm),))
-    rho = np.minimum.accumulate(np.maximum([correlation(distance, width) for width in widths], 1e-9), axis=1)
+    widths = np.broadcast_to(sigma_mm, (len(depth_mm),))[:, None]
+    rho = np.maximum(gaussian_correlation(distance, widths), 1e-9)
     return DecorrelationCurves(
-        KEY, np.array(depth_mm), distance, rho, np.full(len(depth_mm), float(cells)), 100
+        key, np.array(depth_mm), distance, rho, np.full(len(depth_mm), float(cells)), 100
     )

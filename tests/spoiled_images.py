@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+from sweep_examples import frames_of
 
 
 def with_frames(sweep, frames, order=None):
@@ -21,14 +22,14 @@ def with_frames(sweep, frames, order=None):
 
 def first_vectors(sweep):
     """The first 24 vectors of a sweep, held in memory."""
-    frames = np.stack([sweep.frames[k][:24] for k in range(len(sweep))]).astype(np.float32)
+    frames = frames_of(sweep)[:, :24]
     return with_frames(replace(sweep, frames=frames, grid=replace(sweep.grid, vectors=24)), frames)
 
 
 def shadow(sweep, columns, rows):
     """A bone's shadow: nothing but fresh noise of 3 counts in some vectors and samples of every frame."""
     rng = np.random.default_rng(5)
-    frames = np.array([sweep.frames[k] for k in range(len(sweep))], np.float32)
+    frames = frames_of(sweep).astype(np.float32)
     frames[:, columns, rows] *= 0.002
     return with_frames(sweep, np.rint(frames + rng.normal(0.0, 3.0, frames.shape)))
 
@@ -36,7 +37,7 @@ def shadow(sweep, columns, rows):
 def ringing(sweep, columns):
     """Vectors without contact: ringing that is the same in every frame, and fresh noise."""
     rng = np.random.default_rng(6)
-    frames = np.array([sweep.frames[k] for k in range(len(sweep))], np.float32)
+    frames = frames_of(sweep).astype(np.float32)
     sample = np.arange(frames.shape[2])
     frames[:, columns] = 800.0 * np.exp(-sample / 150.0) * np.sin(0.7 * sample)
     return with_frames(sweep, np.rint(frames + rng.normal(0.0, 3.0, frames.shape)))
@@ -45,7 +46,7 @@ def ringing(sweep, columns):
 def text_overlay(sweep):
     """White dots among the letters' strokes, in three blocks of a third of the image by a tenth."""
     rng = np.random.default_rng(7)
-    frames = np.array([sweep.frames[k] for k in range(len(sweep))], np.float32)
+    frames = frames_of(sweep).astype(np.float32)
     wide, high = frames.shape[1] // 3, frames.shape[2] // 10
     for vector, sample in ((0, 2 * high), (wide + 8, 4.5 * high), (2, 7 * high)):
         block = np.s_[:, vector : vector + wide, int(sample) : int(sample) + high]
@@ -64,9 +65,9 @@ def level_by_depth(frames):
     return np.sqrt(np.convolve(power, np.full(201, 1 / 201), "same"))
 
 
-def at_rest(sweep, snr_db):
-    """A probe that rests on the first frame's tissue, with fresh noise in every frame."""
-    level = 10 ** (-snr_db / 20) * level_by_depth(sweep.frames[:1])
+def at_rest(sweep):
+    """A probe that rests on the first frame's tissue, with fresh noise 3 dB below in every frame."""
+    level = 10 ** (-3 / 20) * level_by_depth(sweep.frames[:1])
     noise = level * np.random.default_rng(1).standard_normal(sweep.frames.shape)
     return with_frames(sweep, sweep.frames[:1] + noise, np.zeros(len(sweep), dtype=int))
 

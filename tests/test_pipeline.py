@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from sweep_examples import frames_of
 
-from speckle3d.config import Config
-from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.geometry import mirrored
 from speckle3d.io.curves import read_curves
 from speckle3d.io.load import load_sweep
@@ -54,7 +54,7 @@ def test_setting_then_tracker_then_nothing_settles_the_direction(sweep, tracking
 
 def spoilt(sweep, numbers, change):
     """The sweep with some frames changed by a function of the frame."""
-    frames = np.stack([sweep.frames[k] for k in range(len(sweep))]).astype(np.float32)
+    frames = frames_of(sweep).astype(np.float32)
     for number in numbers:
         frames[number] = change(frames[number])
     return replace(sweep, frames=frames)
@@ -106,12 +106,6 @@ def test_a_spoilt_frame_is_placed_between_its_neighbours_and_not_trusted(sweep, 
     assert abs(z[11] - expected[11]) < 0.08
     deviation = np.sqrt(tracking.covariance[:, 2, 2])
     assert deviation[11] > 3 * np.delete(deviation, [0, 11]).max()
-
-
-def test_curves_of_intensity_do_not_serve_echoes(sweep, curves):
-    config = Config.model_validate({"matching": {"correlate": "intensity"}})
-    with pytest.raises(MismatchError, match="correlation_of"):
-        track(sweep, curves, config)
 
 
 def test_curves_beside_a_recording_are_taken_and_said(data_folder):

@@ -1,8 +1,5 @@
 """One sweep as RF and as I/Q: the same lengths, with curves that were measured on RF."""
 
-from dataclasses import replace
-
-import numpy as np
 import pytest
 
 from speckle3d.core.geometry import elevational_steps
@@ -39,9 +36,3 @@ def test_i_and_q_give_the_lengths_of_their_rf(rf, length_of, length_of_rf, middl
     assert length == pytest.approx(length_of_rf, rel=2e-3)
     # 1.1 %, the worst of a phantom's sweeps of 20 mm in the documentation, over the root of a fifth of that.
     assert length == pytest.approx(elevational_steps(rf.truth, rf.grid.centre_mm).sum(), rel=0.025)
-
-
-def test_the_other_sign_of_q_is_told(rf, curves):
-    iq = received(rf)
-    frames = np.conj([iq.frames[k] for k in range(len(iq))])
-    assert any("sign of Q" in str(doubt) for doubt in track(replace(iq, frames=frames), curves).doubts)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import spoiled_images as spoil
 from accuracy_set import SHEET
+from sweep_examples import frames_of
 
 from speckle3d.config import Config
 from speckle3d.core.errors import InsufficientDataError
@@ -40,7 +41,7 @@ def test_static_clutter_as_strong_as_the_signal_is_refused(narrow, curves, patte
 
 def test_noise_on_a_probe_at_rest_is_no_sweep(narrow, curves):
     with pytest.raises(InsufficientDataError):
-        track(spoil.at_rest(spoil.in_order(narrow, range(40)), 3.0), curves)
+        track(spoil.at_rest(spoil.in_order(narrow, range(40))), curves)
 
 
 def test_a_shadow_is_left_out_and_told_and_the_length_stays(sweep, curves):
@@ -67,7 +68,7 @@ def test_what_stands_still_is_left_out_and_the_length_stays(sweep, curves, signa
 
 def test_what_stands_still_outside_the_region_changes_nothing(sweep, curves):
     part = sweep.part(0, 40)
-    frames = np.array([part.frames[k] for k in range(len(part))], np.float32)
+    frames = frames_of(part).astype(np.float32)
     frames[:, 24:] = frames[0, 24:]
     settings = Config(patches={"region": "rectangle 0,0 7,40"})
     true, estimate, sigma = length_of(part, track(spoil.with_frames(part, frames), curves, settings))

@@ -55,7 +55,7 @@ def scene(seed, frames=30, degrees=12.0):
     centre = np.array([*(PIXEL_MM * SHAPE / 2), 0.0])
     phantom_from_image = RigidTransform.from_components(middle - rotation.apply(centre), rotation)
     world_from_sensor = world_from_phantom * phantom_from_image * sensor_from_image.inv()
-    pixels = np.stack([cut(ENDS_MM, phantom_from_image[i]) for i in range(frames)])
+    pixels = np.stack([cut(phantom_from_image[i]) for i in range(frames)])
     return Scene(
         WirePhantom(NAMES, ENDS_MM, PATTERNS, world_from_phantom),
         sensor_from_image,
@@ -64,10 +64,10 @@ def scene(seed, frames=30, degrees=12.0):
     )
 
 
-def cut(ends, phantom_from_image):
+def cut(phantom_from_image):
     """Column and row at which an image shows each wire, from heights of the wires' ends over its plane."""
     image = phantom_from_image.inv()
-    front, back = image.apply(ends[:, 0]), image.apply(ends[:, 1])
+    front, back = image.apply(ENDS_MM[:, 0]), image.apply(ENDS_MM[:, 1])
     share = front[:, 2] / (front[:, 2] - back[:, 2])
     return (front + share[:, None] * (back - front))[:, :2] / PIXEL_MM
 

@@ -8,19 +8,15 @@ MB and half a minute each); the rest is computed anew. Last come how often the c
 and poses hold.
 """
 
-import argparse
-import os
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-
+import bench
 import numpy as np
 from cache import DEFAULT, sweep_file
-from options import parse_options
 
 from speckle3d.config import Config
 from speckle3d.corrections import correct
@@ -33,7 +29,7 @@ from speckle3d.simulation.presets import SimulationSettings
 from speckle3d.tracking import track
 
 FIRST_SEED = 1001
-CURVES_FILE = Path(__file__).resolve().parents[2] / "data" / "curves.h5"
+CURVES_FILE = bench.DATA / "curves.h5"
 VECTORS = 48
 STEPS = {"preset": "stepped", "steps": 27, "step_mm": 0.06, "blocks": 6}
 CURVE_SWEEPS = (
@@ -150,13 +146,13 @@ def _coverage(standard):
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = bench.parser_of(__doc__)
     parser.add_argument("--seeds", type=int, default=8, help="how many")
     parser.add_argument("--first", type=int, default=FIRST_SEED, help="the first of them")
     parser.add_argument("--workers", type=int, default=2, help="sweeps at a time, a process each")
     parser.add_argument("--case", default="", help="only cases whose name holds this")
     parser.add_argument("--cache", type=Path, default=DEFAULT)
-    options = parse_options(parser, seeds=1, case="tissue, 8 mm", workers=1)
+    options = bench.parse_options(parser, seeds=1, case="tissue, 8 mm", workers=1)
     curves = read_curves(CURVES_FILE) if options.quick else curves_of(options.cache)
     seeds = range(options.first, options.first + options.seeds)
     print(f"seeds {seeds[0]} to {seeds[-1]}; curves from other sweeps, of seeds 11 to 16")

@@ -6,17 +6,12 @@ table; so does why one is missed, until it is met. Rows that miss a goal and do 
 the command then ends with 1.
 """
 
-import argparse
-import os
 import sys
 import tempfile
 from pathlib import Path
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
+import bench
 from accuracy_set import CASES, INDEPENDENT, MOST_CLAIMS, TABLE, AccuracySet, read_table, simulate_set
-from options import parse_options
 
 HEAD = """\
 # By tests/benchmarks/bench_accuracy_set.py, but for goals and for `missed`: why goals are not asserted yet.
@@ -43,18 +38,17 @@ def row(errors, before):
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = bench.parser_of(__doc__)
     parser.add_argument("--keep", type=Path, help="folder of the simulated sweeps, made if it is not there")
     parser.set_defaults(cases="")
-    options = parse_options(parser, cases="phantom, 3.5 mm")
+    options = bench.parse_options(parser, cases="phantom, 3.5 mm")
     before, lines, surprises = read_table() if TABLE.exists() else {}, [], []
     with tempfile.TemporaryDirectory() as scratch:
         folder = options.keep or Path(scratch) / "sweeps"
-        data_folder = TABLE.parents[2] / "data"
         if not (folder.is_dir() or options.quick):
             folder.mkdir(parents=True)
-            simulate_set(folder, data_folder)
-        accuracy_set = AccuracySet(folder, data_folder)
+            simulate_set(folder, bench.DATA)
+        accuracy_set = AccuracySet(folder, bench.DATA)
         for case in (case for case in CASES if options.cases in case):
             if case.startswith("independent") and not INDEPENDENT.is_dir():
                 sys.exit(f"expected sweeps of another physics in {INDEPENDENT}")

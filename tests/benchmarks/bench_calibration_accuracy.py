@@ -7,19 +7,13 @@ plane (a thin bar or a wall) or two crossing threads; or a package of a handheld
 plane: I/Q, packed, the sensor in bursts, of which the command sees nothing else.
 """
 
-import argparse
-import os
-import sys
 import tempfile
 from pathlib import Path
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
+import bench
 import numpy as np
 from commands import run_command
 from handheld import PITCH_MM, write_handheld
-from options import parse_options
 from scipy.spatial.transform import RigidTransform
 
 from calibration.detection.lines import detect_lines
@@ -124,12 +118,12 @@ def report(name, errors):
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = bench.parser_of(__doc__)
     parser.add_argument("phantoms", nargs="*", metavar="PHANTOM", help=f"of {', '.join(SCANS)}; or all")
     parser.add_argument("--scans", type=int, default=25)
     parser.add_argument("--frames", type=int, default=100)
     parser.add_argument("--first-seed", type=int, default=FIRST_SEED)
-    options = parse_options(parser, phantoms=["bar", "handheld"], scans=1, frames=40)
+    options = bench.parse_options(parser, phantoms=["bar", "handheld"], scans=1, frames=40)
     for phantom in options.phantoms or SCANS:
         print(
             f"{phantom}, {options.frames} frames (published, plane: sd of tilt, yaw, roll 1.50, 1.10, 0.08)"

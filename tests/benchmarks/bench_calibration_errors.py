@@ -7,30 +7,27 @@ truth. Seeds and set-ups are not those of development. Ends with status 1 where 
 target is missed, but for ``--quick``.
 """
 
-import argparse
 import os
 import sys
 import time
 from importlib import import_module
 from pathlib import Path
 
-from options import parse_options
+import bench
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("NUMBA_NUM_THREADS", "1")
 
 FOLDER = Path(__file__).resolve().parent
-sys.path.insert(0, str(FOLDER.parent))  # processes of trials have it, too
 KINDS = sorted(path.stem for path in (FOLDER / "calibration_errors").glob("[!_]*.py") if path.stem != "rows")
 FIRST_SEED = 900_001
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = bench.parser_of(__doc__)
     parser.add_argument("kinds", nargs="*", metavar="KIND", help=f"any of: {', '.join(KINDS)}; or all")
     parser.add_argument("--share", type=float, default=1.0, help="of the trials")
     parser.add_argument("--first-seed", type=int, default=FIRST_SEED)
-    options = parse_options(parser, share=0.02, kinds=["clock", "motions", "plane"])
+    options = bench.parse_options(parser, share=0.02, kinds=["clock", "motions", "plane"])
     if unknown := sorted(set(options.kinds) - set(KINDS)):
         parser.error(f"expected kinds among {', '.join(KINDS)}, got {', '.join(unknown)}")
     misses = 0

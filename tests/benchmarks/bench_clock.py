@@ -4,13 +4,8 @@ Run: ``python tests/benchmarks/bench_clock.py [--scans 3]`` (sweeps are simulate
 cache).
 """
 
-import argparse
-import os
-
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-
+import bench
 from cache import sweep_file
-from options import parse_options
 
 from calibration.clock.images import delay_from_images
 from calibration.points import Recording
@@ -22,10 +17,10 @@ FIRST_SEED = 41
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = bench.parser_of(__doc__)
     parser.add_argument("--scans", type=int, default=3)
     parser.add_argument("--frames", type=int, default=100)
-    options = parse_options(parser, scans=1, frames=60)
+    options = bench.parse_options(parser, scans=1, frames=60)
     for seed in range(FIRST_SEED, FIRST_SEED + options.scans):
         frames = {"frames": options.frames, "length_mm": options.frames / 5.0}
         settings = SimulationSettings(preset="reversal", seed=seed, vectors=32, samples=1909, **frames)

@@ -7,7 +7,6 @@ Every module constant of `speckle3d.motion` that is a number is halved and doubl
 lengths are printed in per cent, the largest first. Constants of kernels are compiled in and stay.
 """
 
-import argparse
 import pkgutil
 from contextlib import ExitStack, contextmanager
 from importlib import import_module
@@ -15,8 +14,8 @@ from itertools import islice
 from pathlib import Path
 from unittest.mock import patch
 
+import bench
 import numpy as np
-from options import parse_options
 
 import speckle3d.motion
 from speckle3d.core.errors import Speckle3DError
@@ -24,7 +23,6 @@ from speckle3d.io.curves import read_curves
 from speckle3d.io.load import load_sweep
 from speckle3d.tracking import track
 
-DATA = Path(__file__).resolve().parents[2] / "data"
 NOT_OF_THE_PATH = ("diffraction", "lens", "phantom")
 """Modules of curves, which change no estimate."""
 MODULES = [
@@ -67,12 +65,12 @@ def travels(sweeps, curves):
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("sweeps", nargs="*", type=Path, default=[DATA / "phantom.h5"])
-    parser.add_argument("--curves", type=Path, default=DATA / "curves.h5")
+    parser = bench.parser_of(__doc__)
+    parser.add_argument("sweeps", nargs="*", type=Path, default=[bench.DATA / "phantom.h5"])
+    parser.add_argument("--curves", type=Path, default=bench.DATA / "curves.h5")
     parser.add_argument("--frames", type=int, default=100000, help="of each sweep, at most")
     parser.add_argument("--most", type=int, default=1000, help="changes, at most")
-    options = parse_options(parser, frames=12, most=4)
+    options = bench.parse_options(parser, frames=12, most=4)
     sweeps = [load_sweep(path) for path in options.sweeps]
     sweeps = [sweep.part(0, min(options.frames, len(sweep))) for sweep in sweeps]
     curves, rows = read_curves(options.curves), {}

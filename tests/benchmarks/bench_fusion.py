@@ -5,17 +5,12 @@ without one, of a simulated sensor with iron on it. On-line methods stand beside
 off-line. Last comes how often errors are within one claimed sigma.
 """
 
-import argparse
-import sys
 from pathlib import Path
 
+import bench
 import numpy as np
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
 from broad import OFFLINE, ONLINE, coverage, errors_deg, estimate, read_trial, trials_in
 from field_scenes import scene, simulate_motion
-from options import parse_options
 
 METHODS = ONLINE + OFFLINE
 GROUPS = {"undisturbed": "_undisturbed_", "disturbed": "_disturbed_", "all": ""}
@@ -37,9 +32,9 @@ def row(cells):
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = bench.parser_of(__doc__)
     parser.add_argument("folder", type=Path, nargs="?")
-    options = parse_options(parser, folder=None)
+    options = bench.parse_options(parser, folder=None)
     print(f"{'RMS, degrees (without constant heading)':42}" + "".join(f"{m:^16}" for m in METHODS))
     cells, shares = {}, []
     for name, log, true, moving in trials(options.folder):

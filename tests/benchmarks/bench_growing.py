@@ -6,19 +6,15 @@ process writes frames as fast as it can and counts them; SIGKILL at a time drawn
 was written.
 """
 
-import argparse
 import random
-import sys
 import tempfile
 import time
 from multiprocessing import get_context
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
+import bench
 import numpy as np
 import sweep_examples
-from options import parse_options
 
 from speckle3d.core.sweep import stored_dtype
 from speckle3d.io.load import load_sweep, open_recording
@@ -73,10 +69,10 @@ def check(path, sweep, count):
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = bench.parser_of(__doc__)
     parser.add_argument("--kills", type=int, default=200)
     parser.add_argument("--seed", type=int, default=1)
-    options = parse_options(parser, kills=8)
+    options = bench.parse_options(parser, kills=8)
     rng, frames = random.Random(options.seed), 0
     with tempfile.TemporaryDirectory() as folder:
         for k in range(options.kills):

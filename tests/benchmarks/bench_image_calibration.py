@@ -6,18 +6,10 @@ The pair of sweeps is simulated tissue (minutes, kept in the cache); each start 
 random within 20 mm and 20 degrees.
 """
 
-import argparse
-import os
-import sys
-from pathlib import Path
-
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
+import bench
 import numpy as np
 from cache import sweep_file
 from crossing_scenes import displace
-from options import parse_options
 
 from calibration.images.similarity import prepare
 from calibration.images.solver import calibrate_from_sweeps
@@ -71,11 +63,11 @@ def study(crossing, starts):
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = bench.parser_of(__doc__)
     parser.add_argument("--starts", type=int, default=183)
     parser.add_argument("--seed", type=int, default=601)
     parser.add_argument("--frames", type=int, default=160)
-    options = parse_options(parser, starts=1, frames=40)
+    options = bench.parse_options(parser, starts=1, frames=40)
     errors = study(prepare_pair(options.seed, options.frames), options.starts)
     middle = np.median(errors, axis=0)
     with np.errstate(invalid="ignore"):

@@ -4,28 +4,22 @@
 simulated once (an hour and a half on two cores) and kept.
 """
 
-import argparse
-import sys
-from pathlib import Path
-
-sys.path.insert(0, str(Path(__file__).resolve().parent))
-
+import bench
 from cache import DEFAULT
 from length import crossing, sweeps
-from options import parse_options
 
 FIRST_SEED = 970_001
 """Judged seeds count from here; development used 1 to 99."""
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = bench.parser_of(__doc__)
     parser.add_argument("part", nargs="*", help="sweeps, crossing; by default both")
     parser.add_argument("--first-seed", type=int, default=FIRST_SEED)
     parser.add_argument("--seeds", type=int, default=6, help="RF sweeps of each case")
     parser.add_argument("--share", type=float, default=1.0, help="of the cheaper cases")
     parser.add_argument("--workers", type=int, default=2)
-    options = parse_options(parser, part=["crossing"], share=0.01)
+    options = bench.parse_options(parser, part=["crossing"], share=0.01)
     seeds = range(options.first_seed, options.first_seed + options.seeds)
     parts = {
         "sweeps": lambda: sweeps.measure(seeds, DEFAULT, options.workers),

@@ -4,15 +4,14 @@ Run: ``python tests/benchmarks/bench_live.py [SWEEP CURVES] [--seconds 20]``. Th
 the loopback at its own rate, to and fro so that it can go on.
 """
 
-import argparse
 import tempfile
 import threading
 import time
 from multiprocessing import get_context
 from pathlib import Path
 
+import bench
 import numpy as np
-from options import parse_options
 
 import speckle3d as s3
 from speckle3d.io.igtl.link import Connection, Server
@@ -20,8 +19,6 @@ from speckle3d.io.igtl.messages import TransformReceived, packed_image
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.live.session import Session, SessionSettings
 from speckle3d.live.warming import warm_up
-
-DATA = Path(__file__).resolve().parents[2] / "data"
 
 
 def play(path, seconds, answers):
@@ -56,11 +53,11 @@ def play(path, seconds, answers):
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("sweep", type=Path, nargs="?", default=DATA / "phantom.h5")
-    parser.add_argument("curves", type=Path, nargs="?", default=DATA / "curves.h5")
+    parser = bench.parser_of(__doc__)
+    parser.add_argument("sweep", type=Path, nargs="?", default=bench.DATA / "phantom.h5")
+    parser.add_argument("curves", type=Path, nargs="?", default=bench.DATA / "curves.h5")
     parser.add_argument("--seconds", type=float, default=20.0)
-    options = parse_options(parser, seconds=2.0)
+    options = bench.parse_options(parser, seconds=2.0)
     curves, sweep = s3.load_curves(options.curves), s3.load_sweep(options.sweep)
     signal = {
         name: getattr(sweep.signal, name)

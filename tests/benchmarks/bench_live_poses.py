@@ -8,19 +8,16 @@ has ended, from the whole sweep's (most). They are those to a path or to its mir
 nearer: images do not tell the sign of motion, and here nothing else does.
 """
 
-import argparse
 from dataclasses import replace
 from pathlib import Path
 
+import bench
 import numpy as np
-from options import parse_options
 from scipy.spatial.transform import RigidTransform
 
 import speckle3d as s3
 from speckle3d.core.geometry import mirrored
 from speckle3d.live.tracking import LiveTracker
-
-DATA = Path(__file__).resolve().parents[2] / "data"
 
 
 def apart_mm(poses, reference, centre_mm):
@@ -52,12 +49,12 @@ def row(sweep, curves, step):
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("sweeps", type=Path, nargs="*", default=[DATA / "phantom.h5"])
-    parser.add_argument("--curves", type=Path, default=DATA / "curves.h5")
+    parser = bench.parser_of(__doc__)
+    parser.add_argument("sweeps", type=Path, nargs="*", default=[bench.DATA / "phantom.h5"])
+    parser.add_argument("--curves", type=Path, default=bench.DATA / "curves.h5")
     parser.add_argument("--step", type=int, default=4)
     parser.add_argument("--frames", type=int, default=100000, help="of each sweep, at most")
-    options = parse_options(parser, step=8, frames=16)
+    options = bench.parse_options(parser, step=8, frames=16)
     curves = s3.load_curves(options.curves)
     print("| sweep | first sent, against the frames up to it: median | most | against the whole | ", end="")
     print("that part against the whole | at the end |")

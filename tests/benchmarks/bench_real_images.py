@@ -3,20 +3,14 @@
 Run: ``python tests/benchmarks/bench_real_images.py [--seeds 3] [--length-mm 6] [--signal rf|bmode]``.
 """
 
-import argparse
-import os
-import sys
 from dataclasses import dataclass, replace
-from pathlib import Path
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
+import bench
 import numpy as np
 import spoiled_images as spoil
 from accuracy_set import SHEET, grey
-from options import parse_options
 from scipy.spatial.transform import RigidTransform
+from sweep_examples import frames_of
 
 from speckle3d.core.errors import Speckle3DError
 from speckle3d.core.sweep import Sweep
@@ -100,8 +94,7 @@ def spoilt(sweep, is_bmode):
 
 def in_memory(sweep):
     """The sweep without sensors, its frames in memory."""
-    frames = np.stack([sweep.frames[k] for k in range(len(sweep))])
-    return replace(sweep, frames=frames, tracker=None, orientation=None)
+    return replace(sweep, frames=frames_of(sweep), tracker=None, orientation=None)
 
 
 def cases(sweep, is_bmode):
@@ -113,13 +106,13 @@ def cases(sweep, is_bmode):
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = bench.parser_of(__doc__)
     parser.add_argument("--first-seed", type=int, default=5001)
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--length-mm", type=float, default=6.0)
     parser.add_argument("--vectors", type=int, default=36)
     parser.add_argument("--signal", choices=("rf", "bmode"), default="rf")
-    options = parse_options(parser, seeds=1, length_mm=1.5, vectors=20)
+    options = bench.parse_options(parser, seeds=1, length_mm=1.5, vectors=20)
     size = {"length_mm": options.length_mm, "vectors": options.vectors, "samples": 2600}
     rows = {}
     for seed in range(options.first_seed, options.first_seed + options.seeds):

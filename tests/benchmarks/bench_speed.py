@@ -5,21 +5,13 @@ extra ``bench``. Frames are of 127 vectors by 3818 samples; sweeps are simulated
 kept. A ``!`` marks a target that is missed; peers are given in the unit of the row.
 """
 
-import argparse
-import os
 import platform
-import sys
 from functools import cache
 from importlib import import_module
-from pathlib import Path
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
+import bench
 from bench_accuracy import curves_of
 from cache import DEFAULT, sweep_file, to_and_fro
-from options import parse_options
 from speed import commands
 from speed.rows import print_table
 
@@ -43,10 +35,10 @@ def main():
         "patches": lambda: (sweep_file(SWEEP),),
     }
     parts = ("tracking", "patches", "sensors", "commands", "voxels", "memory")
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = bench.parser_of(__doc__)
     parser.add_argument("--runs", type=int, default=7)
     parser.add_argument("--only", nargs="*", choices=parts, default=parts)
-    options = parse_options(parser, runs=1, only=["commands"])
+    options = bench.parse_options(parser, runs=1, only=["commands"])
     print(f"{platform.machine()}, {cores()} cores, {platform.system()}", flush=True)
     table = []
     for part in options.only:

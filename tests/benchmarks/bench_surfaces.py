@@ -3,17 +3,9 @@
 Run: ``python tests/benchmarks/bench_surfaces.py``.
 """
 
-import argparse
-import os
-import sys
-from pathlib import Path
-
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
+import bench
 import numpy as np
 from digital_phantom import LEVEL, Ball, Phantom, by_hand, voxel_volume
-from options import parse_options
 
 from speckle3d.core.grid import ImageGrid
 from speckle3d.core.volume import Volume
@@ -41,10 +33,10 @@ def volume_by(way, images, grid, poses, voxel_grid):
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = bench.parser_of(__doc__)
     parser.add_argument("--balls", type=int, default=len(BALLS))
     parser.add_argument("--frames", type=int, default=220)
-    options = parse_options(parser, balls=1, frames=110)
+    options = bench.parse_options(parser, balls=1, frames=110)
     balls = BALLS[: options.balls]
     phantom = Phantom(balls, ImageGrid(200, 230, 0.1, 0.1))
     poses = by_hand(options.frames, 0.1 * options.frames)

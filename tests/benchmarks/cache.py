@@ -32,7 +32,7 @@ def ensure_file(path, make):
     return path
 
 
-def to_and_fro(source, frames, folder=DEFAULT):
+def to_and_fro(source, frames):
     """A long sweep made of a short one run forward and back, with exact sensors that read once per frame."""
 
     def long():
@@ -50,7 +50,7 @@ def to_and_fro(source, frames, folder=DEFAULT):
             path=None,
         )
 
-    return ensure_file(folder / f"{source.stem}-{frames}.h5", long)
+    return ensure_file(DEFAULT / f"{source.stem}-{frames}.h5", long)
 
 
 class _InOrder:

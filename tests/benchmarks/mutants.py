@@ -102,7 +102,7 @@ def on_return(change):
     return lambda function, *arguments, **keywords: change(function(*arguments, **keywords))
 
 
-TRACK, DIRECTION = "speckle3d.pipeline:track", "speckle3d.motion.direction:settle_direction"
+TRACK, DIRECTION = "speckle3d.tracking:track", "speckle3d.motion.direction:settle_direction"
 COHERENCE = "speckle3d.motion.coherence:estimate_coherence"
 MUTANTS = {
     "tissue correction off": Mutant(COHERENCE, without_tissue, "tilt and tissue and not independent"),
@@ -192,14 +192,7 @@ def run_tests(name, selection, folder):
     environment = os.environ | {"PYTHONPATH": paths, VARIABLE: name, "SPECKLE3D_ACCURACY_SWEEPS": str(folder)}
     command = [
         sys.executable,
-        "-m",
-        "pytest",
-        "-q",
-        "-p",
-        "no:cacheprovider",
-        "-p",
-        "mutants",
-        "-x",
+        *["-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "mutants", "-x"],
         *selection,
     ]
     process = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)

@@ -35,10 +35,10 @@ def test_distances_scaled_after_the_measurement_contradict_the_tilt(factor, refu
     assert [d.refuted for d in doubts] == [True] * refutes
 
 
-def row_scales(by, rows=9, gain=1.0):
+def row_scales(by, gain=1.0):
     """Scales that rise by so much from the first row to the middle."""
-    line = by * np.linspace(-1, 1, rows)
-    return RowScales(np.linspace(3, 30, rows), line, np.full(rows, gain))
+    line = by * np.linspace(-1, 1, 9)
+    return RowScales(np.linspace(3, 30, 9), line, np.full(9, gain))
 
 
 @pytest.mark.parametrize(

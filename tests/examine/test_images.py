@@ -20,9 +20,9 @@ WIDTH_MM, CELLS, PAIRS = 0.45, 60.0, 100
 PATCHES_MM = np.array([[x, y] for x in (2.0, 6.0, 10.0) for y in np.linspace(5.0, 25.0, 9)])
 
 
-def table_of(position_mm, seed=0, noise=0.03, gain=1.0, source=None):
+def table_of(position_mm, gain=1.0, source=None):
     """The pairs that the schedule wants; `source`: which tissue each frame shows."""
-    rng, schedule = np.random.default_rng(seed), PairSchedule()
+    rng, schedule = np.random.default_rng(0), PairSchedule()
     source = np.zeros(len(position_mm)) if source is None else source
     rows = []
     for frame in range(len(position_mm)):
@@ -30,7 +30,7 @@ def table_of(position_mm, seed=0, noise=0.03, gain=1.0, source=None):
         for first in schedule.references(frame):
             rho = gain * np.exp(-((position_mm[frame] - position_mm[first]) ** 2) / (2 * WIDTH_MM**2))
             rho *= source[frame] == source[first]
-            correlations[first] = float(np.clip(rho + noise * (1 - rho) * rng.standard_normal(), 0.0, 1.0))
+            correlations[first] = float(np.clip(rho + 0.03 * (1 - rho) * rng.standard_normal(), 0.0, 1.0))
         rows += [(first, frame, correlations[first]) for first in sorted(correlations)]
         schedule.settle(frame, correlations)
     first, second, median = (np.array(column) for column in zip(*rows, strict=True))

@@ -11,8 +11,8 @@ AMPLITUDE = 1 / (1 + (GRID_MM / WIDTH_MM) ** 2)
 """Heavy-tailed and smooth: no beam's, so that no formula for a Gaussian one fits by chance."""
 
 
-def predict(d, share=0.0, gain=1.0, of_echo=True):
-    return predict_correlation(d, AMPLITUDE, 0, AMPLITUDE.size - 1.001, STEP_MM, share, gain, CELLS, of_echo)
+def predict(d, share=0.0, gain=1.0):
+    return predict_correlation(d, AMPLITUDE, 0, AMPLITUDE.size - 1.001, STEP_MM, share, gain, CELLS, True)
 
 
 @settings(deadline=None, max_examples=80)

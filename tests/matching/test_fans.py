@@ -11,9 +11,9 @@ CONVEX = ImageGrid.of_fan(193, 401, 0.08, 60.0, tuple(np.deg2rad((-25.0, 25.0)))
 SECTOR = ImageGrid.of_fan(129, 401, 0.08, 0.0, tuple(np.deg2rad((-35.0, 35.0))), 12.0)
 
 
-def speckle(grid, seed=0):
+def speckle(grid):
     """A picture of speckle with room around the fan, and its margin, mm."""
-    rng, margin = np.random.default_rng(seed), 4.0
+    rng, margin = np.random.default_rng(0), 4.0
     size = np.ceil((grid.corners_mm[2, :2] - grid.corners_mm[0, :2] + 2 * margin) / PIXEL_MM).astype(int)
     parts = [gaussian_filter(rng.standard_normal(size), 0.3 / PIXEL_MM) for _ in range(2)]
     return sum(part**2 for part in parts), margin

@@ -11,22 +11,16 @@ import speckle
 from speckle3d.core.sweep import BModeSettings, Sweep
 from speckle3d.matching.intensity import Echo, two_way_wavenumber
 from speckle3d.matching.matcher import FrameMatcher, ImageSettings
-from speckle3d.matching.patches import PatchSettings
 
 GRID = speckle.GRID
 SPECTRA = [speckle.gaussian, speckle.triangle]
 WAVENUMBER_PER_MM = two_way_wavenumber(speckle.RF)
-BMODE = BModeSettings(60.0)
 
 
-def matcher_of(grid=GRID, signal=BMODE, patches=None, equalise_mm=0.0, correlate="echo", **inplane):
-    sweep = Sweep(np.zeros((1, grid.vectors, grid.samples), np.uint8), grid, signal, np.zeros(1))
-    settings = ImageSettings(
-        intensity={"equalise_mm": equalise_mm},
-        patches=patches or PatchSettings(),
-        inplane=inplane,
-        matching={"correlate": correlate},
-    )
+def matcher_of(**inplane):
+    frames = np.zeros((1, GRID.vectors, GRID.samples), np.uint8)
+    sweep = Sweep(frames, GRID, BModeSettings(60.0), np.zeros(1))
+    settings = ImageSettings(intensity={"equalise_mm": 0.0}, inplane=inplane, matching={"correlate": "echo"})
     return FrameMatcher(sweep, settings)
 
 
@@ -66,12 +60,12 @@ def prepare(echo, matcher=MATCHER, of_echo=False):
     return frame._replace(echo=parts) if of_echo else frame
 
 
-def match(echoes, start=None, of_echo=False, matcher=MATCHER, wavenumber_per_mm=WAVENUMBER_PER_MM):
+def match(echoes, start=None, of_echo=False, wavenumber_per_mm=WAVENUMBER_PER_MM):
     """In-plane motion, its covariance, and the patches' correlations."""
-    fixed, moving = (prepare(echo, matcher, of_echo) for echo in echoes)
-    begin = matcher.search(fixed, moving) if start is None else np.array(start)
-    matcher._wavenumber = wavenumber_per_mm
-    table = matcher.match({0: fixed}, 1, moving, [begin])
+    fixed, moving = (prepare(echo, of_echo=of_echo) for echo in echoes)
+    begin = MATCHER.search(fixed, moving) if start is None else np.array(start)
+    MATCHER._wavenumber = wavenumber_per_mm
+    table = MATCHER.match({0: fixed}, 1, moving, [begin])
     return table.inplane[0], table.inplane_covariance[0], table.correlation[0]
 
 
@@ -158,10 +152,8 @@ def test_the_ramp_undoes_what_roll_and_axial_strain_do_to_the_echo(roll_deg, str
     start, means = (0.1, 0.2 + strain * GRID.depth_mm / 2, motion[2]), []
     for sign in (1, 0, -1):
         wavenumber = sign * WAVENUMBER_PER_MM
-        every = [
-            match(pair(k, motion, 0.8, strain=strain), start, True, MATCHER, wavenumber) for k in range(4)
-        ]
-        means.append(np.nanmean([correlation for _, _, correlation in every]))
+        pairs = (pair(k, motion, 0.8, strain=strain) for k in range(4))
+        means.append(np.nanmean([match(echoes, start, True, wavenumber)[2] for echoes in pairs]))
     # Over a patch of 3.6 x 3.0 mm the phase turns evenly by 57/mm slope side; sinc^2 of half that is left.
     turns = WAVENUMBER_PER_MM * np.array([np.deg2rad(roll_deg) * 3.6, strain * 3.0]) / (2 * np.pi)
     assert means[0] == pytest.approx(0.8, abs=0.015)
@@ -181,6 +173,3 @@ def test_whole_sample_shifts_are_found_from_nowhere_within_the_range(shift):
     near = matcher_of(search_mm=1.0)
     fixed, moving = prepare(field.image(), near), prepare(field.image(*motion), near)
     assert (np.abs(near.search(fixed, moving)) <= 1.3).all()
-
-
-# ---- frames of a sweep -----------------------------------------------------------------------------------

@@ -10,16 +10,15 @@ from scipy import fft
 
 from speckle3d.core.grid import ImageGrid
 from speckle3d.core.sweep import BModeSettings, RFSettings
-from speckle3d.matching.intensity import IntensityExtractor, IntensitySettings
+from speckle3d.matching.intensity import IntensityExtractor
 
 RF = RFSettings(66.67e6, 1540.0, 7e6, (5e6, 10e6))
 GRID = ImageGrid(6, 1800, 0.3, RF.sample_spacing_mm)
 BANDS = [(RF, 1800), (sweep_examples.RF, 1001), (RFSettings(40e6, 1540.0, 10e6, (3e6, 15e6)), 640)]
 
 
-def extractor(signal=RF, samples=1800, vectors=6, **settings_):
-    grid = ImageGrid(vectors, samples, 0.3, signal.sample_spacing_mm)
-    return IntensityExtractor(signal, grid, IntensitySettings(**settings_))
+def extractor(signal, samples):
+    return IntensityExtractor(signal, ImageGrid(6, samples, 0.3, signal.sample_spacing_mm))
 
 
 def step(extractor, signal):
@@ -27,24 +26,20 @@ def step(extractor, signal):
     return extractor.grid.sample_spacing_mm / signal.sample_spacing_mm
 
 
-def pulse(signal, samples, at, vectors=6):
+def pulse(signal, samples, at):
     """RF of one echo whose envelope's peak is at sample `at`, well inside the band."""
     t = (np.arange(samples) - at) / signal.sampling_rate_hz
     low, high = signal.bandwidth_hz
     envelope = np.exp(-((t * (high - low)) ** 2))
-    return np.tile(envelope * np.cos(np.pi * (low + high) * t + 0.7), (vectors, 1))
+    return np.tile(envelope * np.cos(np.pi * (low + high) * t + 0.7), (6, 1))
 
 
-def noise(samples, seed=0, vectors=6):
-    return np.random.default_rng(seed).normal(0, 1000, (vectors, samples)).astype(np.float32)
-
-
-def plain_intensity(rf, signal, at, edge_fraction=0.1):
+def plain_intensity(rf, signal, at):
     """Band-passed analytic signal's intensity `at` some samples, in double precision, far from the wrap."""
     n = 8 * rf.shape[1]
     f = fft.fftfreq(n, 1 / signal.sampling_rate_hz)
     low, high = signal.bandwidth_hz
-    edge = edge_fraction * (high - low)
+    edge = 0.1 * (high - low)
     off = np.maximum(low - f, f - high)
     weight = np.where(off <= 0, 1, np.where(off < edge, 0.5 + 0.5 * np.cos(np.pi * off / edge), 0)) * (f > 0)
     band = np.flatnonzero(weight)
@@ -56,7 +51,7 @@ def plain_intensity(rf, signal, at, edge_fraction=0.1):
 @pytest.mark.parametrize(("signal", "samples"), BANDS)
 def test_resampled_intensity_is_the_plain_one_at_its_samples(signal, samples):
     package = extractor(signal, samples)
-    rf = noise(samples)
+    rf = np.random.default_rng(0).normal(0, 1000, (6, samples)).astype(np.float32)
     at = step(package, signal) * np.arange(package.grid.samples)
     assert samples - 1 - step(package, signal) < at[-1] <= samples - 1
     expected = plain_intensity(rf, signal, at)

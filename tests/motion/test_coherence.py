@@ -81,16 +81,15 @@ def coherence_of(path, table, correlate="echo"):
     return estimate_coherence(problem, table, np.ones(len(table), bool), path)
 
 
-def made_path(frames=90, yaw_rad=0.0):
-    """Uneven steps, and a turn about the depth axis there and back again."""
+def made_path(frames=90):
+    """Uneven steps without turns."""
     steps = np.random.default_rng(9).uniform(0.05, 0.2, frames - 1)
-    turn = yaw_rad * np.sin(np.linspace(0, 2 * np.pi, frames))
-    return np.column_stack([np.cumsum(np.r_[0.0, steps]), turn])
+    return np.column_stack([np.cumsum(np.r_[0.0, steps]), np.zeros(frames)])
 
 
-def estimate(share=0.0, noise=0.0, start=1.0, seed=0, correlate="echo", yaw_rad=0.0):
+def estimate(share=0.0, noise=0.0, start=1.0, seed=0, correlate="echo"):
     """Coherence, and length over the true length, where the path given is `start` times the true one."""
-    path = made_path(yaw_rad=yaw_rad)
+    path = made_path()
     share, noise = (np.broadcast_to(values, len(PATCHES)) for values in (share, noise))
     table = sweep_table(path, share, noise, correlate, seed)
     coherence = coherence_of(start * path, table, correlate)

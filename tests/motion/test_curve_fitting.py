@@ -21,13 +21,13 @@ def off_focus(d, sigma_mm):
 LAWS = [speckle.gaussian_correlation, speckle.triangle_correlation, off_focus]
 
 
-def samples(law, distances, noise_floor=1.0, cells=np.inf, repeats=1, seed=0, depths=DEPTHS_MM):
+def samples(law, distances, cells=np.inf, repeats=1):
     """Every distance at every depth, `repeats` times, with the scatter that so many cells leave."""
-    rng = np.random.default_rng(seed)
-    depth = np.repeat(depths, len(distances) * repeats)
-    distance = np.tile(np.repeat(distances, repeats), len(depths))
+    rng = np.random.default_rng(0)
+    depth = np.repeat(DEPTHS_MM, len(distances) * repeats)
+    distance = np.tile(np.repeat(distances, repeats), len(DEPTHS_MM))
     width = np.interp(depth, DEPTHS_MM, WIDTHS_MM)
-    rho = noise_floor * law(distance, width)
+    rho = law(distance, width)
     scatter = 0.0 if np.isinf(cells) else (1 - rho**2) / np.sqrt(cells)
     rho = rho + scatter * rng.normal(size=rho.size)
     # Frames lie before and behind each other; none of these turn.
@@ -35,9 +35,9 @@ def samples(law, distances, noise_floor=1.0, cells=np.inf, repeats=1, seed=0, de
     return PhantomSamples(depth, offset, np.zeros(depth.size), rho, len(distances) * repeats)
 
 
-def read_distance(curves, correlation, depths=DEPTHS_MM):
+def read_distance(curves, correlation):
     """Distance at each depth for each correlation, shape (depth, correlation)."""
-    rows = curves.at(np.array(depths)).correlation
+    rows = curves.at(np.array(DEPTHS_MM)).correlation
     return np.array(
         [np.interp(-c, -row, curves.distance_mm) for c, row in zip(correlation, rows, strict=True)]
     )

@@ -2,12 +2,11 @@
 
 import numpy as np
 import pytest
+from accuracy_set import SHEET
 
 from speckle3d.core.curves import curve_widths
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.sheet_curves import ProbeSheet, data_sheet_curves
-
-SHEET = ProbeSheet(elevation_aperture_mm=5.0, elevation_focus_mm=20.0, band_mhz=(5.0, 10.0))
 
 
 def widths(curves, depth_mm):

@@ -1,7 +1,5 @@
 """Distances of single patches: the inverse of the curves, with deviations that hold."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import speckle
@@ -15,9 +13,9 @@ PATCHES = lay_patches(speckle.GRID)
 SIGMA_MM, CELLS = 0.45, 45.0
 
 
-def problem(cells=CELLS, of="echo", **curves):
-    phantom = speckle.curves(**{"sigma_mm": SIGMA_MM, "cells": cells} | curves)
-    return problem_of(replace(phantom, key=replace(phantom.key, correlation_of=of)), PATCHES, speckle.GRID)
+def problem(**curves):
+    phantom = speckle.curves(sigma_mm=SIGMA_MM, cells=CELLS, key=speckle.ECHO, **curves)
+    return problem_of(phantom, PATCHES, speckle.GRID)
 
 
 def read(problem, rho, share=0.0, gain=1.0):

@@ -40,12 +40,8 @@ def phantom():
     )
 
 
-def matcher_of(sweep):
-    return FrameMatcher(sweep)
-
-
 def samples_of(sweep, settings, progress=None):
-    matcher, poses = matcher_of(sweep), known_positions(sweep)
+    matcher, poses = FrameMatcher(sweep), known_positions(sweep)
     pairs = phantom_pairs(sweep, poses, settings)
     matches = match_sweep(sweep, matcher, KnownSchedule(pairs), progress)
     return phantom_samples(poses, matcher.patches, matches.table, pairs)

@@ -5,28 +5,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import speckle
-from pair_planes import fit, fit_many, problem_of
+from pair_planes import AT, PATCHES, TILT, fit, fit_many, problem_of
 
-from speckle3d.core.curves import TiltResponse
-from speckle3d.core.grid import ImageGrid
 from speckle3d.kernels.statistics import correlation_variance
-from speckle3d.matching.patches import lay_patches
 
-GRID = ImageGrid(vectors=127, samples=640, vector_pitch_mm=0.3, sample_spacing_mm=0.06)
-PATCHES = lay_patches(GRID)
-AT = PATCHES.centre_mm - GRID.centre_mm[:2]
 SIGMA_MM, CELLS = 0.45, 50
-TILT = TiltResponse(np.array([-9.0, 8.0]), np.array([2.0, 6.0]))
-"""As a linear probe's: turning is about a point near the focus, some seven millimetres off at either end."""
 PLANES = [(0.3, 0.0, 0.0), (0.25, 0.006, 0.0), (0.35, -0.003, 0.008), (0.9, 0.005, 0.01)]
 CROSSING = [(0.0, 0.03, 0.0), (0.1, 0.03, 0.0), (0.3, -0.03, 0.0), (0.1, 0.015, 0.004)]
 PARALLEL = [(0.02, 0.0, 0.0), (0.1, 0.0, 0.0), (0.3, 0.006, 0.0), (0.3, 0.015, 0.0)]
 
 
 def problem(of="echo", tilt=TILT, bias_mm=0.02, **curves):
-    phantom = speckle.curves(sigma_mm=SIGMA_MM, cells=CELLS, **curves)
-    phantom = replace(phantom, key=replace(phantom.key, correlation_of=of), tilt=tilt)
-    return problem_of(phantom, PATCHES, GRID, bias_mm=bias_mm)
+    key = speckle.ECHO if of == "echo" else speckle.KEY
+    phantom = speckle.curves(sigma_mm=SIGMA_MM, cells=CELLS, key=key, **curves)
+    return problem_of(replace(phantom, tilt=tilt), bias_mm=bias_mm)
 
 
 def distances(plane, tilt=TILT, at=AT):

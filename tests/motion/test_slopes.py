@@ -3,22 +3,15 @@
 from dataclasses import replace
 
 import numpy as np
-import pair_planes
 import pytest
 import speckle
+from pair_planes import AT, TILT, fit_many, from_coefficients, problem_of
 
-from speckle3d.core.curves import TiltResponse
-from speckle3d.core.grid import ImageGrid
 from speckle3d.kernels.statistics import correlation_variance
-from speckle3d.matching.patches import lay_patches
 from speckle3d.motion.planes import PlaneSettings
 from speckle3d.motion.uncertainty import UNEVENNESS, weigh_slopes
 
-GRID = ImageGrid(vectors=127, samples=640, vector_pitch_mm=0.3, sample_spacing_mm=0.06)
-PATCHES = lay_patches(GRID)
-AT = PATCHES.centre_mm - GRID.centre_mm[:2]
 SIGMA_MM, CELLS = 0.45, 60.0
-TILT = TiltResponse(np.array([-9.0, 8.0]), np.array([2.0, 6.0]))
 SETTINGS = PlaneSettings()
 EXPECTED = float(np.deg2rad(SETTINGS.turn_deg_per_mm))
 PHANTOM, TISSUE = 0.004, 0.04
@@ -27,14 +20,13 @@ DELIBERATE = float(np.deg2rad(5.0) / 20.0)
 LEVER_MM = AT[:, 0].std()
 
 
-def fit_planes(yaw_per_mm=0.0, short=0.0, pairs=60, tilt=TILT):
+def fit_planes(yaw_per_mm=0.0, short=0.0):
     """Planes of pairs that yaw as they travel, read with distances wrong by a share of each patch's own."""
-    rng, curves = np.random.default_rng(0), speckle.curves(sigma_mm=SIGMA_MM, cells=CELLS)
-    curves = replace(curves, key=replace(curves.key, correlation_of="echo"), tilt=tilt)
-    offset = rng.uniform(0.1, 0.5, (pairs, 1))
+    rng, curves = np.random.default_rng(0), speckle.curves(SIGMA_MM, CELLS, key=speckle.ECHO)
+    offset = rng.uniform(0.1, 0.5, (60, 1))
     rho = speckle.gaussian_correlation(offset * (1 + yaw_per_mm * AT[:, 0]) * (1 + short), SIGMA_MM)
     rho = rho + np.sqrt(correlation_variance(rho, CELLS, True)) * rng.normal(size=rho.shape)
-    return pair_planes.fit_many(pair_planes.problem_of(curves, PATCHES, GRID), rho)[0]
+    return fit_many(problem_of(replace(curves, tilt=TILT)), rho)[0]
 
 
 def rates(planes):
@@ -43,12 +35,11 @@ def rates(planes):
     return (p[:, 1:] * p[:, :1]).sum(axis=0) / (p[:, 0] ** 2).sum()
 
 
-def planes_with(offset, slope_x, slope_y=0.0, covariance=None):
-    """Planes of one or several offsets and slopes, as even weights over the image know them."""
-    if covariance is None:
-        covariance = np.diag([1e-5 + SETTINGS.bias_mm**2, *(1e-5 / AT.var(axis=0))])
-    coefficients = np.column_stack(np.broadcast_arrays(np.atleast_1d(offset), slope_x, slope_y))
-    return pair_planes.from_coefficients(0, 1, coefficients, covariance)
+def planes_with(offset, slope_x):
+    """Planes of some offsets and slopes, as even weights over the image know them."""
+    covariance = np.diag([1e-5 + SETTINGS.bias_mm**2, *(1e-5 / AT.var(axis=0))])
+    coefficients = np.column_stack([offset, slope_x, 0 * offset])
+    return from_coefficients(0, 1, coefficients, covariance)
 
 
 def test_a_false_turn_within_the_scales_error_is_left_out():

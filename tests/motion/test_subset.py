@@ -2,19 +2,15 @@
 
 import numpy as np
 import pytest
+from pair_planes import AT
 
-from speckle3d.core.grid import ImageGrid
-from speckle3d.matching.patches import lay_patches
 from speckle3d.motion.subset import consistent_subset
 
-GRID = ImageGrid(vectors=127, samples=640, vector_pitch_mm=0.3, sample_spacing_mm=0.06)
-AT = lay_patches(GRID).centre_mm - GRID.centre_mm[:2]
 
-
-def agreement(distance, sigma, elevation, support=1.0, either_side=True):
+def agreement(distance, sigma, elevation, either_side=True):
     sigma = np.broadcast_to(sigma, distance.shape)
     pair = distance[None], sigma[None], elevation[None], np.array([either_side])
-    return consistent_subset(*pair, support)[0]
+    return consistent_subset(*pair, 1.0)[0]
 
 
 @pytest.mark.parametrize("side", [1, -1])

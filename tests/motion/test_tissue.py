@@ -4,7 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from accuracy_set import INDEPENDENT
+from accuracy_set import INDEPENDENT, SHEET
+from sweep_examples import frames_of
 
 from speckle3d.config import Config
 from speckle3d.core.errors import InsufficientDataError
@@ -14,17 +15,15 @@ from speckle3d.matching.frames import match_sweep
 from speckle3d.matching.matcher import FrameMatcher
 from speckle3d.matching.schedule import PairSchedule
 from speckle3d.motion.tissue import averaging_loss, structure_openness
-from speckle3d.sheet_curves import ProbeSheet, data_sheet_curves
+from speckle3d.sheet_curves import data_sheet_curves
 from speckle3d.simulation.receiver import received
 from speckle3d.tracking import track
-
-SHEET = ProbeSheet(elevation_aperture_mm=5.0, elevation_focus_mm=20.0, band_mhz=(5.0, 10.0))
 
 
 def b_mode(sweep):
     """Grey levels of a sweep of echoes, in memory."""
     images = received(sweep, dynamic_range_db=60.0)
-    return replace(images, frames=np.stack([images.frames[k] for k in range(len(images))]))
+    return replace(images, frames=frames_of(images))
 
 
 @pytest.fixture(scope="module")

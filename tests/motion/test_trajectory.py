@@ -26,8 +26,8 @@ def read_as(first, second, motions, planes):
     return table, pair_planes.from_coefficients(first, second, coefficients, np.array(covariance))
 
 
-def solve(pairs, frames, centre_mm=CENTRE_MM, huber=2.0):
-    return solve_trajectory(pairs, frames, np.asarray(centre_mm), huber).poses
+def solve(pairs, frames, huber=2.0):
+    return solve_trajectory(pairs, frames, CENTRE_MM, huber).poses
 
 
 def elevation(poses):
@@ -82,17 +82,17 @@ def subset(pairs, index):
     return RelativePoses(pairs.first[index], pairs.second[index], pairs.poses[index], pairs.covariance[index])
 
 
-def neighbours(frames=40, reach=3):
+def neighbours():
     """Pairs of near frames of a hand that travels 0.1 mm a frame, with errors as claimed; and its poses."""
-    rng, t = np.random.default_rng(1), np.arange(frames)
+    rng, t = np.random.default_rng(1), np.arange(40)
     turns = 0.007 * np.column_stack([np.sin(t / 9), np.cos(t / 7), np.sin(t / 5)])
     position = np.column_stack([0.3 * np.sin(t / 8), 0.3 * np.cos(t / 6), 0.1 * t])
     truth = RigidTransform.from_components(position, Rotation.from_euler("xyz", turns))
     sigma2 = np.diag([3e-3, 1e-3, 8e-3, 2e-4, 2e-4, 1e-4]) ** 2
     rows = [
         (i, j, truth[i].inv() * truth[j] * pose_of(*rng.multivariate_normal(np.zeros(6), sigma2)), sigma2)
-        for j in range(1, frames)
-        for i in range(max(0, j - reach), j)
+        for j in t[1:]
+        for i in range(max(0, j - 3), j)
     ]
     return graph_of(rows), truth[0].inv() * truth
 

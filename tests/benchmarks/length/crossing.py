@@ -3,13 +3,7 @@
 The tissue is not the estimator's model: see `crossing_tissue`.
 """
 
-import sys
-from pathlib import Path
-
 import numpy as np
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
-
 from crossing_tissue import GRID, PairCase, tissue_pair
 
 from length.sweeps import figures

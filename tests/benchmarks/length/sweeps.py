@@ -10,8 +10,8 @@ import sys
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from multiprocessing import get_context
-from pathlib import Path
 
+import bench
 import numpy as np
 from cache import ensure_file, sweep_file
 
@@ -23,7 +23,7 @@ from speckle3d.simulation.beam import Probe, tabulate_beam
 from speckle3d.simulation.presets import simulate
 from speckle3d.simulation.settings import SimulationSettings
 
-RIGHT = Path(__file__).resolve().parents[3] / "data" / "curves.h5"
+RIGHT = bench.DATA / "curves.h5"
 """Of the simulator's default probe, over a phantom that attenuates as the tissue does."""
 SHEET = ProbeSheet(elevation_aperture_mm=5.0, elevation_focus_mm=23.0, band_mhz=(5.0, 10.0))
 """Its focal length is 15 % off: the sweeps' lens focuses at 20 mm."""

@@ -6,11 +6,11 @@ import subprocess
 import sys
 import tempfile
 import time
-from pathlib import Path
+
+import bench
 
 from speed.rows import Row
 
-DATA = Path(__file__).resolve().parents[3] / "data"
 HELP_S, RECONSTRUCT_S, MEMORY_GB = 0.3, 3.0, 0.5
 FRAMES = (300, 1200, 2000)
 """Of the sweeps whose memory is measured."""
@@ -22,7 +22,7 @@ def rows(runs):
     bare = seconds(["-c", "import typer, rich.console"], runs)
     help_s = seconds(["-m", "speckle3d.cli", "--help"], runs)
     libraries = seconds(["-c", LIBRARIES], runs)
-    whole = statistics.median([reconstruct(DATA / "phantom.h5")[0] for _ in range(runs + 1)][1:])
+    whole = statistics.median([reconstruct(bench.DATA / "phantom.h5")[0] for _ in range(runs + 1)][1:])
     beside = {"falling": True, "unit": "s"}
     return [
         Row("speckle3d --help", help_s, peer="importing typer and rich", peer_value=bare,
