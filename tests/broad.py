@@ -103,20 +103,11 @@ def errors_deg(found_wxyz, true_wxyz, moving, steady=False):
     return np.array([rms_deg(e) for e in (errors.total, errors.heading, inclination)])
 
 
-class Coverage(NamedTuple):
-    """Share of errors within one claimed sigma, and RMS error over RMS claimed sigma."""
-
-    heading_share: float
-    heading_ratio: float
-    inclination_share: float
-    inclination_ratio: float
-
-
 def coverage(orientation, true_wxyz, moving, steady=False):
-    """How the claimed sigma fits the errors; of inclination, about x and y each with its own."""
+    """Share of errors within one claimed sigma, RMS error over RMS sigma: of heading, then inclination."""
     counts = counting(true_wxyz, moving)
     errors, sigmas = errors_rad(orientation.wxyz, true_wxyz, counts, steady), orientation.sigma_rad[counts]
     parts = []
     for error, sigma in ((errors.heading, sigmas[:, 2]), (errors.inclination_xy, sigmas[:, :2])):
         parts += [float(np.mean(np.abs(error) < sigma)), rms_deg(error) / rms_deg(sigma)]
-    return Coverage(*parts)
+    return parts

@@ -27,12 +27,10 @@ class PlaneScan:
     ----------
     lines : ImagePoints
     world_from_image : RigidTransform
-    normal_in_image : ndarray, shape (m, 3)
     """
 
     lines: ImagePoints
     world_from_image: RigidTransform
-    normal_in_image: np.ndarray
 
 
 def about(axis, angles_rad):
@@ -74,7 +72,7 @@ def scan_plane(
     readings = world_from_image * sensor_from_image.inv()
     depth += line_noise_mm * rng.standard_normal((count, 2))
     points = np.stack([np.broadcast_to(ends, depth.shape), depth / PIXEL_MM[1]], axis=-1)
-    return PlaneScan(ImagePoints.of_lines(np.arange(count), points, readings), world_from_image, up)
+    return PlaneScan(ImagePoints.of_lines(np.arange(count), points, readings), world_from_image)
 
 
 def line_directions(

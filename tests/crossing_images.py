@@ -50,6 +50,13 @@ class Probe:
             depth = np.hypot(x, y + self.radius_mm) - self.radius_mm
         return (across / self.width_mm + 0.5) * (self.beams - 1), depth / self.depth_mm * (self.samples - 1)
 
+    def direction(self, x, y):
+        """Of the beams through points, mm."""
+        if np.isinf(self.radius_mm):
+            return 0.0, 1.0
+        length = np.hypot(x, y + self.radius_mm)
+        return x / length, (y + self.radius_mm) / length
+
     def from_image(self, pixels):
         """Points in mm from the array's middle."""
         return (np.asarray(pixels) - self.corner_px) * self.pixel_mm
@@ -79,7 +86,6 @@ class World:
     world_from_sensor: RigidTransform
     crossing_px: np.ndarray
     is_visible: np.ndarray
-    sensor_from_image: RigidTransform
 
 
 def random_probe(rng):
@@ -160,7 +166,7 @@ def crossing_world(seed, frames=54):
     mounting = RigidTransform.from_components(rng.uniform(-120, 120, 3), Rotation.random(rng=rng))
     readings = world_from_image * mounting.inv() * _errors(rng, frames)
     is_visible = (np.abs(away) < 1.2 * look.elevation_mm) & probe.inside(pixels) & visible[best]
-    return World(images, probe.pixel_mm, readings, pixels, is_visible, mounting)
+    return World(images, probe.pixel_mm, readings, pixels, is_visible)
 
 
 def _hand(rng, frames):
@@ -207,7 +213,7 @@ def _both_visible(probe, look, pixels, turns, along):
     They must be 20 degrees apart, or both be strokes shorter than 8 mm.
     """
     x, y = probe.from_image(pixels).T
-    beam = (0.0, 1.0) if np.isinf(probe.radius_mm) else _unit(x, y + probe.radius_mm)
+    beam = probe.direction(x, y)
     in_image = np.stack([turns.inv().apply(direction) for direction in along])
     level = _slope_loss_db(look, in_image, beam) + np.array([[0.0], [look.faint_db]])
     flat = in_image[..., :2] / np.linalg.norm(in_image[..., :2], axis=2, keepdims=True)
@@ -258,7 +264,7 @@ def _frame(rng, probe, look, world_from_image, wires, points, floor, skin, lette
         grain /= grain.std()
         amplitude = 1.0 + 0.35 * (grain[0] + 1j * grain[1])
         x, y = probe.from_image(place[:, :2] / probe.pixel_mm).T
-        beam = (0.0, 1.0) if np.isinf(probe.radius_mm) else _unit(x, y + probe.radius_mm)
+        beam = probe.direction(x, y)
         loss = 10 ** (_slope_loss_db(look, direction, beam) / 20.0)
         weight = (faint if number else 1.0) * amplitude * loss * STEP_MM / 0.6
         _splat(echoes, probe, x, y, weight * _elevation_weight(look, y, place[:, 2]))
@@ -295,15 +301,10 @@ def _floor(rng, probe, look, place, normal):
     place = probe.from_image(place[:2] / probe.pixel_mm) - place[2] * np.array([0, normal[2]])
     t = np.arange(-120, 120, STEP_MM)[:, None]
     x, y = (place + t * across).T
-    beam = (0.0, 1.0) if np.isinf(probe.radius_mm) else _unit(x, y + probe.radius_mm)
+    beam = probe.direction(x, y)
     aslant = np.arccos(np.clip(np.abs(beam[0] * normal[0] + beam[1] * normal[1]), 0, 1))
     grain = 1.0 + 0.4 * gaussian_filter1d(rng.standard_normal(len(x)), 8) / 0.19
     return x, y, grain * 10 ** ((look.floor_db - 18 * (aslant / 0.5) ** 2) / 20.0) * STEP_MM / 0.6
-
-
-def _unit(x, y):
-    length = np.hypot(x, y)
-    return x / length, y / length
 
 
 def _elevation_weight(look, y, z):

@@ -27,6 +27,14 @@ GRID = ImageGrid(96, 82, 0.3, 0.35, 0.2)
 FRAME_RATE_HZ = 25.0
 
 
+INDEPENDENT = 0.3
+"""Share of the speckle's power that the sweeps do not share."""
+STRETCH, VARIATION = 0.08, 0.03
+"""Standard deviations of the scale's logarithm: wrong in both sweeps together; in each and along it."""
+TURN_PER_MM = 0.002
+"""Standard deviation of false tilt and yaw, rad/mm."""
+
+
 @dataclass(frozen=True)
 class PairCase:
     """What is made.
@@ -37,14 +45,6 @@ class PairCase:
         Factor on the contrast of everything in the tissue; 1 is usual, 0.3 poor.
     moved_mm : float
         RMS displacement of the tissue between the sweeps, smooth over 8 mm.
-    independent : float
-        Share of the speckle's power that the sweeps do not share.
-    stretch : float
-        Standard deviation of the logarithm of the scale that both sweeps have wrong together.
-    varying : float
-        Of what it differs by between the sweeps, and along each.
-    turn_per_mm : float
-        Standard deviation of false tilt and yaw, rad/mm.
     """
 
     seed: int
@@ -53,10 +53,6 @@ class PairCase:
     frames: int = 150
     texture: float = 1.0
     moved_mm: float = 0.0
-    independent: float = 0.3
-    stretch: float = 0.08
-    varying: float = 0.03
-    turn_per_mm: float = 0.002
     with_sensor: bool = False
     mirror: bool = False
 
@@ -75,7 +71,7 @@ def tissue_pair(case):
     rng = np.random.default_rng([case.seed, 611])
     strength = _strength(case, rng)
     common = rng.standard_normal((2, *strength.shape), np.float32)
-    common_stretch = case.stretch * rng.standard_normal()
+    common_stretch = STRETCH * rng.standard_normal()
     displacement = _displacement_field(rng, case.moved_mm)
     heading = Rotation.from_rotvec([0.0, 0.0, rng.uniform(-np.pi, np.pi)])
     # The medium's y points down, the sensor's z up.
@@ -85,10 +81,10 @@ def tissue_pair(case):
     for number in (0, 1):
         truth = _hand(case, rng, number, sign * case.angle_deg)
         fresh = rng.standard_normal(common.shape, np.float32)
-        weight = np.float32(np.sqrt([1 - case.independent, case.independent]))
+        weight = np.float32(np.sqrt([1 - INDEPENDENT, INDEPENDENT]))
         field = strength * (weight[0] * common + weight[1] * fresh)
         stack = _images(field, truth, displacement if number else 0.0 * displacement, rng)
-        poses = _drifting_poses(case, truth, common_stretch, rng)
+        poses = _drifting_poses(truth, common_stretch, rng)
         if case.mirror and number:
             flip = np.diag([1.0, 1.0, -1.0, 1.0])
             poses = RigidTransform.from_matrix(flip @ poses.as_matrix() @ flip)
@@ -167,16 +163,16 @@ def _hand(case, rng, number, angle_deg):
     return path.medium_from_image(np.arange(case.frames) / FRAME_RATE_HZ)
 
 
-def _drifting_poses(case, truth, stretch, rng):
+def _drifting_poses(truth, stretch, rng):
     """Poses as images give them: steps about the centre with errors, chained."""
     at_centre = truth * RigidTransform.from_translation(GRID.centre_mm)
     steps = at_centre[:-1].inv() * at_centre[1:]
     shift, turns = steps.translation.copy(), steps.rotation.as_rotvec()
     n, dz = len(shift), np.abs(shift[:, 2]).mean()
-    log_scale = stretch + case.varying * rng.standard_normal() + case.varying * _walk(rng, n, 8.0 / dz)
+    log_scale = stretch + VARIATION * rng.standard_normal() + VARIATION * _walk(rng, n, 8.0 / dz)
     scale = np.exp(-(log_scale + 0.10 * rng.standard_normal(n)))
     for axis in (0, 1):
-        rate = case.turn_per_mm * (rng.standard_normal() + 0.5 * _walk(rng, n, 10.0 / dz))
+        rate = TURN_PER_MM * (rng.standard_normal() + 0.5 * _walk(rng, n, 10.0 / dz))
         turns[:, axis] -= rate * shift[:, 2] + 2e-4 * rng.standard_normal(n)
     shift[:, 2] *= scale
     shift[:, :2] += 0.002 * rng.standard_normal((n, 2))

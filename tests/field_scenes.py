@@ -33,30 +33,22 @@ class Scene(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """A recording from the first camera image to the last; `turns` is true wherever `has_truth`."""
+    """A recording in the earth's field alone, when the sensor moves, and how it is turned."""
 
     log: ImuLog
-    true_wxyz: np.ndarray
     moving: np.ndarray
     turns: Rotation
-    has_truth: np.ndarray
 
 
 def scene(motion, kind, amount, rng):
     """A recording as it would be in such a field or of such a sensor."""
     if kind == "truncated":
-        return Scene(*truncate(motion, amount, rng))
-    readings = FIELDS[kind](motion, amount, rng)
-    residual = np.eye(3) + RESIDUAL * rng.standard_normal((3, 3))
-    readings = readings @ residual.T + RESIDUAL * np.linalg.norm(EARTH_UT) * rng.standard_normal(3)
-    readings = readings + NOISE_UT * rng.standard_normal(readings.shape)
-    log = with_readings(motion.log, magnetometer_au=np.where(motion.has_truth[:, None], readings, np.nan))
-    return Scene(log, motion.true_wxyz, motion.moving)
-
-
-def with_readings(log, **changes):
-    readings = {name: getattr(log, name) for name in VECTORS}
-    return ImuLog(log.time_s, source=log.source, **(readings | changes))
+        vector = {"gyroscope_rad_s": truncate(motion.log.gyroscope_rad_s, amount, rng)}
+    else:
+        vector = {"magnetometer_au": with_errors(FIELDS[kind](motion, amount, rng), rng)}
+    readings = {name: getattr(motion.log, name) for name in VECTORS} | vector
+    log = ImuLog(motion.log.time_s, source=motion.log.source, **readings)
+    return Scene(log, motion.turns.as_quat(scalar_first=True), motion.moving)
 
 
 # -- motions
@@ -79,8 +71,7 @@ def simulate_motion(rng, seconds):
         turns.inv().apply(EARTH_UT) + NOISE_UT * rng.standard_normal(rate.shape),
         source="simulated",
     )
-    every = np.ones(len(log), dtype=bool)
-    return Motion(log, turns.as_quat(scalar_first=True), time_s > 3.0, turns, every)
+    return Motion(log, time_s > 3.0, turns)
 
 
 def wandering(time_s, rng, sd, period_s):
@@ -143,12 +134,17 @@ FIELDS = {
 }
 
 
-# -- other gyroscopes: log, truth, where it moves
+# -- other sensors
 
 
-def truncate(motion, amount, rng):
+def with_errors(readings, rng):
+    """What a calibration leaves of the sensor's iron, and noise."""
+    residual = np.eye(3) + RESIDUAL * rng.standard_normal((3, 3))
+    readings = readings @ residual.T + RESIDUAL * np.linalg.norm(EARTH_UT) * rng.standard_normal(3)
+    return readings + NOISE_UT * rng.standard_normal(readings.shape)
+
+
+def truncate(rate, step_deg, rng):
     """Coarser steps, cut toward zero, about another bias: at rest it differs from that in motion."""
-    step = np.deg2rad(amount)
-    rate = motion.log.gyroscope_rad_s + rng.uniform(-0.5, 0.5, 3) * step
-    log = with_readings(motion.log, gyroscope_rad_s=np.trunc(rate / step) * step)
-    return log, motion.true_wxyz, motion.moving
+    step = np.deg2rad(step_deg)
+    return np.trunc((rate + rng.uniform(-0.5, 0.5, 3) * step) / step) * step

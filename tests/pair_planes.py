@@ -48,9 +48,8 @@ def fit(problem, rho, shift_mm=(0.0, 0.0), share=None, gain=None, **priors):
     planes, has_plane = fit_many(problem, np.asarray(rho)[None], shift_mm, models=models, **alone)
     if not has_plane[0]:
         return None
-    offset, slope_x, slope_y = planes.coefficients[0]
     fields = {name: value[0] for name, value in vars(planes).items()}
-    return SimpleNamespace(offset_mm=offset, slope_x=slope_x, slope_y=slope_y, **fields)
+    return SimpleNamespace(offset_mm=planes.offset_mm[0], **fields)
 
 
 def from_coefficients(first, second, coefficients, covariance):

@@ -45,12 +45,9 @@ def test_a_sweep_without_the_sensor_is_refused(sensor):
 def test_mountings_are_compared_where_both_are_known(sensor):
     sweep = calibrated(sweep_examples.rf_sweep(), example_calibration(sensor))
     remount = example_calibration(sensor, rotation=ROTATION * Rotation.from_euler("y", 7, degrees=True))
-    shift_mm = 0.0
+    shift_mm = 5.0 if sensor == "tracker" else 0.0
     if sensor == "tracker":
-        shift_mm, remount = (
-            5.0,
-            replace(remount, translation_mm=remount.translation_mm + np.array([3.0, 0.0, -4.0])),
-        )
+        remount = replace(remount, translation_mm=remount.translation_mm + [3.0, 0.0, -4.0])
     assert mounting_difference(sweep, remount) == pytest.approx((7.0, shift_mm), abs=1e-6)
     unknown = replace(sweep, **{sensor: replace(getattr(sweep, sensor), sensor_from_image=None)})
     assert mounting_difference(unknown, remount) == (0.0, 0.0)

@@ -11,30 +11,8 @@ from speckle3d.matching.matcher import FrameMatcher
 
 pytestmark = pytest.mark.realdata
 
-# Centre and band are read off the spectra; the machines' own settings are not in the files.
+# Centre and band are read off the spectra; the machine's own settings are not in the file.
 MOUSE = ImportSettings(centre_frequency_hz=20e6, bandwidth_hz=(12e6, 28e6), frame_rate_hz=10.0)
-ULTRASONIX = ImportSettings(
-    sampling_rate_hz=40e6,
-    vector_pitch_mm=0.3,
-    centre_frequency_hz=5e6,
-    bandwidth_hz=(3e6, 7e6),
-    demodulation_frequency_hz=0.0,
-)
-RECORDINGS = {
-    "mouse": ("rf/MouseLiverRF.mha", MOUSE),
-    "ultrasonix": ("plus/UltrasonixLinearRfData.igs.mha", ULTRASONIX),
-}
-
-
-@pytest.fixture(scope="module", params=RECORDINGS)
-def recording(request, realdata):
-    path, settings = RECORDINGS[request.param]
-    sweep = load_sweep(realdata / path, settings)
-    return sweep, FrameMatcher(sweep)
-
-
-def ready(matcher, frame):
-    return matcher.prepare(matcher.echo(frame))
 
 
 def match(matcher, fixed, moving, start=None):
@@ -43,9 +21,10 @@ def match(matcher, fixed, moving, start=None):
     return table.inplane[0], table.correlation[0]
 
 
-def test_neighbouring_frames_are_matched(recording):
-    sweep, matcher = recording
-    frames = [ready(matcher, sweep.frames[i]) for i in range(len(sweep))]
+def test_neighbouring_frames_are_matched(realdata):
+    sweep = load_sweep(realdata / "rf" / "MouseLiverRF.mha", MOUSE)
+    matcher = FrameMatcher(sweep)
+    frames = [matcher.prepare(matcher.echo(sweep.frames[i])) for i in range(len(sweep))]
     for fixed, moving in pairwise(frames):
         motion, correlation = match(matcher, fixed, moving)
         finite = np.isfinite(correlation)

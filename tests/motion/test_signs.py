@@ -63,80 +63,55 @@ def yaw_in_place(rng, seed):
 SWEEPS = [one_way, reversal_in_a_pause, there_and_back_twice, yaw_in_place]
 
 
-class Sweep:
-    """Pairs of a made sweep, as a reading in order meets them: two recent frames and some key frames."""
+def read_pairs(z, b, seed, wrong):
+    """Frames, truth and readings of pairs: of each frame with two recent ones and some key frames."""
+    rng, keys, rows = np.random.default_rng(seed), [], []
 
-    def __init__(self, z, b, seed, wrong=0.0, relative=0.03, slope_noise=2e-4):
-        self.z, self.b = z, b
-        self.wrong, self.relative, self.slope_noise = wrong, relative, slope_noise
-        self.rng = np.random.default_rng(seed)
-        self.first, self.second, self.is_wrong = [], [], []
-        self.steps, self.covariance = [], []
-        self._pair_up()
+    def apart(i, j):
+        return abs(z[j] - z[i]) + TURN_MM * abs(b[j] - b[i])
 
-    def _pair_up(self):
-        """Measure each frame in turn against earlier ones."""
-        keys = []
-        for frame in range(len(self.z)):
-            near = [k for k in keys[-8:] if self._apart(k, frame) < REACH_MM]
-            references = sorted({*range(max(0, frame - 2), frame), *near})
-            self._left = len(references) // 3
-            for k in references:
-                self._measure(k, frame)
-            if not keys or self._apart(keys[-1], frame) > KEY_MM:
-                keys.append(frame)
-
-    def _apart(self, i, j):
-        return abs(self.z[j] - self.z[i]) + TURN_MM * abs(self.b[j] - self.b[i])
-
-    def _measure(self, i, j):
-        z = self.z[j] - self.z[i]
-        a = z + self.rng.normal() * np.hypot(self.relative * z, 0.004)
-        b = self.b[j] - self.b[i] + self.slope_noise * self.rng.normal()
+    for frame in range(len(z)):
+        near = [k for k in keys[-8:] if apart(k, frame) < REACH_MM]
+        references = sorted({*range(max(0, frame - 2), frame), *near})
         # Never most of a frame's pairs: those would place it wrongly, and rightly so.
-        is_false = bool(self.rng.uniform() < self.wrong and self._left > 0)
-        if is_false:
-            self._left -= 1
-            a, b = self.rng.uniform(-0.8, 0.8), 0.01 * self.rng.normal()
-        side = 1.0 if a >= 0 else -1.0
-        variance = [(self.relative * a) ** 2 + 0.02**2, self.slope_noise**2]
-        self.first.append(i)
-        self.second.append(j)
-        self.is_wrong.append(is_false)
-        self.steps.append([side * a, side * b])
-        self.covariance.append(np.diag(variance))
-
-    @property
-    def planes(self):
-        return planes_of(*(np.array(x) for x in (self.first, self.second, self.steps, self.covariance)))
-
-    def resolve(self):
-        return likeliest_path(self.planes, len(self.z), NO_STRANGERS)
-
-    def wrong_signs(self, path):
-        """Pairs with a clear sign that got the other, up to the mirror image of the whole."""
-        first, second = np.array(self.first), np.array(self.second)
-        z, b = self.z[second] - self.z[first], self.b[second] - self.b[first]
-        steps = on_path(self.planes, path).coefficients[:, :2]
-        # Below three deviations either sign is as good.
-        by_offset, by_slope = np.abs(z) > 0.07, np.abs(b) > 0.006
-        truth = np.where(by_offset, z * steps[:, 0], b * steps[:, 1])
-        clear = (by_offset | (by_slope & (np.abs(z) < 0.02))) & ~np.array(self.is_wrong)
-        # The first pair alone places its frame; a slope three deviations off, one in 370, mirrors it.
-        clear &= second > 1
-        off = (truth < 0)[clear]
-        assert clear.sum() > len(self.z)
-        return min(off.sum(), (~off).sum())
+        most_false = len(references) // 3
+        for k in references:
+            step = z[frame] - z[k]
+            offset = step + rng.normal() * np.hypot(0.03 * step, 0.004)
+            slope = b[frame] - b[k] + 2e-4 * rng.normal()
+            is_false = rng.uniform() < wrong and most_false > 0
+            if is_false:
+                most_false -= 1
+                offset, slope = rng.uniform(-0.8, 0.8), 0.01 * rng.normal()
+            side = 1.0 if offset >= 0 else -1.0
+            covariance = np.diag([(0.03 * offset) ** 2 + 0.02**2, 2e-4**2])
+            rows.append((k, frame, is_false, [side * offset, side * slope], covariance))
+        if not keys or apart(keys[-1], frame) > KEY_MM:
+            keys.append(frame)
+    return (np.array(column) for column in zip(*rows, strict=True))
 
 
-def failures(sweep, **noise):
+def wrong_signs(z, b, seed, wrong):
+    """Pairs with a clear sign that got the other, up to the mirror image of the whole."""
+    first, second, is_false, *readings = read_pairs(z, b, seed, wrong)
+    planes, frames = planes_of(first, second, *readings), len(z)
+    steps = on_path(planes, likeliest_path(planes, frames, NO_STRANGERS)).coefficients[:, :2]
+    z, b = z[second] - z[first], b[second] - b[first]
+    # Below three deviations either sign is as good.
+    by_offset, by_slope = np.abs(z) > 0.07, np.abs(b) > 0.006
+    truth = np.where(by_offset, z * steps[:, 0], b * steps[:, 1])
+    clear = (by_offset | (by_slope & (np.abs(z) < 0.02))) & ~is_false
+    # The first pair alone places its frame; a slope three deviations off, one in 370, mirrors it.
+    clear &= second > 1
+    off = (truth < 0)[clear]
+    assert clear.sum() > frames
+    return min(off.sum(), (~off).sum())
+
+
+def failures(sweep, wrong=0.0):
     """Seeds of which any sign is wrong."""
-    bad = []
-    for seed in range(12):
-        example = Sweep(*sweep(np.random.default_rng(100 + seed), seed), seed, **noise)
-        if example.wrong_signs(example.resolve()):
-            bad.append(seed)
-    return bad
+    paths = (sweep(np.random.default_rng(100 + seed), seed) for seed in range(12))
+    return [seed for seed, path in enumerate(paths) if wrong_signs(*path, seed, wrong)]
 
 
 @pytest.mark.parametrize("sweep", SWEEPS)
