@@ -47,7 +47,7 @@ def test_mountings_are_compared_where_both_are_known(sensor):
     remount = example_calibration(sensor, rotation=ROTATION * Rotation.from_euler("y", 7, degrees=True))
     shift_mm = 5.0 if sensor == "tracker" else 0.0
     if sensor == "tracker":
-        remount = replace(remount, translation_mm=remount.translation_mm + [3.0, 0.0, -4.0])
+        remount = replace(remount, translation_mm=remount.translation_mm + np.array([3.0, 0.0, -4.0]))
     assert mounting_difference(sweep, remount) == pytest.approx((7.0, shift_mm), abs=1e-6)
     unknown = replace(sweep, **{sensor: replace(getattr(sweep, sensor), sensor_from_image=None)})
     assert mounting_difference(unknown, remount) == (0.0, 0.0)
