@@ -1,7 +1,7 @@
 """Errors that wander: the answer and the covariance of a calibration whose sensor drifts over seconds.
 
 Plain least squares takes all errors for white and the sensor's poses for exact. But a sensor's error wanders
-(Ornstein and Uhlenbeck), so that neighbouring frames say the same: residuals are whiten for a grid of sizes
+(Ornstein and Uhlenbeck), so that neighbouring frames say the same: residuals are whitened for a grid of sizes
 and times of the wandering, and the answers of the grid are averaged by their restricted likelihood [2]_. And
 the derivatives contain the poses' errors, which are in the residuals too, so that pixel sizes come out too
 small: derivatives are taken at poses and points corrected by what the residuals say [1]_.
@@ -48,7 +48,7 @@ _SHORTEST, _LONGEST = 4.0, 2.0
 """Time constants tried: from four frames, of which fewer look like white noise, to twice the recording, which
 looks like a straight line."""
 _NEGLIGIBLE = 1e-4
-"""Weight over the largest below which a point of the grid has no say in the next step."""
+"""Weight over the largest below which a point of the grid has no say."""
 _SINGULAR = 1e-15
 """Ratio of eigenvalues below which a direction counts as not determined."""
 _SMALLEST = 1e-12

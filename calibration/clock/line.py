@@ -1,7 +1,7 @@
 """Clock offset between images and a sensor, from a plane's echo line: its depth and slope follow the sensor.
 
 The line's depth is a linear function of a tracker's position and, for small turns, of its rotation; its slope
-is one of an orientation sensor's rotation. The function is fitted anew for every delay that is delays; the
+is one of an orientation sensor's rotation. The function is fitted anew for every delay that is tried; the
 best delay leaves the least residual.
 
 References
@@ -67,7 +67,7 @@ def delay_from_lines(
         orientation sensor the slope.
     frame_time_s : ndarray, shape (m,)
     around_s, search_s : float
-        Delays from `around_s` - `search_s` to `around_s` + `search_s` are delays.
+        Delays from `around_s` - `search_s` to `around_s` + `search_s` are tried.
 
     Raises
     ------

@@ -176,7 +176,7 @@ def read_stack(
     shape = (len(frames), grid.vectors // bins[0], grid.samples // bins[1])
     if min(shape[1:]) < 8:
         raise InvalidInputError(
-            f"{recording.name}: expected images of at least 8 pixels of {pixel_mm:g} mm either path, "
+            f"{recording.name}: expected images of at least 8 pixels of {pixel_mm:g} mm either way, "
             f"got {shape[1]} x {shape[2]}"
         )
     transform = extra_module("skimage.transform", "calibrate", "a calibration from images")
