@@ -196,9 +196,8 @@ class HeadingFilter:
         rows = self._run(bins, arrays)
         weights, best = (values[-1] for values in self._weights(rows))
         best_filters = np.full(len(bins), best)
-        later = self._unsteady(rows, best_filters, bins)[
-            _STEADY:
-        ]  # what passes, as iron at the start, is smoothed
+        # What passes, as iron at the start, is smoothed.
+        later = self._unsteady(rows, best_filters, bins)[_STEADY:]
         unsteady = np.median(later) if later.size > _STEADY // 4 else 0.0
         weights[weights < _NEGLIGIBLE] = 0.0
         for j in np.union1d(np.flatnonzero(weights), best):

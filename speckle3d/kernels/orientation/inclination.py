@@ -232,9 +232,8 @@ def _set_up(s: Any, r: Any, force: FloatArray) -> None:
     bias_variance = s.p[BIAS : BIAS + 3, BIAS : BIAS + 3].copy()
     s.p[:] = np.diag(s.fresh)
     if s.running:
-        s.p[BIAS : BIAS + 3, BIAS : BIAS + 3] = (
-            bias_variance + r.bias_walk_rad_s_sqrt_s** 2 * s.pause_s * np.eye(3)
-        )
+        walk = r.bias_walk_rad_s_sqrt_s**2 * s.pause_s
+        s.p[BIAS : BIAS + 3, BIAS : BIAS + 3] = bias_variance + walk * np.eye(3)
     s.running = s.starting = True
     s.resting = s.rest_known = False
     s.still_s = s.start_s = 0.0
