@@ -76,7 +76,7 @@ def track(
 
     doubts += tissue.attenuation.doubts + examine_processing(tissue.structure, averaging)
     # What structure leaves open is told by itself.
-    doubts += examine_images(matches, motion, motion.claims(error)[1], curves, flags == 0)
+    doubts += examine_images(matches, motion, motion.claims(error)[1], tissue.unattenuated, flags == 0)
     doubts += sensors.doubts + disagreements(sensors.credible, motion.poses, covariance)
     if sink:
         sink(frame_pairs(motion, subset.used, shared.length_sigma))

@@ -177,7 +177,7 @@ def examine_images(
     covariance : ndarray, shape (n, 6, 6)
         Claimed for its poses.
     curves : DecorrelationCurves
-        As measured.
+        As measured, but stretched for structure where that is seen in place of speckle.
     usable : ndarray of bool, shape (n,)
 
     Raises

@@ -56,6 +56,8 @@ class TissueCurves:
     Attributes
     ----------
     curves : DecorrelationCurves
+    unattenuated : DecorrelationCurves
+        The same, stretched for structure alone.
     attenuation : Attenuation
         Of the tissue over the curves' phantom.
     structure : float
@@ -63,6 +65,7 @@ class TissueCurves:
     """
 
     curves: DecorrelationCurves
+    unattenuated: DecorrelationCurves
     attenuation: Attenuation
     structure: float
 
@@ -79,7 +82,7 @@ def tissue_curves(curves: DecorrelationCurves, texture: Texture, usable: BoolArr
     structure = 0.0 if curves.of_tissue else structure_openness(texture)
     if structure:
         curves = replace(stretched(curves, np.array(structure)), of_tissue=True)
-    return TissueCurves(attenuation.applied(curves), attenuation, structure)
+    return TissueCurves(attenuation.applied(curves), curves, attenuation, structure)
 
 
 def structure_openness(texture: Texture) -> float:
