@@ -6,7 +6,6 @@ import numpy as np
 
 from speckle3d.core.curves import TiltResponse
 from speckle3d.core.grid import ImageGrid
-from speckle3d.kernels.plane_misfit import EchoModels
 from speckle3d.matching.patches import lay_patches
 from speckle3d.matching.schedule import TrajectorySettings
 from speckle3d.matching.table import CorrelationTable
@@ -35,17 +34,16 @@ def table_of(rho, shift_mm=(0.0, 0.0), first=None, second=None):
     return CorrelationTable(first, second, rho, *motion)
 
 
-def fit_many(problem, rho, shift_mm=(0.0, 0.0), models=None, **priors):
+def fit_many(problem, rho, shift_mm=(0.0, 0.0), **priors):
     """Planes of pairs from correlations of shape (e, p), and which are determined."""
-    models = models or fully_developed(rho.shape[1])
+    models = fully_developed(rho.shape[1])
     return pair_planes(problem, table_of(rho, shift_mm), np.arange(len(rho)), models, **priors)
 
 
-def fit(problem, rho, shift_mm=(0.0, 0.0), share=None, gain=None, **priors):
+def fit(problem, rho, shift_mm=(0.0, 0.0), **priors):
     """Plane of one pair, from correlations of shape (p,); None if they determine none."""
     alone = {name: np.asarray(value)[None] for name, value in priors.items()}
-    models = None if share is None else EchoModels(share[None], gain[None])
-    planes, has_plane = fit_many(problem, np.asarray(rho)[None], shift_mm, models=models, **alone)
+    planes, has_plane = fit_many(problem, np.asarray(rho)[None], shift_mm, **alone)
     if not has_plane[0]:
         return None
     fields = {name: value[0] for name, value in vars(planes).items()}

@@ -1,4 +1,4 @@
-"""What holds for the project as a whole: imports that cost nothing, public names, README, shipped data."""
+"""What holds for the project as a whole: imports that cost nothing, public names, kernels, a page's example."""
 
 import importlib
 import json
@@ -76,29 +76,11 @@ def test_every_kernel_says_how_it_is_rounded_and_is_kept(project):
     assert [words for words, call in uses if ("cache=True" in words) == bool(call)] == []
 
 
-def examples(page):
-    return re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
-
-
-def test_the_readmes_python_example_runs(project, monkeypatch, capsys):
-    (example,) = examples(project / "README.md")
-    assert len([line for line in example.splitlines() if line.strip()]) <= 8
-    monkeypatch.chdir(project)
-    exec(compile(example, "README.md", "exec"), {})
-    assert "mm" in capsys.readouterr().out
-
-
 def test_the_example_of_the_orientation_sensor_runs(project, monkeypatch, tmp_path, capsys):
-    (example,) = examples(project / "docs" / "howto" / "orientation.md")
+    page = (project / "docs" / "howto" / "orientation.md").read_text(encoding="utf-8")
+    (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     write_csv(tmp_path / "log.bin", ImuLog(**{**samples(300), "source": "turning"}))
     monkeypatch.chdir(tmp_path)
     exec(compile(example, "orientation.md", "exec"), {})
     # As many orientations as samples; level and pointing north.
     assert capsys.readouterr().out.startswith("300 [")
-
-
-def test_the_readmes_test_command_is_what_ci_runs(project):
-    readme = (project / "README.md").read_text(encoding="utf-8")
-    ci = (project / ".ci" / "run").read_text(encoding="utf-8")
-    (command,) = re.findall(r"^pip install .*python -m pytest.*$", readme, re.MULTILINE)
-    assert command in ci.replace(" --quiet", "")

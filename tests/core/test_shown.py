@@ -4,35 +4,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform
 
-import speckle3d as s3
 from speckle3d.core.volume import Volume
-from xsens.logs.samples import ImuLog
 
 
-@pytest.fixture(scope="module")
-def things(sweep, curves, tracking):
-    modes = s3.correct(tracking, sweep, ["pose", "orientation", "fused"])
-    volume = Volume(np.zeros((4, 3, 2), np.uint8), (0.5, 0.5, 1.0), RigidTransform.identity())
-    log = ImuLog(np.arange(500) / 100, gyroscope_rad_s=np.zeros((500, 3)))
-    return [
-        sweep,
-        sweep.tracker,
-        sweep.orientation,
-        sweep.tracker.readings,
-        curves,
-        tracking,
-        volume,
-        log,
-        *modes.values(),
-    ]
-
-
-def test_a_repr_fits_in_ten_lines(things):
-    for thing in things:
-        lines = repr(thing).splitlines()
-        assert lines[0].startswith(type(thing).__name__), lines[0]
-        assert 2 <= len(lines) <= 10, (type(thing).__name__, len(lines))
-        assert max(map(len, lines)) <= 100, type(thing).__name__
+def test_a_repr_has_a_few_lines(tracking, sweep, curves):
+    for thing in (tracking, sweep, sweep.tracker, sweep.orientation, curves):
+        assert 2 <= len(repr(thing).splitlines()) <= 10
 
 
 def test_a_table_has_a_row_for_each_frame(tracking, sweep):

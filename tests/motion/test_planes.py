@@ -127,15 +127,6 @@ def test_three_patches_make_no_plane():
     assert fit(problem(), rho) is not None
 
 
-def test_what_stays_is_allowed_for():
-    """Half the patches hold a coherent share, all of them noise."""
-    share, gain = np.where(np.arange(len(AT)) % 2 == 0, 0.4, 0.0), np.full(len(AT), 0.95)
-    rho = 0.95 * (share + (1.0 - share) * np.sqrt(correlations(PLANES[1]))) ** 2
-    estimate = fit(problem(), rho, share=share, gain=gain)
-    np.testing.assert_allclose(estimate.coefficients, PLANES[1], atol=5e-4)
-    assert np.abs(fit(problem(), rho).coefficients - PLANES[1])[1:].max() > 1.5e-3
-
-
 @pytest.mark.parametrize("plane", CROSSING)
 def test_frames_that_cross_are_told_by_their_v_of_distances(plane):
     """Even where a few patches on the line have lost their correlation."""
