@@ -1,4 +1,4 @@
-"""What holds for the project as a whole: imports that cost nothing, public names, kernels, a page's example."""
+"""What holds for the whole project: cheap imports, public names, flags of kernels, a page's example."""
 
 import importlib
 import json
