@@ -47,10 +47,10 @@ def require_modes(sweep: Sweep, modes: Sequence[str], crossing: bool = False) ->
                     f"{where}: expected a crossing sweep (--crossing SWEEP), got none"
                 )
             continue
+        if mode == "fused" and crossing:
+            continue
         sensor = sensor_of(sweep, mode)
         if sensor is None:
-            if mode == "fused" and crossing:
-                continue
             raise InsufficientDataError(f"{where}: expected {_WANTED[mode]}, got none")
         if sensor.sensor_from_image is None:
             raise InsufficientDataError(f"{where}: {sensor.uncalibrated}")
@@ -66,9 +66,11 @@ _WANTED = {
 
 
 def sensor_of(sweep: Sweep, mode: str) -> OrientationSensor | Tracker | None:
-    """The sensor that a drift mode needs; None for those that need none."""
+    """The sensor that a drift mode needs, of several a calibrated one; None for those that need none."""
     if mode == "crossed":
         return None
+    if mode == "fused" and sweep.orientation is not None and sweep.orientation.sensor_from_image is None:
+        return sweep.tracker or sweep.orientation
     return sweep.tracker if mode == "pose" else sweep.orientation_source
 
 

@@ -11,6 +11,7 @@ from speckle3d.core.errors import MismatchError
 from speckle3d.core.streams import TimedPoses
 from speckle3d.correction.fused import fuse
 from speckle3d.correction.scale import ScaleEvidence
+from speckle3d.corrections import correct
 from speckle3d.tracking import track
 
 
@@ -35,6 +36,11 @@ def test_evidence_of_the_scale_counts_by_its_information_against_the_images_clai
     assert least - 5e-4 < found.log_scale < most + 5e-4
     assert found.log_scale_sigma == pytest.approx(0.01, rel=0.2)
     assert found.used == ("images", "crossing")
+
+
+def test_a_sensor_without_a_mounting_costs_itself_alone(sweep, tracking):
+    loose = replace(sweep, orientation=replace(sweep.orientation, sensor_from_image=None))
+    assert correct(tracking, loose, "fused")["fused"].used == ("images", "tracker")
 
 
 def test_a_loop_of_the_images_says_nothing_of_their_scale(sweep, curves):
