@@ -75,13 +75,17 @@ def innovations(
                 for b in range(a):
                     gain[a, i] -= root[a, b] * gain[b, i]
                 gain[a, i] /= root[a, a]
+            # Columns innermost, which the compiler takes several at a time.
             for c in range(wide):
-                value = columns[first + a, c]
-                for i in range(size):
-                    value -= effects[first + a, i] * expected[i, c]
-                for b in range(a):
-                    value -= root[a, b] * white[first + b, c]
-                white[first + a, c] = value / root[a, a]
+                white[first + a, c] = columns[first + a, c]
+            for i in range(size):
+                for c in range(wide):
+                    white[first + a, c] -= effects[first + a, i] * expected[i, c]
+            for b in range(a):
+                for c in range(wide):
+                    white[first + a, c] -= root[a, b] * white[first + b, c]
+            for c in range(wide):
+                white[first + a, c] /= root[a, a]
         for a in range(n):
             for i in range(size):
                 for c in range(wide):
