@@ -9,7 +9,7 @@ from speckle3d.core.errors import naming
 from speckle3d.core.sweep import Sweep
 from speckle3d.correction.crossing.pair import CrossedPair
 from speckle3d.correction.drift import DriftCorrection
-from speckle3d.correction.modes import PUBLISHED, correct_mode, require_modes, sensor_of
+from speckle3d.correction.modes import CUBIC_MODES, correct_mode, require_modes, sensor_of
 from speckle3d.correction.scale import FusedPoses, ScaledPoses
 from speckle3d.examine.sensors import credible_sensors, repair_readings, require_credible
 from speckle3d.tracked import Tracked
@@ -79,7 +79,7 @@ def correct(
         sweep, _ = repair_readings(sweep)
     corrections: dict[str, Correction] = {}
     for mode in modes:
-        if mode in PUBLISHED:
+        if mode in CUBIC_MODES:
             # What wander the sensed orientation shows, cubics need not make up for.
             start = tracked.subset if tracked.subset is not None else tracked.image
             corrections[mode] = correct_mode(

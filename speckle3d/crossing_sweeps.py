@@ -9,7 +9,7 @@ from speckle3d.core.curves import BAND_ADVICE, DecorrelationCurves
 from speckle3d.core.errors import InvalidInputError, MismatchError
 from speckle3d.core.progress import Progress, after
 from speckle3d.core.sweep import Sweep
-from speckle3d.correction.crossing.pair import CrossedPair, crossed
+from speckle3d.correction.crossing.pair import CrossedPair, solve_crossing
 from speckle3d.correction.crossing.stack import ImageStack
 from speckle3d.correction.crossing.sweep import CrossingSweep
 from speckle3d.examine.sensors import credible_sensors
@@ -90,7 +90,7 @@ def cross_with(
     report = after(progress, len(first), len(first) + len(second))
     second_stack = stack_for(second, config)
     second_tracking = track(second, curves, config, report, images=second_stack.keep)
-    pair = crossed(
+    pair = solve_crossing(
         crossing_side(first, tracking, stack, config),
         crossing_side(second, second_tracking, second_stack, config),
         config.crossing,

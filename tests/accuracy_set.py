@@ -16,7 +16,7 @@ from sweep_examples import frames_of
 from speckle3d.config import Config
 from speckle3d.core.streams import TimedPoses, TimedRotations
 from speckle3d.core.sweep import OrientationSensor, Tracker
-from speckle3d.correction.crossing.pair import crossed
+from speckle3d.correction.crossing.pair import solve_crossing
 from speckle3d.corrections import correct
 from speckle3d.io.curves import read_curves
 from speckle3d.io.load import load_sweep
@@ -196,7 +196,7 @@ class AccuracySet:
         """Errors by mode."""
         if name.startswith("crossing"):
             pair = tissue_pair(PairCase(seed=2))
-            first = crossed(pair.first, pair.second).first
+            first = solve_crossing(pair.first, pair.second).first
             return _score({"crossed": first}, pair.truth[0], GRID.centre_mm)
         sweep = self.sweep(name)
         kind = (*CASES[name], None, None)[2]

@@ -47,12 +47,12 @@ def correlated_readings(error: FloatArray, shapes: int = 0) -> float:
     energy = total = float((error**2).sum())
     lags = 1
     while lags < len(error) // 4:
-        alike = float((error[lags:] * error[:-lags]).sum())
-        if alike <= 0.0:
+        product = float((error[lags:] * error[:-lags]).sum())
+        if product <= 0.0:
             break
-        total, lags = total + 2.0 * alike, lags + 1
-    lost = min((2 * lags - 1) * shapes / len(error), 0.75) if lags > 1 else 0.0
-    return max(total / max(energy, np.finfo(float).tiny) / (1.0 - lost), 1.0)
+        total, lags = total + 2.0 * product, lags + 1
+    bias = min((2 * lags - 1) * shapes / len(error), 0.75) if lags > 1 else 0.0
+    return max(total / max(energy, np.finfo(float).tiny) / (1.0 - bias), 1.0)
 
 
 def curve_errors(error: FloatArray, frames: int) -> FloatArray:
@@ -72,36 +72,36 @@ def curve_errors(error: FloatArray, frames: int) -> FloatArray:
     order = np.arange(CUBIC + 1)
     basis = legendre.legvander(np.linspace(-1.0, 1.0, frames), CUBIC) * np.sqrt(2.0 * order + 1.0)
     against_first = ((basis - basis[0]) ** 2).sum(axis=1) / len(error)
-    alike = [correlated_readings(column[:, None], CUBIC + 1) for column in error.T]
+    runs = [correlated_readings(column[:, None], CUBIC + 1) for column in error.T]
     white = np.mean((error[2:] - 2.0 * error[1:-1] + error[:-2]) ** 2, axis=0) / 6.0
-    left = 2.0 * np.maximum(error.var(axis=0) - white, 0.0)
-    variance = against_first[:, None] * error.var(axis=0) * alike
-    variance[1:] += left
+    excess = 2.0 * np.maximum(error.var(axis=0) - white, 0.0)
+    variance = against_first[:, None] * error.var(axis=0) * runs
+    variance[1:] += excess
     return np.asarray(variance[:, :, None] * np.eye(6))
 
 
 def tracker_errors(
-    poses: RigidTransform, centre_mm: FloatArray, time_s: FloatArray, known: FusedSettings
+    poses: RigidTransform, centre_mm: FloatArray, time_s: FloatArray, errors: FusedSettings
 ) -> FloatArray:
     """Covariance by a tracker's millimetres, mounting and clock, which none of its readings shows."""
     from_first = poses[0].inv() * poses
-    path, turned = from_first.apply(centre_mm) - centre_mm, from_first.rotation.as_matrix() - np.eye(3)
+    path, rotation = from_first.apply(centre_mm) - centre_mm, from_first.rotation.as_matrix() - np.eye(3)
     drift = np.gradient(path, time_s, axis=0)
     drift -= drift[0]
     across = skew(path)
     covariance = np.zeros((len(poses), 6, 6))
     covariance[:, :3, :3] = (
-        known.tracker_scale_sigma**2 * path[:, :, None] * path[:, None, :]
-        + known.clock_sigma_s**2 * drift[:, :, None] * drift[:, None, :]
-        + known.mounting_sigma_rad**2 * across @ across.transpose(0, 2, 1)
-        + known.mounting_sigma_mm**2 * turned @ turned.transpose(0, 2, 1)
+        errors.tracker_scale_sigma**2 * path[:, :, None] * path[:, None, :]
+        + errors.clock_sigma_s**2 * drift[:, :, None] * drift[:, None, :]
+        + errors.mounting_sigma_rad**2 * across @ across.transpose(0, 2, 1)
+        + errors.mounting_sigma_mm**2 * rotation @ rotation.transpose(0, 2, 1)
     )
-    covariance[:, 3:, 3:] = known.mounting_sigma_rad**2 * turned @ turned.transpose(0, 2, 1)
+    covariance[:, 3:, 3:] = errors.mounting_sigma_rad**2 * rotation @ rotation.transpose(0, 2, 1)
     return covariance
 
 
 def orientation_errors(
-    poses: RigidTransform, centre_mm: FloatArray, time_s: FloatArray, known: FusedSettings
+    poses: RigidTransform, centre_mm: FloatArray, time_s: FloatArray, errors: FusedSettings
 ) -> FloatArray:
     """Covariance by an orientation sensor's slow errors, which bend the path, too.
 
@@ -110,12 +110,12 @@ def orientation_errors(
     poses : RigidTransform, length n
         In the sensor's world, z up.
     """
-    sigma = np.array([known.inclination_sigma_rad, known.inclination_sigma_rad, known.heading_sigma_rad])
+    sigma = np.array([errors.inclination_sigma_rad, errors.inclination_sigma_rad, errors.heading_sigma_rad])
     to_first = poses[0].rotation.as_matrix().T
     slow = to_first @ np.diag(sigma**2) @ to_first.T
-    grown = 2.0 * (1.0 - np.exp(-(time_s - time_s[0]) / known.wander_s))
+    grown = 2.0 * (1.0 - np.exp(-(time_s - time_s[0]) / errors.wander_s))
     path = (poses[0].inv() * poses).apply(centre_mm) - centre_mm
     # An angle that grows evenly along the way moves its end by half as much as one that is there throughout.
-    bent = -0.5 * skew(path)
-    errors = np.concatenate([bent, np.broadcast_to(np.eye(3), bent.shape)], axis=1)
-    return np.asarray(grown[:, None, None] * errors @ slow @ errors.transpose(0, 2, 1))
+    lever = -0.5 * skew(path)
+    slopes = np.concatenate([lever, np.broadcast_to(np.eye(3), lever.shape)], axis=1)
+    return np.asarray(grown[:, None, None] * slopes @ slow @ slopes.transpose(0, 2, 1))

@@ -136,28 +136,22 @@ class CorrectedChain:
         turning, moving = _world_axes(poses, self.values(coefficients))
         return self._accumulate(turning[:, :, columns]), self._accumulate(moving[:, :, columns])
 
-    def frame_errors(self, coefficients: FloatArray, poses: FloatArray, centre_mm: FloatArray) -> FloatArray:
-        """How every frame moves against the first with every coefficient, along the first frame's axes.
-
-        Parameters
-        ----------
-        centre_mm : ndarray, shape (3,)
-            Of the image, in its frame.
+    def frame_errors(self, coefficients: FloatArray, poses: FloatArray) -> FloatArray:
+        """How every frame's origin moves against the first with every coefficient, along the first's axes.
 
         Returns
         -------
         ndarray, shape (n, 6, n_coefficients)
-            (x, y, z, tilt, yaw, roll) of the image's centre, mm and rad per unit coefficient.
+            (x, y, z, tilt, yaw, roll), mm and rad per unit coefficient.
         """
         turn, shift = (part - part[:1] for part in self.twists(coefficients, poses))
-        centres = poses[:, :3, :3] @ centre_mm + poses[:, :3, 3]
-        moved = shift - skew(centres) @ turn
+        shift = shift - skew(poses[:, :3, 3]) @ turn
         to_first = poses[0, :3, :3].T
-        return np.concatenate([to_first @ moved, to_first @ turn], axis=1)
+        return np.concatenate([to_first @ shift, to_first @ turn], axis=1)
 
     def _accumulate(self, per_frame: FloatArray) -> FloatArray:
-        weighted = per_frame[:, :, :, None] * self.basis[:, None, :, :]
-        return np.asarray(np.cumsum(weighted, axis=0).reshape(len(per_frame), 3, -1))
+        per_coefficient = per_frame[:, :, :, None] * self.basis[:, None, :, :]
+        return np.asarray(np.cumsum(per_coefficient, axis=0).reshape(len(per_frame), 3, -1))
 
 
 def correction_matrices(values: FloatArray) -> FloatArray:

@@ -101,7 +101,7 @@ class DriftCorrection:
 def correct_pose(
     world_from_image: RigidTransform,
     reference: RigidTransform,
-    covered: BoolArray,
+    has_reading: BoolArray,
     corners_mm: FloatArray,
     settings: DriftSettings | None = None,
 ) -> DriftCorrection:
@@ -116,10 +116,10 @@ def correct_pose(
     ----------
     world_from_image : RigidTransform, length n
         Image-based poses, in any world, mm.
-    reference : RigidTransform, as long as there are covered frames
+    reference : RigidTransform, one for each frame with a reading
         The sensor's ``world_from_image`` of each of them.
-    covered : ndarray of bool, shape (n,)
-        Which frames have a reading. The others are corrected by the same smooth curves and add no cost.
+    has_reading : ndarray of bool, shape (n,)
+        Frames with a reading. The others are corrected by the same smooth curves and add no cost.
     corners_mm : ndarray, shape (4, 3)
         Image corners in the image frame.
 
@@ -134,29 +134,29 @@ def correct_pose(
        use in a hybrid acquisition system", BioMedical Engineering OnLine 7:5, 2008.
     """
     settings = settings or DriftSettings()
-    _require_coverage(covered, settings)
+    _require_coverage(has_reading, settings)
     centre = corners_mm.mean(axis=0)
-    sensor_from_start = _registered(world_from_image[covered], reference, centre)
+    sensor_from_start = _mean_alignment(world_from_image[has_reading], reference, centre)
     target = _points(sensor_from_start.inv() * reference, corners_mm)
     chain = _chain(world_from_image, centre, AXES, settings)
 
     def misfit(poses: FloatArray) -> FloatArray:
-        """Equation (4): distances between corrected and measured corners of every covered frame."""
+        """Equation (4): distances between corrected and measured corners of every frame with a reading."""
         error = _points(RigidTransform.from_matrix(poses), corners_mm) - target
-        softened = (error**2).sum(axis=-1, keepdims=True) + settings.loss_epsilon_mm**2
-        return np.asarray((error * softened**-0.25).reshape(len(poses), -1))
+        square = (error**2).sum(axis=-1, keepdims=True) + settings.loss_epsilon_mm**2
+        return np.asarray((error * square**-0.25).reshape(len(poses), -1))
 
-    fit = _solve(misfit, chain, covered, settings)
+    fit = _solve(misfit, chain, has_reading, settings)
     poses = sensor_from_start * RigidTransform.from_matrix(chain.poses(fit.x))
-    left = poses[covered].inv() * reference
+    left = poses[has_reading].inv() * reference
     error = np.hstack([left.apply(centre) - centre, left.rotation.as_rotvec()])
-    return _correction(poses, fit, chain, covered, settings, error, centre)
+    return _correction(poses, fit, chain, has_reading, settings, error, centre)
 
 
 def correct_orientation(
     world_from_image: RigidTransform,
     reference: Rotation,
-    covered: BoolArray,
+    has_reading: BoolArray,
     centre_mm: FloatArray,
     settings: DriftSettings | None = None,
 ) -> DriftCorrection:
@@ -168,9 +168,9 @@ def correct_orientation(
 
     Parameters
     ----------
-    world_from_image, covered, settings
+    world_from_image, has_reading, settings
         As for `correct_pose`.
-    reference : Rotation, as long as there are covered frames
+    reference : Rotation, one for each frame with a reading
         The sensor's ``world_from_image`` of each of them.
     centre_mm : ndarray, shape (3,)
         Image centre in the image frame.
@@ -186,45 +186,45 @@ def correct_orientation(
        use in a hybrid acquisition system", BioMedical Engineering OnLine 7:5, 2008.
     """
     settings = settings or DriftSettings()
-    _require_coverage(covered, settings)
-    sensor_from_start = (reference * world_from_image[covered].rotation.inv()).mean()
+    _require_coverage(has_reading, settings)
+    sensor_from_start = (reference * world_from_image[has_reading].rotation.inv()).mean()
     target = sensor_from_start.inv() * reference
     # With the frame's origin moved to the centre, a turn about the centre has no translation.
-    image_from_centred = RigidTransform.from_translation(centre_mm)
-    chain = _chain(world_from_image * image_from_centred, np.zeros(3), AXES[3:], settings)
+    image_from_centre = RigidTransform.from_translation(centre_mm)
+    chain = _chain(world_from_image * image_from_centre, np.zeros(3), AXES[3:], settings)
 
     def misfit(poses: FloatArray) -> FloatArray:
         """Equation (5): roll, yaw and tilt of the measured orientation seen from the corrected frame."""
         return roll_yaw_tilt(Rotation.from_matrix(poses[:, :3, :3]).inv() * target)
 
-    fit = _solve(misfit, chain, covered, settings)
-    centred = RigidTransform.from_matrix(chain.poses(fit.x))
-    turned = RigidTransform.from_rotation(sensor_from_start) * centred * image_from_centred.inv()
-    poses = RigidTransform.from_translation(-turned[0].translation) * turned
+    fit = _solve(misfit, chain, has_reading, settings)
+    about_centre = RigidTransform.from_matrix(chain.poses(fit.x))
+    in_sensor = RigidTransform.from_rotation(sensor_from_start) * about_centre * image_from_centre.inv()
+    poses = RigidTransform.from_translation(-in_sensor[0].translation) * in_sensor
     angles = fit.fun.reshape(-1, 3)[:, ::-1]
     error = np.hstack([np.zeros_like(angles), angles])
-    return _correction(poses, fit, chain, covered, settings, error, centre_mm)
+    return _correction(poses, fit, chain, has_reading, settings, error, centre_mm)
 
 
 def _solve(
     misfit: Callable[[FloatArray], FloatArray],
     chain: CorrectedChain,
-    used: BoolArray,
+    has_reading: BoolArray,
     settings: DriftSettings,
 ) -> OptimizeResult:
-    """Least squares of the misfits of the covered frames' poses, each of which depends on one pose alone."""
+    """Least squares of the misfits of poses that have a reading, each of which depends on one pose alone."""
     tick = 1e-7
     small = RigidTransform.from_exp_coords(tick * np.eye(6)).as_matrix()
 
     def jacobian(coefficients: FloatArray) -> FloatArray:
         poses = chain.poses(coefficients)
-        twists = np.concatenate(chain.twists(coefficients, poses), axis=1)[used]
-        now = misfit(poses[used])
-        slopes = np.stack([misfit(each @ poses[used]) - now for each in small], axis=-1) / tick
+        twists = np.concatenate(chain.twists(coefficients, poses), axis=1)[has_reading]
+        error = misfit(poses[has_reading])
+        slopes = np.stack([misfit(nudge @ poses[has_reading]) - error for nudge in small], axis=-1) / tick
         return np.asarray((slopes @ twists).reshape(-1, coefficients.size))
 
     def residuals(coefficients: FloatArray) -> FloatArray:
-        return misfit(chain.poses(coefficients)[used]).ravel()
+        return misfit(chain.poses(coefficients)[has_reading]).ravel()
 
     tolerance = settings.tolerance
     return least_squares(
@@ -243,7 +243,7 @@ def _correction(
     poses: RigidTransform,
     fit: OptimizeResult,
     chain: CorrectedChain,
-    used: BoolArray,
+    has_reading: BoolArray,
     settings: DriftSettings,
     error: FloatArray,
     centre_mm: FloatArray,
@@ -251,7 +251,9 @@ def _correction(
     """The result, with what the readings' scatter about the curves claims."""
     covariance = curve_errors(error, len(poses))
     sigma, values = length_sigma(poses, covariance, centre_mm), chain.values(fit.x)
-    return DriftCorrection(poses, fit, chain.names, values, float(used.mean()), settings, covariance, sigma)
+    return DriftCorrection(
+        poses, fit, chain.names, values, float(has_reading.mean()), settings, covariance, sigma
+    )
 
 
 def _chain(
@@ -273,23 +275,23 @@ def _points(poses: RigidTransform, corners: FloatArray) -> FloatArray:
     return np.asarray(corners @ rotation.as_matrix().transpose(0, 2, 1) + translation[:, None, :])
 
 
-def _registered(moving: RigidTransform, fixed: RigidTransform, centre_mm: FloatArray) -> RigidTransform:
+def _mean_alignment(moving: RigidTransform, fixed: RigidTransform, centre_mm: FloatArray) -> RigidTransform:
     """Rigid transform ``fixed_from_moving`` of the mean turn and the mean place of the image's centre."""
     turn = (fixed.rotation * moving.rotation.inv()).mean()
     shift = (fixed.apply(centre_mm) - turn.apply(moving.apply(centre_mm))).mean(axis=0)
     return RigidTransform.from_components(shift, turn)
 
 
-def _require_coverage(covered: BoolArray, settings: DriftSettings) -> None:
-    """Raise `InsufficientDataError` unless curves through the covered frames are determined everywhere."""
-    frames, count = covered.size, int(covered.sum())
+def _require_coverage(has_reading: BoolArray, settings: DriftSettings) -> None:
+    """Raise `InsufficientDataError` unless readings determine the curves everywhere."""
+    frames, count = has_reading.size, int(has_reading.sum())
     if frames < settings.minimum_frames:
         raise InsufficientDataError(
             f"drift correction: expected {settings.minimum_frames} frames or more, got {frames}"
         )
     least = max(settings.minimum_coverage * frames, settings.minimum_frames)
     end = int(settings.maximum_end_gap * frames) + 1
-    if count < least or not (covered[:end].any() and covered[-end:].any()):
+    if count < least or not (has_reading[:end].any() and has_reading[-end:].any()):
         raise InsufficientDataError(
             f"drift correction: expected sensor readings for at least {least:.0f} of {frames} frames, also "
             f"among the first {end} and the last {end}, got {count}"

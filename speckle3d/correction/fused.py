@@ -33,7 +33,7 @@ from speckle3d.correction.settings import FusedSettings
 
 HUBER = 2.0
 """Deviations, by the root mean square of three residuals, at which a reading begins to lose weight."""
-MOST_ROUNDS, CONVERGED = 12, 1e-5
+MOST_ROUNDS, LEAST_STEP = 12, 1e-5
 FARTHEST = 2.0
 """Factor between the lengths of images and tracker beyond which no average of the two means anything."""
 
@@ -59,23 +59,27 @@ class FusionProblem:
         """
         # A path that cannot follow a sensor that wanders shows how large its error is.
         stiff = replace(self, path=self.path.stiff)
-        unknowns, _ = stiff.iterated(np.zeros(self.columns[-1].stop))
+        unknowns, _ = stiff.gauss_newton(np.zeros(self.columns[-1].stop))
         poses = self.path.chain.poses(unknowns[self.columns[0]])
-        sensors = zip(self.sensors, self.columns[1:], strict=True)
-        problem = replace(self, sensors=tuple(each.sized(poses, unknowns[own]) for each, own in sensors))
-        unknowns, matrix = problem.iterated(unknowns)
-        sensors = zip(self.sensors, self.columns[1:], strict=True)
-        strain = max([1.0, *(each.strain(unknowns[own]) for each, own in sensors)])
+        sensors = [sensor.with_jitter_along(poses, part) for sensor, part in self._of_sensors(unknowns)]
+        problem = replace(self, sensors=tuple(sensors))
+        unknowns, matrix = problem.gauss_newton(unknowns)
+        strain = max([1.0, *(sensor.strain(part) for sensor, part in self._of_sensors(unknowns))])
         return unknowns, strain**2 * np.asarray(np.linalg.inv(matrix), dtype=float), problem
 
-    def iterated(self, unknowns: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _of_sensors(self, unknowns: FloatArray) -> list[tuple[SensorReadings, FloatArray]]:
+        """Each sensor with its unknowns."""
+        parts = [unknowns[columns] for columns in self.columns[1:]]
+        return list(zip(self.sensors, parts, strict=True))
+
+    def gauss_newton(self, unknowns: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Gauss-Newton with Huber's weights: unknowns, and the matrix of the normal equations there."""
         matrix, gradient = self.normal_equations(unknowns)
         for _ in range(MOST_ROUNDS):
             step = cho_solve(cho_factor(matrix), -gradient)
             unknowns = unknowns + step
             matrix, gradient = self.normal_equations(unknowns)
-            if np.abs(step[self.columns[0]]).max() < CONVERGED:
+            if np.abs(step[self.columns[0]]).max() < LEAST_STEP:
                 break
         return unknowns, matrix
 
@@ -85,9 +89,9 @@ class FusionProblem:
         for columns, residual, slope, robust in self._equations(unknowns):
             size = np.sqrt((residual**2).mean(axis=1))
             root = np.sqrt(huber_weights(size, HUBER) if robust else np.ones_like(size))[:, None]
-            weighed, pull = (slope * root[:, :, None]).reshape(-1, slope.shape[-1]), (residual * root).ravel()
-            matrix[np.ix_(columns, columns)] += weighed.T @ weighed
-            gradient[columns] += weighed.T @ pull
+            rows, pull = (slope * root[:, :, None]).reshape(-1, slope.shape[-1]), (residual * root).ravel()
+            matrix[np.ix_(columns, columns)] += rows.T @ rows
+            gradient[columns] += rows.T @ pull
         return matrix, gradient
 
     def _equations(self, unknowns: FloatArray) -> Iterator[tuple[IntArray, FloatArray, FloatArray, bool]]:
@@ -103,11 +107,11 @@ class FusionProblem:
         for evidence in self.evidence:
             residual, slope = self.path.misfit(coefficients, evidence)
             yield every[on_path], residual[None], slope[None], True
-        for sensor, own in zip(self.sensors, self.columns[1:], strict=True):
-            residual, slope = sensor.prior(unknowns[own])
-            yield every[own], residual[:, None], slope[:, None], False
-            joint = np.concatenate([every[on_path], every[own]])
-            for residual, slope in sensor.equations(self.path, coefficients, unknowns[own]):
+        for sensor, columns in zip(self.sensors, self.columns[1:], strict=True):
+            residual, slope = sensor.prior(unknowns[columns])
+            yield every[columns], residual[:, None], slope[:, None], False
+            joint = np.concatenate([every[on_path], every[columns]])
+            for residual, slope in sensor.equations(self.path, coefficients, unknowns[columns]):
                 yield joint, residual, slope, True
 
 
@@ -165,36 +169,34 @@ def fuse(
     start = centre.inv() * (image[0].inv() * image) * centre
     own_sigma = float(np.sqrt(max(scale_sigma**2 - curves_sigma**2, 0.0)))
     path = ImagePath.of(edges, start, share, scale_sigma, own_sigma, turn_sigma_per_mm, frame_time_s)
-    known = start.as_matrix(), centre_mm, frame_time_s, settings
-    readings = (SensorReadings.of(tracker, *known), SensorReadings.of(orientation, *known))
-    if (
-        readings[0] is not None
-        and not 1.0 / FARTHEST < (ratio := readings[0].travel_ratio(known[0])) < FARTHEST
-    ):
-        raise MismatchError(
-            f"expected a tracker that travels as far as the images, within a factor of {FARTHEST:g}, got "
-            f"{ratio:.3g} times as far: compare modes image and pose"
-        )
-    problem = FusionProblem(path, tuple(each for each in readings if each is not None), tuple(evidence))
-    unknowns, whole, problem = problem.solve()
-    coefficients, inside = unknowns[problem.columns[0]], problem.columns[0]
+    frames = start.as_matrix(), centre_mm, frame_time_s, settings
+    readings = [SensorReadings.of(sensor, *frames) for sensor in (tracker, orientation)]
+    sensors = tuple(sensor for sensor in readings if sensor is not None)
+    for sensor in sensors:
+        ratio = sensor.travel_ratio(frames[0]) if sensor.places else 1.0
+        if not 1.0 / FARTHEST < ratio < FARTHEST:
+            raise MismatchError(
+                f"expected a tracker that travels as far as the images, within a factor of {FARTHEST:g}, got "
+                f"{ratio:.3g} times as far: compare modes image and pose"
+            )
+    problem = FusionProblem(path, sensors, tuple(evidence))
+    unknowns, uncertainty, problem = problem.solve()
+    on_path = problem.columns[0]
+    coefficients = unknowns[on_path]
     poses = path.chain.poses(coefficients)
-    slopes = path.chain.frame_errors(coefficients, poses, np.zeros(3))
-    covariance = np.einsum("nic,cd,njd->nij", slopes, whole[inside, inside], slopes, optimize=True)
-    bent = centre * RigidTransform.from_matrix(poses) * centre.inv()
+    slopes = path.chain.frame_errors(coefficients, poses)
+    covariance = np.einsum("nic,cd,njd->nij", slopes, uncertainty[on_path, on_path], slopes, optimize=True)
+    from_first = centre * RigidTransform.from_matrix(poses) * centre.inv()
     world = RigidTransform.identity()
-    if problem.sensors:
-        world = problem.sensors[0].world_of(unknowns[problem.columns[1]])
-        if problem.sensors[0].places:
-            world = world * centre.inv()
-        else:
-            world = RigidTransform.from_rotation(world.rotation)
+    if sensors:
+        world = sensors[0].world_of(unknowns[problem.columns[1]])
+        world = world * centre.inv() if sensors[0].places else RigidTransform.from_rotation(world.rotation)
     return FusedPoses(
-        poses=world * bent,
+        poses=world * from_first,
         covariance=covariance,
         log_scale=float(np.log1p(path.mean_rates()[0] @ coefficients)),
-        log_scale_sigma=length_sigma(bent, covariance, centre_mm),
+        log_scale_sigma=length_sigma(from_first, covariance, centre_mm),
         evidence=tuple(evidence),
-        used=("images", *(each.name for each in problem.sensors), *(each.source for each in evidence)),
-        sizes={f"{each.name} jitter": float(each.jitter[int(each.places)]) for each in problem.sensors},
+        used=("images", *(sensor.name for sensor in sensors), *(source.source for source in evidence)),
+        sizes={f"{s.name} jitter": float(s.jitter[int(s.places)]) for s in problem.sensors},
     )

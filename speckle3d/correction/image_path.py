@@ -136,8 +136,8 @@ class ImagePath:
 
 def _knot_variances(edges: RelativePoses, knots: IntArray, frames: int) -> FloatArray:
     """Variances of motion from knot to knot, each component by itself and pairs independent, shape (6, k)."""
-    every = np.arange(frames)
-    ends = np.concatenate([edges.first, every[:-1], edges.second, every[1:]])
+    frame_numbers = np.arange(frames)
+    ends = np.concatenate([edges.first, frame_numbers[:-1], edges.second, frame_numbers[1:]])
     size = ends.size // 2
     sign, rows = np.repeat([-1.0, 1.0], size), np.tile(np.arange(size), 2)
     difference = sparse.csr_matrix((sign, (rows, ends)), (size, frames))[:, 1:]
@@ -146,8 +146,8 @@ def _knot_variances(edges: RelativePoses, knots: IntArray, frames: int) -> Float
     between[knots[:-1], np.arange(knots.size - 1)] -= 1.0
     variances = []
     for axis in range(6):
-        joined = 1.0 / edges.covariance[:, axis, axis]
-        information = np.concatenate([joined, np.full(frames - 1, HELD[axis] ** -2)])
+        weight = 1.0 / edges.covariance[:, axis, axis]
+        information = np.concatenate([weight, np.full(frames - 1, HELD[axis] ** -2)])
         factor = splu((difference.T @ sparse.diags(information) @ difference).tocsc())
         variances.append((between[1:] * factor.solve(between[1:])).sum(axis=0))
     return np.array(variances)

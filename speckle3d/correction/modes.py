@@ -15,9 +15,9 @@ from speckle3d.correction.claims import length_sigma, orientation_errors, tracke
 from speckle3d.correction.drift import DriftCorrection, DriftSettings, correct_orientation, correct_pose
 from speckle3d.correction.settings import FusedSettings
 
-PUBLISHED = ("orientation", "pose")
+CUBIC_MODES = ("orientation", "pose")
 """The modes of Housden et al. 2008, which fit cubics."""
-DRIFT_MODES = (*PUBLISHED, "crossed", "fused")
+DRIFT_MODES = (*CUBIC_MODES, "crossed", "fused")
 
 
 def require_modes(sweep: Sweep, modes: Sequence[str], crossing: bool = False) -> None:
@@ -51,14 +51,14 @@ def require_modes(sweep: Sweep, modes: Sequence[str], crossing: bool = False) ->
             continue
         sensor = sensor_of(sweep, mode)
         if sensor is None:
-            raise InsufficientDataError(f"{where}: expected {_WANTED[mode]}, got none")
+            raise InsufficientDataError(f"{where}: expected {_NEEDS[mode]}, got none")
         if sensor.sensor_from_image is None:
             raise InsufficientDataError(f"{where}: {sensor.uncalibrated}")
         if not sensor.covers(sweep.frame_time_s).any():
             raise InsufficientDataError(f"{where}: expected readings over the frames, got none")
 
 
-_WANTED = {
+_NEEDS = {
     "pose": "a tracker in /tracker",
     "orientation": "an orientation sensor in /orientation",
     "fused": "a sensor in /orientation or /tracker, or a crossing sweep",
@@ -80,7 +80,7 @@ def correct_mode(
     sweep: Sweep,
     settings: DriftSettings,
     image_covariance: FloatArray,
-    known: FusedSettings,
+    errors: FusedSettings,
 ) -> DriftCorrection:
     """Correct image-based poses by the sensor that a mode stands for; see `require_modes`.
 
@@ -92,24 +92,26 @@ def correct_mode(
         Of every frame of `sweep`.
     image_covariance : ndarray, shape (n, 6, 6)
         Claimed for the image-based poses; `orientation` leaves their errors of place as they are.
-    known : FusedSettings
+    errors : FusedSettings
         Errors of the sensors that their readings do not show.
     """
     sensor = sensor_of(sweep, mode)
     assert sensor is not None
     time_s, centre_mm = sweep.frame_time_s, sweep.grid.centre_mm
-    covered = sensor.covers(time_s)
+    has_reading = sensor.covers(time_s)
     with naming(sweep.name):
         if isinstance(sensor, Tracker) and mode == "pose":
-            measured = sensor.world_from_image(time_s[covered])
-            found = correct_pose(world_from_image, measured, covered, sweep.grid.corners_mm, settings)
-            covariance = found.covariance + tracker_errors(found.poses, centre_mm, time_s, known)
+            reference = sensor.world_from_image(time_s[has_reading])
+            correction = correct_pose(
+                world_from_image, reference, has_reading, sweep.grid.corners_mm, settings
+            )
+            covariance = correction.covariance + tracker_errors(correction.poses, centre_mm, time_s, errors)
         else:
-            rotation = image_orientation(sensor, time_s[covered])
-            found = correct_orientation(world_from_image, rotation, covered, centre_mm, settings)
-            covariance = found.covariance.copy()
+            rotation = image_orientation(sensor, time_s[has_reading])
+            correction = correct_orientation(world_from_image, rotation, has_reading, centre_mm, settings)
+            covariance = correction.covariance.copy()
             covariance[:, :3, :3] += image_covariance[:, :3, :3]
             if isinstance(sensor, OrientationSensor):
-                covariance += orientation_errors(found.poses, centre_mm, time_s, known)
-    sigma = length_sigma(found.poses, covariance, centre_mm)
-    return replace(found, covariance=covariance, length_sigma=sigma)
+                covariance += orientation_errors(correction.poses, centre_mm, time_s, errors)
+    sigma = length_sigma(correction.poses, covariance, centre_mm)
+    return replace(correction, covariance=covariance, length_sigma=sigma)

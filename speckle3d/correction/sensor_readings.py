@@ -49,7 +49,8 @@ class SensorReadings:
         The mounting, to the image's centre.
     world : RigidTransform
         Sensor's world from the path's, to begin with.
-    measured : RigidTransform, length m
+    world_from_sensor : RigidTransform, length m
+        Readings; without places of an orientation sensor.
     time_s : ndarray, shape (m,)
         On the images' clock.
     jitter : ndarray, shape (2,)
@@ -60,7 +61,7 @@ class SensorReadings:
     places: bool
     centre_from_sensor: RigidTransform
     world: RigidTransform
-    measured: RigidTransform
+    world_from_sensor: RigidTransform
     time_s: FloatArray
     frame_time_s: FloatArray
     settings: FusedSettings
@@ -88,24 +89,20 @@ class SensorReadings:
         inside = np.flatnonzero((time_s >= frame_time_s[0]) & (time_s <= frame_time_s[-1]))
         if inside.size < FEWEST_READINGS:
             return None
-        measured, mounting = (
-            _rigid(sensor.readings.world_from_sensor[inside]),
-            _rigid(sensor.sensor_from_image),
-        )
         places = isinstance(sensor, Tracker)
-        to_centre = RigidTransform.from_translation(-centre_mm if places else np.zeros(3))
+        centre = RigidTransform.from_translation(centre_mm if places else np.zeros(3))
         readings = cls(
             sensor.label,
             places,
-            to_centre * mounting.inv(),
+            (_rigid(sensor.sensor_from_image) * centre).inv(),
             RigidTransform.identity(),
-            measured,
+            _rigid(sensor.readings.world_from_sensor[inside]),
             time_s[inside],
             frame_time_s,
             settings,
             np.ones(2),
         )
-        readings = replace(readings, world=readings._registered(path))
+        readings = replace(readings, world=readings._consensus_world(path))
         second = [
             (values[2:] - 2.0 * values[1:-1] + values[:-2]) / np.sqrt(6.0)
             for values in readings.errors(path, np.zeros(readings.size))
@@ -118,8 +115,8 @@ class SensorReadings:
         """Times at which the wandering error is unknown; none of a tracker."""
         if self.places:
             return np.zeros(0)
-        wanted = WANDER_KNOTS_PER_TIME * np.ptp(self.time_s) / self.settings.wander_s
-        count = int(np.clip(np.ceil(wanted), 2, MOST_WANDER_KNOTS))
+        times = np.ptp(self.time_s) / self.settings.wander_s
+        count = int(np.clip(np.ceil(WANDER_KNOTS_PER_TIME * times), 2, MOST_WANDER_KNOTS))
         return np.linspace(self.time_s[0], self.time_s[-1], count)
 
     @property
@@ -127,26 +124,26 @@ class SensorReadings:
         """Number of unknowns."""
         return RIGID + 3 * self.knots_s.size
 
-    def _registered(self, path: FloatArray) -> RigidTransform:
+    def _consensus_world(self, path: FloatArray) -> RigidTransform:
         """The world that most readings agree on."""
-        mounted = self._expected(path, np.zeros(self.size))
-        turns = self.measured.rotation * mounted.rotation.inv()
+        expected = self._expected(path, np.zeros(self.size))
+        turns = self.world_from_sensor.rotation * expected.rotation.inv()
         turn = turns[int(np.argmin((turns.mean().inv() * turns).magnitude()))]
-        place = np.median(self.measured.translation - turn.apply(mounted.translation), axis=0)
+        place = np.median(self.world_from_sensor.translation - turn.apply(expected.translation), axis=0)
         return RigidTransform.from_components(place, turn)
 
     def travel_ratio(self, path: FloatArray) -> float:
         """How many times as far as the images the sensor travels, along the path that both have."""
-        mounted = self._expected(path, np.zeros(self.size)) * self.centre_from_sensor.inv()
-        images, measured = (
-            each.translation - each.translation.mean(axis=0)
-            for each in (mounted, self.measured * self.centre_from_sensor.inv())
+        expected = self._expected(path, np.zeros(self.size)) * self.centre_from_sensor.inv()
+        image_path, sensor_path = (
+            poses.translation - poses.translation.mean(axis=0)
+            for poses in (expected, self.world_from_sensor * self.centre_from_sensor.inv())
         )
-        return float((images * measured).sum() / max((images**2).sum(), LEAST_JITTER[1] ** 2))
+        return float((image_path * sensor_path).sum() / max((image_path**2).sum(), LEAST_JITTER[1] ** 2))
 
     def world_of(self, unknowns: FloatArray) -> RigidTransform:
         """Sensor's world from the path's; it turns about the middle of the readings."""
-        pivot = RigidTransform.from_translation(self.measured.translation.mean(axis=0))
+        pivot = RigidTransform.from_translation(self.world_from_sensor.translation.mean(axis=0))
         turn = RigidTransform.from_rotation(Rotation.from_rotvec(unknowns[WORLD_TURN]))
         shift = RigidTransform.from_translation(unknowns[WORLD_SHIFT])
         return shift * pivot * turn * pivot.inv() * self.world
@@ -175,12 +172,12 @@ class SensorReadings:
     def errors(self, path: FloatArray, unknowns: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Expected less measured turns, rad, and places, mm, along the world's axes, shape (m, 3) each."""
         expected = self._expected(path, unknowns)
-        turn = (expected.rotation * self.measured.rotation.inv()).as_rotvec()
+        turn = (expected.rotation * self.world_from_sensor.rotation.inv()).as_rotvec()
         if not self.places:
             return turn + self._hats() @ unknowns[RIGID:].reshape(-1, 3), np.zeros_like(turn)
         place = expected.translation
-        stretched = place + unknowns[MILLIMETRES] * (place - place.mean(axis=0))
-        return turn, stretched - self.measured.translation
+        stretch = unknowns[MILLIMETRES] * (place - place.mean(axis=0))
+        return turn, place + stretch - self.world_from_sensor.translation
 
     def equations(
         self, path: ImagePath, coefficients: FloatArray, unknowns: FloatArray
@@ -220,21 +217,21 @@ class SensorReadings:
         world, axes = self.world_of(unknowns), expected[rows].rotation.as_matrix()
         to_world, place, c = world.rotation.as_matrix(), expected.translation, turn.shape[-1]
         turns, places = np.zeros((2, len(at), 3, c + self.size))
-        own = turns[:, :, c:]
+        slopes = turns[:, :, c:]
         turns[:, :, :c] = to_world @ turn
-        own[:, :, WORLD_TURN] = np.eye(3)
-        own[:, :, MOUNTING_TURN] = axes
-        own[:, :, CLOCK] = ahead[0][rows]
-        own[:, :, RIGID:] = np.einsum("mk,ij->mikj", self._hats()[rows], np.eye(3)).reshape(len(at), 3, -1)
+        slopes[:, :, WORLD_TURN] = np.eye(3)
+        slopes[:, :, MOUNTING_TURN] = axes
+        slopes[:, :, CLOCK] = ahead[0][rows]
+        slopes[:, :, RIGID:] = np.einsum("mk,ij->mikj", self._hats()[rows], np.eye(3)).reshape(len(at), 3, -1)
         if self.places:
             on_path = (world.inv() * expected[rows]).translation
-            own = places[:, :, c:]
+            slopes = places[:, :, c:]
             places[:, :, :c] = to_world @ (shift - skew(on_path) @ turn)
-            own[:, :, WORLD_TURN] = -skew(place[rows] - self.measured.translation.mean(axis=0))
-            own[:, :, WORLD_SHIFT] = np.eye(3)
-            own[:, :, MOUNTING_SHIFT] = axes
-            own[:, :, CLOCK] = ahead[1][rows]
-            own[:, :, MILLIMETRES] = place[rows] - place.mean(axis=0)
+            slopes[:, :, WORLD_TURN] = -skew(place[rows] - self.world_from_sensor.translation.mean(axis=0))
+            slopes[:, :, WORLD_SHIFT] = np.eye(3)
+            slopes[:, :, MOUNTING_SHIFT] = axes
+            slopes[:, :, CLOCK] = ahead[1][rows]
+            slopes[:, :, MILLIMETRES] = place[rows] - place.mean(axis=0)
         return turns, places
 
     def prior(self, unknowns: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -246,9 +243,9 @@ class SensorReadings:
         matrix = np.zeros((self.size, self.size))
         matrix[range(RIGID), range(RIGID)] = rigid
         size = np.array([s.inclination_sigma_rad, s.inclination_sigma_rad, s.heading_sigma_rad])
-        kept = np.exp(-np.diff(self.knots_s)[:1] / s.wander_s)
-        change = np.eye(k) - kept * np.eye(k, k=-1)
-        change[1:] /= np.sqrt(1.0 - kept**2)
+        decay = np.exp(-np.diff(self.knots_s)[:1] / s.wander_s)
+        change = np.eye(k) - decay * np.eye(k, k=-1)
+        change[1:] /= np.sqrt(1.0 - decay**2)
         matrix[RIGID:, RIGID:] = np.kron(change, np.diag(1.0 / size))
         return matrix @ unknowns, matrix
 
@@ -256,7 +253,7 @@ class SensorReadings:
         """How many of their deviations a tracker's millimetres are off, to please the images, too."""
         return float(abs(unknowns[MILLIMETRES])) / self.settings.tracker_scale_sigma
 
-    def sized(self, path: FloatArray, unknowns: FloatArray) -> SensorReadings:
+    def with_jitter_along(self, path: FloatArray, unknowns: FloatArray) -> SensorReadings:
         """The readings with the jitter that is left of them along a path.
 
         Parameters

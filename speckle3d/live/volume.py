@@ -47,7 +47,7 @@ class GrowingVolume:
     def keep(self, index: int, intensity: Float32Array) -> None:
         """Keep a frame's image, unless those of its neighbours are enough."""
         self._pooled.keep(0, intensity)
-        self._latest = self._pooled.kept(0, 1)[0]
+        self._latest = self._pooled.images(1)[0].astype(np.float16)
         if index % self._every:
             return
         with self._lock:

@@ -149,7 +149,7 @@ class BeamTable:
 
 
 @lru_cache(maxsize=4)
-def tabulate_beam(probe: Probe | None = None, attenuation_db_cm_mhz: float = 0.0) -> BeamTable:
+def tabulate_beam(probe: Probe = Probe(), attenuation_db_cm_mhz: float = 0.0) -> BeamTable:
     """Compute the two-way field of `probe` by Rayleigh-Sommerfeld sums over elements and lens strips.
 
     The last four tables, 5 MB each, are kept: the two sweeps of a pair share one, each kind of medium has
@@ -165,7 +165,6 @@ def tabulate_beam(probe: Probe | None = None, attenuation_db_cm_mhz: float = 0.0
     ----------
     .. [1] J. W. Goodman, "Introduction to Fourier Optics", first Rayleigh-Sommerfeld solution.
     """
-    probe = probe or Probe()
     step = probe.pitch_mm / PER_PITCH
     lateral = np.arange(round(_LATERAL_REACH_MM / step) + 1, dtype=np.float64) * step
     wavenumbers = 2e-3 * np.pi * _NODES_HZ / probe.speed_of_sound_m_s

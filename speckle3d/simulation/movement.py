@@ -34,6 +34,10 @@ _WANDER = np.array([0.5, 0.5, 0.0, *np.deg2rad([0.6, 0.6, 0.6])])
 """Slow wander over a sweep: standard deviation of x, y (mm), tilt, yaw and roll (rad)."""
 
 _PAUSE_S = 0.3
+"""How long the hand stops, once in a sweep."""
+
+_FRAME_JITTER_S = 1e-3
+"""Of the frame clock, at most, either way."""
 
 _WOBBLE_HZ = 3.0
 
@@ -70,15 +74,12 @@ class HandMotion:
         Sweep forward, then back over the same tissue.
     wobble_mm : float
         Deliberate to and fro along the elevational axis: amplitude, uneven as the frequency is.
-    pauses : int
-        How many times the hand stops.
     """
 
     start_rad: tuple[float, float, float] = (0.0, 0.0, 0.0)
     turn_rad: tuple[float, float, float] = (0.0, 0.0, 0.0)
     reverse: bool = False
     wobble_mm: float = 0.0
-    pauses: int = 1
 
 
 @dataclass(frozen=True)
@@ -97,7 +98,7 @@ class Trajectory:
     face_mm : float
         Width of the image; the probe turns about the middle of its face.
     world_from_medium : RigidTransform
-    medium_from_start : RigidTransform, optional
+    medium_from_start : RigidTransform
         What positions in the medium count from.
     """
 
@@ -106,26 +107,25 @@ class Trajectory:
     in_medium: FloatArray
     face_mm: float
     world_from_medium: RigidTransform
-    medium_from_start: RigidTransform | None = None
+    medium_from_start: RigidTransform = RigidTransform.identity()
 
     def medium_from_image(self, time_s: FloatArray) -> RigidTransform:
         """Pose in the medium at any times within the knots."""
         place, turns = np.split(self.columns(time_s), 2, axis=-1)
         rotation = Rotation.from_euler(self.order, turns[..., ["XYZ".index(axis) for axis in self.order]])
         in_image = [self.face_mm / 2.0, 0.0, 0.0] + place * (1.0 - self.in_medium)
-        moved = place * self.in_medium - rotation.apply(in_image)
-        pose = RigidTransform.from_components(moved, rotation)
-        return pose if self.medium_from_start is None else self.medium_from_start * pose
+        translation = place * self.in_medium - rotation.apply(in_image)
+        return self.medium_from_start * RigidTransform.from_components(translation, rotation)
 
     def world_from_image(self, time_s: FloatArray) -> RigidTransform:
         """Pose in the world at any times within the knots."""
         return self.world_from_medium * self.medium_from_image(time_s)
 
 
-def frame_times(frames: int, rate_hz: float, rng: np.random.Generator, jitter_s: float = 1e-3) -> FloatArray:
-    """Frame clock with uniform jitter of at most `jitter_s` either way."""
-    jitter = min(jitter_s, 0.2 / rate_hz)
-    return np.arange(frames) / rate_hz + rng.uniform(-jitter, jitter, frames)
+def frame_times(frames: int, rate_hz: float, rng: np.random.Generator) -> FloatArray:
+    """Frame clock with uniform jitter."""
+    jitter_s = min(_FRAME_JITTER_S, 0.2 / rate_hz)
+    return np.arange(frames) / rate_hz + rng.uniform(-jitter_s, jitter_s, frames)
 
 
 def _knot_times(duration_s: float) -> FloatArray:
@@ -161,7 +161,7 @@ def hand_sweep(
     time = _knot_times(duration_s)
     columns = np.zeros((time.size, 6))
     columns[:, 0] = face_mm / 2.0
-    columns[:, 2] += _progress(time, duration_s, motion, rng) * length_mm
+    columns[:, 2] += _progress(time, duration_s, motion.reverse, rng) * length_mm
     phase = np.clip(time / duration_s, 0.0, 1.0)
     columns[:, 3:] = motion.start_rad + _smooth_step(phase)[:, None] * np.asarray(motion.turn_rad)
     for axis in range(6):
@@ -169,7 +169,7 @@ def hand_sweep(
             columns[:, axis] += _WANDER[axis] * _band_noise(time, (0.0, 1.0 / duration_s), rng)
         columns[:, axis] += _TREMOR[axis] * _band_noise(time, _TREMOR_HZ, rng)
     if motion.wobble_mm > 0:
-        columns[:, 2] += _wobble(time, duration_s, motion, rng)
+        columns[:, 2] += motion.wobble_mm * _wobble(time, duration_s, rng)
     spline = _spline(time, columns)
     return Trajectory(spline, "ZYX", np.ones(3), face_mm, world_from_medium, medium_from_start)
 
@@ -217,20 +217,17 @@ def world_from_medium(heading_rad: float) -> RigidTransform:
     return RigidTransform.from_rotation(Rotation.from_rotvec([0.0, 0.0, heading_rad]) * down)
 
 
-def _progress(
-    time: FloatArray, duration_s: float, motion: HandMotion, rng: np.random.Generator
-) -> FloatArray:
+def _progress(time: FloatArray, duration_s: float, reverse: bool, rng: np.random.Generator) -> FloatArray:
     """Fraction of the length travelled: zero before the sweep, one (or zero again) after it."""
     inside = (time >= 0.0) & (time <= duration_s)
     duration = float(time[inside][-1])
     speed = 1.0 + _SPEED_VARIATION * np.tanh(_band_noise(time, (0.0, 0.8), rng))
     # In a very short sweep a whole pause would leave no motion at all.
     pause_s = min(_PAUSE_S, 0.2 * duration)
-    for centre in rng.uniform(0.15, 0.85, motion.pauses) * duration:
-        # At rest for a pause, which begins and ends within a quarter of it.
-        speed *= 1.0 - np.clip(3.0 - 4.0 * np.abs((time - centre) / pause_s), 0.0, 1.0)
-    speed = np.where(inside, speed, 0.0)
-    if motion.reverse:
+    # At rest for a pause, which begins and ends within a quarter of it.
+    away = np.abs(time - rng.uniform(0.15, 0.85) * duration) / pause_s
+    speed = np.where(inside, speed * (1.0 - np.clip(3.0 - 4.0 * away, 0.0, 1.0)), 0.0)
+    if reverse:
         speed *= np.tanh((duration / 2.0 - time) / 0.25)
         forward, back = speed.clip(0.0).sum(), -speed.clip(None, 0.0).sum()
         speed = np.where(speed > 0.0, speed / forward, speed / back)
@@ -241,13 +238,13 @@ def _progress(
     return np.cumsum(np.convolve(speed, start / start.sum(), mode="same"))
 
 
-def _wobble(time: FloatArray, duration_s: float, motion: HandMotion, rng: np.random.Generator) -> FloatArray:
+def _wobble(time: FloatArray, duration_s: float, rng: np.random.Generator) -> FloatArray:
     """To and fro during the sweep, as evenly as a hand can: phase and amplitude wander."""
     uneven = _band_noise(time, (0.0, 0.3), rng)
     strength = 1.0 + 0.15 * np.tanh(_band_noise(time, (0.0, 0.5), rng))
     during = np.clip(time / 0.5, 0.0, 1.0) * np.clip((duration_s - time) / 0.5, 0.0, 1.0)
     phase = 2.0 * np.pi * _WOBBLE_HZ * time + uneven
-    return np.asarray(motion.wobble_mm * strength * _smooth_step(during) * np.sin(phase))
+    return np.asarray(strength * _smooth_step(during) * np.sin(phase))
 
 
 def _smooth_step(u: FloatArray) -> FloatArray:

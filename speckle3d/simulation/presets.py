@@ -36,7 +36,7 @@ from speckle3d.simulation.settings import Preset, SimulationSettings
 
 __all__ = ["Preset", "SimulatedSweep", "SimulationSettings", "simulate"]
 
-_PHANTOM_FRAMES = 150
+_BATH_FRAMES = 150
 
 _BATH_MM = (320.0, -150.0, -240.0)
 """Place of the bath in the tracker's world, off its axes."""
@@ -93,14 +93,11 @@ def simulate(settings: SimulationSettings) -> tuple[SimulatedSweep, ...]:
     medium_seed, heading_seed, *sweep_seeds = np.random.SeedSequence(settings.seed).spawn(4)
     world = world_from_medium(float(np.random.default_rng(heading_seed).uniform(-np.pi, np.pi)))
     if settings.preset in _BATH:
-        # Its floor is level; by the turn of nothing files are those of older versions, to the last bit.
-        world = RigidTransform.from_translation(_BATH_MM) * world * RigidTransform.identity()
+        world = RigidTransform.from_translation(_BATH_MM) * world
     medium = _medium(settings, _entropy(medium_seed))
-    beam = tabulate_beam(Probe(), attenuation_db_cm_mhz=medium.attenuation_db_cm_mhz)
-    count = 2 if settings.preset == "crossed" else 1
-    return tuple(
-        _sweep(settings, beam, medium, world, seed, number) for number, seed in enumerate(sweep_seeds[:count])
-    )
+    beam = tabulate_beam(attenuation_db_cm_mhz=medium.attenuation_db_cm_mhz)
+    numbers = (0, 1) if settings.preset == "crossed" else (0,)
+    return tuple(_sweep(settings, beam, medium, world, sweep_seeds[number], number) for number in numbers)
 
 
 def _medium(settings: SimulationSettings, entropy: int) -> Medium:
@@ -136,10 +133,16 @@ def _sweep(
         times = np.arange(len(poses)) / settings.frame_rate_hz
     else:
         motion_seed, clock_seed, tracker_seed, orientation_seed, seed = seed.spawn(5)
-        frames, duration, rate_hz = _timing(settings)
-        times = frame_times(frames, rate_hz, np.random.default_rng(clock_seed))
-        trajectory = _trajectory(settings, image, duration, world, number, np.random.default_rng(motion_seed))
-        poses, span = trajectory.medium_from_image(times), (-0.3, duration + 0.3)
+        per_mm = 16 if settings.preset == "reversal" else 8
+        frames = settings.frames or (_BATH_FRAMES if in_bath else round(per_mm * settings.length_mm))
+        duration_s = settings.duration_s if in_bath else frames / settings.frame_rate_hz
+        times = frame_times(frames, frames / duration_s, np.random.default_rng(clock_seed))
+        motion_rng = np.random.default_rng(motion_seed)
+        if in_bath:
+            trajectory = calibration_scan(settings, image.width_mm, world, motion_rng)
+        else:
+            trajectory = _hand_sweep(settings, image.width_mm, duration_s, world, number, motion_rng)
+        poses, span = trajectory.medium_from_image(times), (-0.3, duration_s + 0.3)
         noise = settings.sensor_noise if in_bath else 1.0
         tracker = simulate_tracker(trajectory, span, np.random.default_rng(tracker_seed), noise)
         orientation = simulate_orientation(trajectory, span, np.random.default_rng(orientation_seed), noise)
@@ -166,25 +169,14 @@ def _image_grid(settings: SimulationSettings, probe: Probe) -> ImageGrid:
     return ImageGrid.of_fan(settings.vectors, settings.samples, spacing_mm, radius_mm, (-half, half))
 
 
-def _timing(settings: SimulationSettings) -> tuple[int, float, float]:
-    """Frames, duration (s) and frame rate (Hz)."""
-    if settings.preset in _BATH:
-        frames = settings.frames or _PHANTOM_FRAMES
-        return frames, settings.duration_s, frames / settings.duration_s
-    frames = settings.frames or round((16 if settings.preset == "reversal" else 8) * settings.length_mm)
-    return frames, frames / settings.frame_rate_hz, settings.frame_rate_hz
-
-
-def _trajectory(
+def _hand_sweep(
     settings: SimulationSettings,
-    image: ImageGrid,
+    face_mm: float,
     duration_s: float,
     world: RigidTransform,
     number: int,
     rng: np.random.Generator,
 ) -> Trajectory:
-    if settings.preset in _BATH:
-        return calibration_scan(settings, image.width_mm, world, rng)
     fan, turn, crossing = np.deg2rad([settings.fan_deg, settings.turn_deg, settings.crossing_deg]).tolist()
     tilt, turns = 0.0, (0.0, 0.0, 0.0)
     if settings.preset == "crossed":
@@ -192,6 +184,6 @@ def _trajectory(
     elif settings.preset == "rotation":
         turns = (turn, 0.0, 0.0) if settings.turn_axis == "tilt" else (0.0, turn, 0.0)
     motion = HandMotion((tilt, 0.0, 0.0), turns, settings.preset == "reversal", settings.wobble_mm)
-    centre = np.array([image.width_mm / 2.0, 0.0, settings.length_mm / 2.0])
+    centre = np.array([face_mm / 2.0, 0.0, settings.length_mm / 2.0])
     start = turned_about(centre, crossing * number)
-    return hand_sweep(settings.length_mm, duration_s, image.width_mm, motion, start, world, rng)
+    return hand_sweep(settings.length_mm, duration_s, face_mm, motion, start, world, rng)

@@ -29,7 +29,7 @@ from speckle3d.core.reconstruction import (
 from speckle3d.core.shown import shown
 from speckle3d.core.sweep import Sweep
 from speckle3d.correction.crossing.pair import CrossedPair
-from speckle3d.correction.modes import PUBLISHED, require_modes
+from speckle3d.correction.modes import CUBIC_MODES, require_modes
 from speckle3d.corrections import Correction, correct
 from speckle3d.crossing_sweeps import cross_with, require_pair, stack_for
 from speckle3d.examine.disagreements import differing_lengths
@@ -287,7 +287,7 @@ def _correct_modes(
             elif mode not in left_out:
                 corrections |= correct(tracked, sweep, [mode], config, pair)
         except (MismatchError, InsufficientDataError) as error:
-            if mode in PUBLISHED and isinstance(error, InsufficientDataError):
+            if mode in CUBIC_MODES and isinstance(error, InsufficientDataError):
                 raise
             left_out[mode] = str(error) if str(error).startswith(sweep.name) else f"{where}: {error}"
     return poses | {mode: correction.poses for mode, correction in corrections.items()}, corrections

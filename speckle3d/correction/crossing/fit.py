@@ -21,18 +21,18 @@ from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 
 from speckle3d.core.arrays import FloatArray
-from speckle3d.correction.crossing.planes import BENDS
+from speckle3d.correction.crossing.planes import BENDS, SPACING_MM
 from speckle3d.correction.crossing.similarity import (
     PARAMETERS,
     RIGID,
     BlurredSweep,
     OneWay,
     Placing,
-    compared,
+    look_up_points,
 )
 
 _MOST_STEPS = 30
-_CONVERGED = 0.02
+_LEAST_STEP = 0.02
 """Step, in the posterior's own standard deviations, at which a level has converged."""
 _LEAST_UNLIKE = 0.05
 """Least 1 - correlation by which residuals are weighed."""
@@ -41,8 +41,8 @@ PART_MM = 6.0
 _REACH_MM = 12.0
 """Over which the correlation of tissue's displacement falls to 1 / e: a probe's contact is centimetres wide,
 and what it presses moves in one piece."""
-_SEEN = 1.5
-"""What is there over what is found of displacements: parts see shifts through images that are alike in part
+_DISPLACEMENT_RATIO = 1.5
+"""True displacements over what parts show of them: parts see shifts through images that are alike in part
 only, and the smoothest of it passes for place and turn. Of simulated pairs."""
 _USUAL_MM = 0.3
 """Displacement, mm over the deviation of speckle's part, for which it is found best."""
@@ -97,7 +97,7 @@ class CrossingFit:
     @cached_property
     def ways(self) -> tuple[OneWay, OneWay]:
         """Points of either sweep looked up in the other."""
-        return compared(self.pair, self.placing)
+        return look_up_points(self.pair, self.placing)
 
     @cached_property
     def correlation(self) -> float:
@@ -121,42 +121,39 @@ class CrossingFit:
         return -0.5 * self.independent * float(np.log(max(1.0 - self.correlation, 1e-3))) - self.strain
 
     @cached_property
-    def matrix(self) -> FloatArray:
-        """Of Gauss and Newton and of the prior, shape (24, 24)."""
-        rows = [way.residuals()[1] for way in self.ways]
-        return np.asarray(self.prior.information + self.weight * sum(each.T @ each for each in rows))
-
-    def step(self, damping: float) -> FloatArray:
-        """Damped step towards the least cost, shape (24,)."""
-        gradient = self.prior.information @ self.prior.deviation(self.placing)
+    def normal_equations(self) -> tuple[FloatArray, FloatArray]:
+        """Matrix of Gauss and Newton with the prior's, shape (24, 24), and gradient of the cost."""
+        information = self.prior.information
+        gradient, hessian = information @ self.prior.deviation(self.placing), np.zeros_like(information)
         for way in self.ways:
             residuals, rows = way.residuals()
-            gradient = gradient + self.weight * (rows.T @ residuals)
-        return np.asarray(-np.linalg.solve(self.matrix + damping * np.diag(np.diag(self.matrix)), gradient))
+            gradient, hessian = gradient + self.weight * (rows.T @ residuals), hessian + rows.T @ rows
+        return information + self.weight * hessian, gradient
 
-    def is_better(self, other: CrossingFit) -> bool:
+    def is_better(self, fit: CrossingFit) -> bool:
         """Whether the cost is below another's at the points that both show, by the other's weight."""
-        gain = other.strain - self.strain
-        for way, theirs in zip(self.ways, other.ways, strict=True):
-            both = way.valid & theirs.valid
+        gain = fit.strain - self.strain
+        for way, reference in zip(self.ways, fit.ways, strict=True):
+            common = way.valid & reference.valid
             # Less overlap could pass for more likeness.
-            if both.sum() < 0.5 * theirs.valid.sum():
+            if common.sum() < 0.5 * reference.valid.sum():
                 return False
-            gain += other.weight * (way.correlation(both) - theirs.correlation(both))
+            gain += fit.weight * (way.correlation(common) - reference.correlation(common))
         return gain > 0.0
 
-    def refined(self) -> CrossingFit:
+    def refine(self) -> CrossingFit:
         """At the placing of least cost nearby."""
         fit, damping = self, 1e-2
         for _ in range(_MOST_STEPS):
-            step = fit.step(damping)
-            trial = replace(fit, placing=fit.placing.stepped(step))
+            matrix, gradient = fit.normal_equations
+            step = np.asarray(-np.linalg.solve(matrix + damping * np.diag(np.diag(matrix)), gradient))
+            trial = replace(fit, placing=fit.placing.moved_by(step))
             if not trial.is_better(fit):
                 damping *= 8.0
                 continue
-            converged = step @ fit.matrix @ step < _CONVERGED**2 * PARAMETERS
+            close = step @ matrix @ step < _LEAST_STEP**2 * PARAMETERS
             fit, damping = trial, max(damping / 6.0, 1e-6)
-            if converged:
+            if close:
                 break
         return fit
 
@@ -166,16 +163,17 @@ class CrossingFit:
         across = self.placing.first_from_second.rotation.as_matrix()[:, 0]
         return float(np.rad2deg(np.arccos(min(1.0, abs(float(across[0] / np.hypot(across[0], across[2])))))))
 
-    def overlap_mm(self, spacing_mm: float) -> float:
+    @property
+    def overlap_mm(self) -> float:
         """Length along either sweep, the lesser, of which the other sees a good part of each image."""
         lengths = []
         for way, sweep in zip(self.ways, self.pair, strict=True):
-            many, shared = (
+            every, visible = (
                 np.bincount(plane, minlength=len(sweep.volume))
                 for plane in (sweep.plane, sweep.plane[way.valid])
             )
-            at = np.flatnonzero((many > 0) & (shared >= 0.25 * many))
-            lengths.append(spacing_mm * float(np.ptp(at)) if at.size else 0.0)
+            at = np.flatnonzero((every > 0) & (visible >= 0.25 * every))
+            lengths.append(SPACING_MM * float(np.ptp(at)) if at.size else 0.0)
         return min(lengths)
 
 
@@ -188,15 +186,15 @@ class Parts:
     pulls : ndarray, shape (n, 24)
         Gradient of the cost with the parameters. The first three shift the second sweep against the first, so
         that they are a part's own shift, too.
-    shared : ndarray, shape (n, 3, 24)
+    coupling : ndarray, shape (n, 3, 24)
         Matrix of Gauss and Newton between that shift, mm, and all parameters.
-    alike : ndarray, shape (3 n, 3 n)
+    correlation : ndarray, shape (3 n, 3 n)
         Correlation of the displacements of all parts and directions.
     """
 
     pulls: FloatArray
-    shared: FloatArray
-    alike: FloatArray
+    coupling: FloatArray
+    correlation: FloatArray
 
     @classmethod
     def of(cls, fit: CrossingFit) -> Parts:
@@ -205,17 +203,17 @@ class Parts:
         for way in fit.ways:
             residuals, rows = way.residuals()
             points.append(way.points_mm[way.valid])
-            shared = (rows[:, :3, None] * rows[:, None, :]).reshape(len(rows), -1)
-            values.append(fit.weight * np.concatenate([rows * residuals[:, None], shared], axis=1))
+            coupling = (rows[:, :3, None] * rows[:, None, :]).reshape(len(rows), -1)
+            values.append(fit.weight * np.concatenate([rows * residuals[:, None], coupling], axis=1))
         places, rows = np.concatenate(points), np.concatenate(values)
         cells, number = np.unique(np.floor(places / PART_MM), axis=0, return_inverse=True)
         sums = np.zeros((len(cells), rows.shape[1]))
         np.add.at(sums, number.ravel(), rows)
-        alike = np.kron(np.exp(-PART_MM * cdist(cells, cells) / _REACH_MM), np.eye(3))
+        correlation = np.kron(np.exp(-PART_MM * cdist(cells, cells) / _REACH_MM), np.eye(3))
         pulls, products = np.split(sums, [PARAMETERS], axis=1)
-        return cls(pulls, products.reshape(-1, 3, PARAMETERS), np.asarray(alike, dtype=np.float64))
+        return cls(pulls, products.reshape(-1, 3, PARAMETERS), np.asarray(correlation, dtype=np.float64))
 
-    def moved_mm(self, matrix: FloatArray) -> float:
+    def displacement_mm(self, matrix: FloatArray) -> float:
         """RMS of each component of the tissue's displacement between the sweeps, at least zero.
 
         Parameters
@@ -224,23 +222,23 @@ class Parts:
             Of Gauss and Newton and of the prior, of a fit under a blur that is wide against the displacement:
             only then residuals are in proportion.
         """
-        shared = self.shared.reshape(-1, PARAMETERS)
-        taken = np.linalg.solve(matrix, shared.T)
-        left = block_diag(*self.shared[:, :, :3]) - shared @ taken
-        pulls = self.pulls[:, :3].ravel() - self.pulls.sum(axis=0) @ taken
-        values, vectors = np.linalg.eigh(left)
+        coupling = self.coupling.reshape(-1, PARAMETERS)
+        response = np.linalg.solve(matrix, coupling.T)
+        stiffness = block_diag(*self.coupling[:, :, :3]) - coupling @ response
+        pulls = self.pulls[:, :3].ravel() - self.pulls.sum(axis=0) @ response
+        values, vectors = np.linalg.eigh(stiffness)
         # Of what the fit left nearly nothing, noise is all there is.
-        kept = values > 0.3 * np.median(values)
-        root = vectors[:, kept] * np.sqrt(values[kept])
-        white = (root / values[kept]).T @ pulls
+        informative = values > 0.3 * np.median(values)
+        root = vectors[:, informative] * np.sqrt(values[informative])
+        white = (root / values[informative]).T @ pulls
         # Squares grow with the power that a displacement would have: by its variance, beyond speckle's.
-        power, axes = np.linalg.eigh(root.T @ self.alike @ root)
+        power, axes = np.linalg.eigh(root.T @ self.correlation @ root)
         weight = 1.0 / (1.0 + _USUAL_MM**2 * power)
         slope = np.polyfit(power, (axes.T @ white) ** 2, 1, w=weight)[0]
-        return _SEEN * float(np.sqrt(max(slope, 0.0)))
+        return _DISPLACEMENT_RATIO * float(np.sqrt(max(slope, 0.0)))
 
 
-def covariance(fit: CrossingFit, moved_mm: float) -> FloatArray:
+def covariance(fit: CrossingFit, displacement_mm: float) -> FloatArray:
     """Covariance of all parameters, shape (24, 24).
 
     The images' curvature says how the answer moves with the residuals; what the parts of the tissue pull by
@@ -249,14 +247,14 @@ def covariance(fit: CrossingFit, moved_mm: float) -> FloatArray:
 
     Parameters
     ----------
-    moved_mm : float
+    displacement_mm : float
         RMS of each component of the tissue's displacement between the sweeps.
     """
     parts = Parts.of(fit)
-    shared, many = parts.shared.reshape(-1, PARAMETERS), len(parts.pulls)
-    pulled = parts.pulls.T @ parts.pulls * many / max(many - 1, 1)
-    pulled += moved_mm**2 * shared.T @ parts.alike @ shared
-    inverse = np.linalg.inv(fit.matrix)
-    whole = inverse @ (pulled + fit.prior.information) @ inverse
+    coupling, count = parts.coupling.reshape(-1, PARAMETERS), len(parts.pulls)
+    scatter = parts.pulls.T @ parts.pulls * count / max(count - 1, 1)
+    scatter += displacement_mm**2 * coupling.T @ parts.correlation @ coupling
+    inverse = np.linalg.inv(fit.normal_equations[0])
+    whole = inverse @ (scatter + fit.prior.information) @ inverse
     whole[SCALES, SCALES] += FACES**2 + (OBLIQUE * np.cos(np.deg2rad(fit.angle_deg))) ** 2
     return np.asarray(whole)

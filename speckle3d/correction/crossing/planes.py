@@ -72,7 +72,7 @@ class StraightSweep:
 
     def bent_frames(self, bends: FloatArray) -> RigidTransform:
         """Every frame's pose on the bent path, whose middle stays in place."""
-        start, poses = (self.frames.poses(each) for each in (np.zeros(BENDS), bends))
+        start, poses = (self.frames.poses(coefficients) for coefficients in (np.zeros(BENDS), bends))
         at = self.nearest
         return RigidTransform.from_matrix(start[at] @ np.linalg.inv(poses[at]) @ poses)
 
@@ -88,7 +88,7 @@ def relative_turn(first: StraightSweep, second: StraightSweep) -> Rotation | Non
     return first.world.inv() * second.world
 
 
-def straightened(sweep: CrossingSweep, nearest_mm: float = 0.0) -> StraightSweep:
+def straighten(sweep: CrossingSweep, nearest_mm: float = 0.0) -> StraightSweep:
     """Put a sweep's frames on the planes of its smooth path.
 
     Parameters
@@ -117,9 +117,9 @@ def straightened(sweep: CrossingSweep, nearest_mm: float = 0.0) -> StraightSweep
     count = 1 + int((high - low) / SPACING_MM)
     travel -= low + count // 2 * SPACING_MM
     at = np.multiply(np.arange(count) - count // 2, SPACING_MM, dtype=np.float64)
-    centred = sweep.poses * RigidTransform.from_translation(sweep.centre_mm)
-    frames = _smoothed(travel[good], centred[good], np.zeros(1))[0].inv() * centred
-    planes, base = (_smoothed(travel[good], frames[good], each) for each in (at, travel))
+    about_centre = sweep.poses * RigidTransform.from_translation(sweep.centre_mm)
+    frames = _smooth_path(travel[good], about_centre[good], np.zeros(1))[0].inv() * about_centre
+    planes, base = (_smooth_path(travel[good], frames[good], place) for place in (at, travel))
     away = base.inv() * frames
     travel = travel + away.translation[:, 2]
     top_mm = grid.first_sample_depth_mm
@@ -127,10 +127,10 @@ def straightened(sweep: CrossingSweep, nearest_mm: float = 0.0) -> StraightSweep
     pixels[2:] -= sweep.centre_mm[:2]
     # Within a plane frames roll too little about the smooth path to matter.
     shifts = away.translation[:, :2] / pixels[:2]
-    moved = np.stack([shift(images[f], shifts[f], order=1, cval=np.nan) for f in good])
-    moved[:, :, top_mm + np.arange(grid.samples) * grid.sample_spacing_mm < nearest_mm] = np.nan
+    images = np.stack([shift(images[f], shifts[f], order=1, cval=np.nan) for f in good])
+    images[:, :, top_mm + np.arange(grid.samples) * grid.sample_spacing_mm < nearest_mm] = np.nan
     texture = local_contrast(
-        _onto_planes(moved, travel[good], at),
+        _onto_planes(images, travel[good], at),
         np.array([SPACING_MM, grid.vector_pitch_mm, grid.sample_spacing_mm]),
     )
     return StraightSweep(
@@ -139,7 +139,7 @@ def straightened(sweep: CrossingSweep, nearest_mm: float = 0.0) -> StraightSweep
         _chain(planes, at),
         _chain(frames, travel),
         int(np.argmin(np.abs(travel))),
-        None if sweep.sensed is None else (sweep.sensed * frames.rotation.inv()).mean(),
+        None if sweep.orientation is None else (sweep.orientation * frames.rotation.inv()).mean(),
     )
 
 
@@ -153,7 +153,7 @@ def _chain(poses: RigidTransform, travel_mm: FloatArray) -> CorrectedChain:
     return CorrectedChain.of(poses, ELEVATIONAL, basis)
 
 
-def _smoothed(travel: FloatArray, poses: RigidTransform, at: FloatArray) -> RigidTransform:
+def _smooth_path(travel: FloatArray, poses: RigidTransform, at: FloatArray) -> RigidTransform:
     """Poses as a smooth function of travel: local straight lines."""
     mean = poses.rotation.mean()
     values = np.concatenate([poses.translation, (mean.inv() * poses.rotation).as_rotvec()], axis=1)
@@ -178,12 +178,12 @@ def _onto_planes(images: Float32Array, travel: FloatArray, at: FloatArray) -> Fl
     middle = mean @ travel
     after = np.clip(np.searchsorted(middle, at), 1, many.size - 1)
     gap = middle[after] - middle[after - 1]
-    share = np.clip((at - middle[after - 1]) / gap, 0.0, 1.0)[:, None]
-    weight = ((1.0 - share) * mean[after - 1] + share * mean[after]).astype(np.float32)
+    fraction = np.clip((at - middle[after - 1]) / gap, 0.0, 1.0)[:, None]
+    weight = ((1.0 - fraction) * mean[after - 1] + fraction * mean[after]).astype(np.float32)
     flat = images.reshape(len(images), -1)
-    there = np.isfinite(flat)
-    shown = weight @ there.astype(np.float32)
-    kept = (shown > 0.25) & (gap < 2.0 * _WIDEST_GAP_MM)[:, None]
-    total = weight @ np.where(there, flat, np.float32(0.0))
-    volume = np.divide(total, shown, out=np.full_like(total, np.nan), where=kept)
+    valid = np.isfinite(flat)
+    coverage = weight @ valid.astype(np.float32)
+    dense = (coverage > 0.25) & (gap < 2.0 * _WIDEST_GAP_MM)[:, None]
+    total = weight @ np.where(valid, flat, np.float32(0.0))
+    volume = np.divide(total, coverage, out=np.full_like(total, np.nan), where=dense)
     return np.asarray(volume.reshape(len(at), *images.shape[1:]), dtype=np.float32)

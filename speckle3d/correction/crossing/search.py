@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -13,7 +14,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from speckle3d.core.arrays import Float32Array, FloatArray
 from speckle3d.correction.crossing.planes import BENDS, StraightSweep, relative_turn
 from speckle3d.correction.crossing.similarity import Placing
-from speckle3d.correction.crossing.texture import blurred
+from speckle3d.correction.crossing.texture import gaussian_mean
 
 VOXEL_MM = 1.6
 """Blur and voxel of the search: refinement starts from 6 mm away."""
@@ -43,6 +44,11 @@ class Candidate(NamedTuple):
     mirrored: tuple[bool, bool]
     score: float
 
+    def is_near(self, start: Candidate) -> bool:
+        """Whether refinement of both would end in one place."""
+        alike = self.mirrored == start.mirrored
+        return alike and self.placing.is_near(start.placing, 1.2 * _APART_MM, np.deg2rad(20.0))
+
 
 def candidates(
     sides: Callable[[int, bool], StraightSweep], depth_shift_mm: float, keep: int
@@ -60,30 +66,26 @@ def candidates(
     """
     turns = Rotation.from_rotvec(np.deg2rad(np.outer([*_TURNS_DEG, *-_TURNS_DEG], [0.0, 1.0, 0.0])))
     starts: list[Candidate] = []
-    sensed = relative_turn(sides(0, False), sides(1, False)) is not None
+    by_sensors = relative_turn(sides(0, False), sides(1, False)) is not None
     # Without sensors, two sweeps that are both mirrored look the same at the opposite turn.
-    for one in (False, True)[: 1 + sensed]:
-        for other in (False, True):
-            pair = sides(0, one), sides(1, other)
-            textures = [blurred(each.texture, (VOXEL_MM,) * 3, each.spacing_mm) for each in pair]
-            for scale in _SCALES:
-                bends = np.zeros((2, BENDS))
-                bends[:, 0] = scale
-                first = _turned(pair[0], textures[0], Rotation.identity(), scale)
-                for turn in [relative_turn(*pair) or Rotation.identity()] if sensed else turns:
-                    second = _turned(pair[1], textures[1], turn, scale)
-                    for shift, score in _peaks(first, second, depth_shift_mm):
-                        place = RigidTransform.from_components(shift, turn)
-                        starts.append(Candidate(Placing(place, bends), (one, other), score))
-    chosen: list[Candidate] = []
+    for mirrored in product((False, True)[: 1 + by_sensors], (False, True)):
+        pair = [sides(number, flip) for number, flip in enumerate(mirrored)]
+        textures = [gaussian_mean(side.texture, VOXEL_MM, side.spacing_mm) for side in pair]
+        sensed_turn = relative_turn(*pair)
+        for scale in _SCALES:
+            bends = np.zeros((2, BENDS))
+            bends[:, 0] = scale
+            first = _resample(pair[0], textures[0], Rotation.identity(), scale)
+            for turn in turns if sensed_turn is None else [sensed_turn]:
+                second = _resample(pair[1], textures[1], turn, scale)
+                for shift, score in _peaks(first, second, depth_shift_mm):
+                    place = RigidTransform.from_components(shift, turn)
+                    starts.append(Candidate(Placing(place, bends), mirrored, score))
+    distinct: list[Candidate] = []
     for start in sorted(starts, key=lambda c: -c.score):
-        if len(chosen) < keep and not any(
-            start.mirrored == other.mirrored
-            and start.placing.is_near(other.placing, 1.2 * _APART_MM, np.deg2rad(20.0))
-            for other in chosen
-        ):
-            chosen.append(start)
-    return chosen
+        if len(distinct) < keep and not any(start.is_near(better) for better in distinct):
+            distinct.append(start)
+    return distinct
 
 
 class _Volume(NamedTuple):
@@ -91,10 +93,10 @@ class _Volume(NamedTuple):
 
     low_mm: FloatArray
     values: Float32Array
-    there: Float32Array
+    mask: Float32Array
 
 
-def _turned(sweep: StraightSweep, texture: Float32Array, turn: Rotation, scale: float) -> _Volume:
+def _resample(sweep: StraightSweep, texture: Float32Array, turn: Rotation, scale: float) -> _Volume:
     """Take the planes for parallel: refinement starts from further away than paths bend."""
     size, shape = np.array([1.0 + scale, 1.0, 1.0]) * sweep.spacing_mm, np.array(texture.shape)
     first = np.array([-(shape[0] // 2) * size[0], *sweep.pixels[2:]])
@@ -105,26 +107,26 @@ def _turned(sweep: StraightSweep, texture: Float32Array, turn: Rotation, scale: 
     whole = (np.ceil((corners.max(axis=1) - low) / VOXEL_MM) + 1).astype(int)
     matrix, offset = VOXEL_MM * axes.T / size[:, None], (axes.T @ low - first) / size
     values = affine_transform(texture, matrix, offset, tuple(whole), order=1, cval=np.nan)
-    there = np.isfinite(values)
-    return _Volume(low, np.where(there, values, np.float32(0.0)), there.astype(np.float32))
+    valid = np.isfinite(values)
+    return _Volume(low, np.where(valid, values, np.float32(0.0)), valid.astype(np.float32))
 
 
-def _peaks(one: _Volume, other: _Volume, depth_shift_mm: float) -> list[tuple[FloatArray, float]]:
-    """Shifts of the other volume at which the two correlate best, with score."""
+def _peaks(fixed: _Volume, moving: _Volume, depth_shift_mm: float) -> list[tuple[FloatArray, float]]:
+    """Shifts of the moving volume at which the two correlate best, with score."""
     # Textures have no mean, so that sums of products are covariances.
-    a = np.stack([one.there, one.values**2, one.there, one.values])
-    b = np.stack([other.there, other.there, other.values**2, other.values])[:, ::-1, ::-1, ::-1]
+    a = np.stack([fixed.mask, fixed.values**2, fixed.mask, fixed.values])
+    b = np.stack([moving.mask, moving.mask, moving.values**2, moving.values])[:, ::-1, ::-1, ::-1]
     whole = np.add(a.shape[1:], b.shape[1:]) - 1
     size, axes = [next_fast_len(int(n), real=True) for n in whole], (1, 2, 3)
     sums = irfftn(rfftn(a, size, axes) * rfftn(b, size, axes), size, axes)
-    count, power_a, power_b, product = sums[:, : whole[0], : whole[1], : whole[2]]
+    count, power_a, power_b, cross = sums[:, : whole[0], : whole[1], : whole[2]]
     power = power_a * power_b
-    correlation = product / np.sqrt(np.maximum(power, 1e-3 * float(power.max())))
+    correlation = cross / np.sqrt(np.maximum(power, 1e-3 * float(power.max())))
     score = np.arctanh(np.clip(correlation, -0.99, 0.99)) * np.sqrt(np.maximum(count, 0.0))
-    # Without shift both volumes begin at index `shape - 1` of the other.
-    origin_mm = one.low_mm - other.low_mm - VOXEL_MM * (np.array(other.there.shape) - 1)
+    # Without shift both volumes begin at index `shape - 1` of the moving one.
+    origin_mm = fixed.low_mm - moving.low_mm - VOXEL_MM * (np.array(moving.mask.shape) - 1)
     depth_mm = origin_mm[1] + VOXEL_MM * np.arange(score.shape[1])
-    score[count < _LEAST_SHARE * min(one.there.sum(), other.there.sum())] = -np.inf
+    score[count < _LEAST_SHARE * min(fixed.mask.sum(), moving.mask.sum())] = -np.inf
     score[:, np.abs(depth_mm) > depth_shift_mm] = -np.inf
     top = np.isfinite(score) & (score == maximum_filter(score, 1 + 2 * int(_APART_MM / VOXEL_MM)))
     best = np.argwhere(top)[np.argsort(-score[top])[:2]]

@@ -15,7 +15,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from speckle3d.core.geometry import skew
 from speckle3d.correction.crossing.planes import BENDS, StraightSweep
-from speckle3d.correction.crossing.texture import blurred
+from speckle3d.correction.crossing.texture import gaussian_mean
 from speckle3d.correction.curves import CorrectedChain
 from speckle3d.kernels.crossing import look_up
 
@@ -40,16 +40,16 @@ class Placing:
     first_from_second: RigidTransform
     bends: FloatArray
 
-    def stepped(self, step: FloatArray) -> Placing:
+    def moved_by(self, step: FloatArray) -> Placing:
         """Moved by a step: shift (mm) and turn (rad) in the first path's frame, then bends."""
         turn = RigidTransform.from_components(step[:3], Rotation.from_rotvec(step[3:RIGID]))
         return Placing(turn * self.first_from_second, self.bends + step[RIGID:].reshape(2, -1))
 
-    def is_near(self, other: Placing, apart_mm: float, apart_rad: float) -> bool:
+    def is_near(self, placing: Placing, apart_mm: float, apart_rad: float) -> bool:
         """Whether both differ by less than a shift and a turn."""
-        one, two = self.first_from_second, other.first_from_second
-        near = np.linalg.norm(one.translation - two.translation) < apart_mm
-        return bool(near and (one.rotation.inv() * two.rotation).magnitude() < apart_rad)
+        first, second = self.first_from_second, placing.first_from_second
+        near = np.linalg.norm(first.translation - second.translation) < apart_mm
+        return bool(near and (first.rotation.inv() * second.rotation).magnitude() < apart_rad)
 
 
 @dataclass(frozen=True)
@@ -76,10 +76,10 @@ class BlurredSweep:
     @classmethod
     def of(cls, sweep: StraightSweep, blur_mm: float, points: int) -> BlurredSweep:
         """Choose points at random."""
-        volume = blurred(sweep.texture, (blur_mm,) * 3, sweep.spacing_mm)
-        there = np.flatnonzero(np.isfinite(volume))
-        chosen = np.random.default_rng(0).choice(there, min(points, there.size), replace=False)
-        k, u, v = np.unravel_index(np.sort(chosen), volume.shape)
+        volume = gaussian_mean(sweep.texture, blur_mm, sweep.spacing_mm)
+        valid = np.flatnonzero(np.isfinite(volume))
+        sample = np.random.default_rng(0).choice(valid, min(points, valid.size), replace=False)
+        k, u, v = np.unravel_index(np.sort(sample), volume.shape)
         x, y = sweep.pixels[2] + u * sweep.pixels[0], sweep.pixels[3] + v * sweep.pixels[1]
         local = np.stack([x, y, np.zeros_like(x)], axis=1)
         return cls(sweep.planes, volume, sweep.pixels, k, local, volume[k, u, v].astype(float))
@@ -112,20 +112,20 @@ class OneWay:
     def residuals(self) -> tuple[FloatArray, FloatArray]:
         """Difference of both normalised lists at valid points, and its derivative."""
         valid = self.valid
-        a, _ = _normalised(self.values[valid])
-        b, size_b = _normalised(self.levels[valid])
+        a, _ = _unit_vector(self.values[valid])
+        b, size_b = _unit_vector(self.levels[valid])
         rows = self.rows[valid]
         rows = rows - rows.sum(axis=0) / max(len(rows), 1)
         return b - a, (rows - np.outer(b, b @ rows)) / size_b
 
-    def correlation(self, chosen: BoolArray) -> float:
+    def correlation(self, points: BoolArray) -> float:
         """Of both lists at some valid points; zero if there are too few."""
-        if int(chosen.sum()) < _LEAST_POINTS:
+        if int(points.sum()) < _LEAST_POINTS:
             return 0.0
-        return float(_normalised(self.values[chosen])[0] @ _normalised(self.levels[chosen])[0])
+        return float(_unit_vector(self.values[points])[0] @ _unit_vector(self.levels[points])[0])
 
 
-def compared(pair: Sequence[BlurredSweep], placing: Placing) -> tuple[OneWay, OneWay]:
+def look_up_points(pair: Sequence[BlurredSweep], placing: Placing) -> tuple[OneWay, OneWay]:
     """Look up either sweep's points in the other, all in the first path's frame."""
     planes, twists = [], []
     places = RigidTransform.identity(), placing.first_from_second
@@ -136,33 +136,33 @@ def compared(pair: Sequence[BlurredSweep], placing: Placing) -> tuple[OneWay, On
         turn, shift = (into[:3, :3] @ (part - part[middle]) for part in sweep.planes.twists(bends, chain))
         planes.append(into @ chain)
         twists.append(np.concatenate([shift + skew(into[:3, 3]) @ turn, turn], axis=1))
-    return _looked_up(pair, planes, twists, 0), _looked_up(pair, planes, twists, 1)
+    return _one_way(pair, planes, twists, 0), _one_way(pair, planes, twists, 1)
 
 
-def _looked_up(
-    pair: Sequence[BlurredSweep], planes: Sequence[FloatArray], twists: Sequence[FloatArray], which: int
+def _one_way(
+    pair: Sequence[BlurredSweep], planes: Sequence[FloatArray], twists: Sequence[FloatArray], number: int
 ) -> OneWay:
-    ours, other = pair[which], pair[1 - which]
-    poses = planes[which][ours.plane]
-    points = np.einsum("nij,nj->ni", poses[:, :3, :3], ours.local_mm) + poses[:, :3, 3]
+    source, target = pair[number], pair[1 - number]
+    poses = planes[number][source.plane]
+    points = np.einsum("nij,nj->ni", poses[:, :3, :3], source.local_mm) + poses[:, :3, 3]
     levels, place, slopes = np.empty(len(points)), np.empty(len(points)), np.empty((len(points), 3))
-    from_first = np.ascontiguousarray(np.linalg.inv(planes[1 - which])[:, :3])
-    look_up(points, other.volume, from_first, other.pixels, levels, slopes, place)
+    from_first = np.ascontiguousarray(np.linalg.inv(planes[1 - number])[:, :3])
+    look_up(points, target.volume, from_first, target.pixels, levels, slopes, place)
     valid = np.isfinite(levels)
     # What the level changes by as the point shifts and turns about the origin.
     pull = np.concatenate([slopes[valid], np.cross(points[valid], slopes[valid])], axis=1)
     rows = np.zeros((len(points), PARAMETERS))
-    rows[valid, :RIGID] = pull if which == 1 else -pull
+    rows[valid, :RIGID] = pull if number == 1 else -pull
     for sweep, sign, plane in (
-        (which, 1.0, ours.plane[valid]),
-        (1 - which, -1.0, np.round(place[valid]).astype(int)),
+        (number, 1.0, source.plane[valid]),
+        (1 - number, -1.0, np.round(place[valid]).astype(int)),
     ):
-        own = slice(RIGID + sweep * BENDS, RIGID + (sweep + 1) * BENDS)
-        rows[valid, own] = sign * np.einsum("ni,nij->nj", pull, twists[sweep][plane])
-    return OneWay(ours.values, levels, rows, points)
+        block = slice(RIGID + sweep * BENDS, RIGID + (sweep + 1) * BENDS)
+        rows[valid, block] = sign * np.einsum("ni,nij->nj", pull, twists[sweep][plane])
+    return OneWay(source.values, levels, rows, points)
 
 
-def _normalised(values: FloatArray) -> tuple[FloatArray, float]:
+def _unit_vector(values: FloatArray) -> tuple[FloatArray, float]:
     away = values - values.sum() / max(values.size, 1)
     size = max(float(np.sqrt(away @ away)), 1e-12)
     return away / size, size

@@ -59,22 +59,15 @@ class ImageStack:
         across, deep = self._pool
         wide, high = self.grid.vectors, self.grid.samples
         part = intensity[: wide * across, : high * deep]
-        pooled = part.reshape(wide, across, high, deep).mean(axis=(1, 3), dtype=np.float32)
-        self._images[index] = (10 * np.log10(np.maximum(pooled, 1e-12))).astype(np.float16)
-
-    def kept(self, first: int, stop: int) -> Float16Array:
-        """Images of some frames as they are kept, shape (frame, vector, sample), dB."""
-        return np.stack([self._images[index] for index in range(first, stop)])
+        means = part.reshape(wide, across, high, deep).mean(axis=(1, 3), dtype=np.float32)
+        self._images[index] = (10 * np.log10(np.maximum(means, 1e-12))).astype(np.float16)
 
     def take(self, first: int, images: Float16Array) -> None:
         """Keep images of the frames from `first` on that were pooled elsewhere."""
         self._images.update(enumerate(images, start=first))
 
-    def __len__(self) -> int:
-        return len(self._images)
-
     def images(self, frames: int) -> Float32Array:
-        """Return all images, shape (frames, vector, sample), dB.
+        """Images of the first frames, shape (frames, vector, sample), dB.
 
         Raises
         ------
@@ -87,4 +80,4 @@ class ImageStack:
                 f"expected an image of each of {frames} frames, got none of frame {missing[0]}: track the "
                 "sweep with the stack as its image sink"
             )
-        return self.kept(0, frames).astype(np.float32)
+        return np.stack([self._images[index] for index in range(frames)]).astype(np.float32)

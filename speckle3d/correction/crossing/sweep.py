@@ -93,7 +93,7 @@ class CrossingSweep:
         another probe or another attenuation can do.
     turn_sigma_per_mm : float
         Standard deviation of tilt and yaw that the images lack, rad/mm.
-    sensed : Rotation of length n, or None
+    orientation : Rotation of length n, or None
         ``world_from_image`` by an orientation sensor or tracker.
     flags : ndarray of int, shape (n,), or None
         Not zero for frames that are not to be trusted.
@@ -107,12 +107,12 @@ class CrossingSweep:
     centre_mm: FloatArray
     scale_sigma: float
     turn_sigma_per_mm: float
-    sensed: Rotation | None = None
+    orientation: Rotation | None = None
     flags: IntArray | None = None
     frame_time_s: FloatArray | None = None
 
     @property
     def good(self) -> IntArray:
         """Numbers of the frames to be trusted."""
-        flagged = np.zeros(len(self.poses), int) if self.flags is None else self.flags
-        return np.flatnonzero(flagged == 0)
+        flags = np.zeros(len(self.poses), int) if self.flags is None else self.flags
+        return np.flatnonzero(flags == 0)

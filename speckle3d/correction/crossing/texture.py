@@ -22,18 +22,18 @@ _REACH = 2.5
 def local_contrast(volume: Float32Array, spacing_mm: FloatArray) -> Float32Array:
     """Images in dB without trends, over their local standard deviation, shape (k, u, v); NaN stays."""
     for sigma_mm in _TRENDS_MM:
-        volume = volume - blurred(volume, sigma_mm, spacing_mm)
-    contrast = np.sqrt(blurred(volume**2, (_LOCAL_MM,) * 3, spacing_mm))
+        volume = volume - gaussian_mean(volume, sigma_mm, spacing_mm)
+    contrast = np.sqrt(gaussian_mean(volume**2, _LOCAL_MM, spacing_mm))
     return np.asarray(volume / np.maximum(contrast, _LEAST_DB), dtype=np.float32)
 
 
-def blurred(
-    volume: Float32Array, sigma_mm: tuple[float, float, float], spacing_mm: FloatArray
+def gaussian_mean(
+    volume: Float32Array, sigma_mm: float | tuple[float, float, float], spacing_mm: FloatArray
 ) -> Float32Array:
     """Gaussian mean over the neighbours that are not NaN; NaN where there was none."""
-    there, sigma = np.isfinite(volume), np.divide(sigma_mm, spacing_mm)
+    valid, sigma = np.isfinite(volume), np.divide(sigma_mm, spacing_mm)
     total, share = (
         gaussian_filter(values, sigma, truncate=_REACH, mode="constant")
-        for values in (np.where(there, volume, np.float32(0.0)), there.astype(np.float32))
+        for values in (np.where(valid, volume, np.float32(0.0)), valid.astype(np.float32))
     )
-    return np.asarray(np.where(there, total / np.maximum(share, 1e-3), np.nan), dtype=np.float32)
+    return np.asarray(np.where(valid, total / np.maximum(share, 1e-3), np.nan), dtype=np.float32)

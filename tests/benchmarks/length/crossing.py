@@ -8,7 +8,7 @@ from crossing_tissue import GRID, PairCase, tissue_pair
 
 from length.sweeps import figures
 from speckle3d.core.errors import InsufficientDataError, MismatchError
-from speckle3d.correction.crossing.pair import crossed
+from speckle3d.correction.crossing.pair import solve_crossing
 
 GROUPS = {
     "90 deg": {},
@@ -39,7 +39,7 @@ def sides_of(case):
     """Of both sweeps: log of the length's error, tilt in degrees, and the length's claim; or why not."""
     pair = tissue_pair(case)
     try:
-        correction = crossed(pair.first, pair.second)
+        correction = solve_crossing(pair.first, pair.second)
     except (InsufficientDataError, MismatchError) as error:
         return [str(error)] * 2
     sides = []

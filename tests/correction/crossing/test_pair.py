@@ -9,7 +9,7 @@ from crossing_tissue import GRID, PairCase, tissue_pair
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.errors import InsufficientDataError, MismatchError
-from speckle3d.correction.crossing.pair import crossed
+from speckle3d.correction.crossing.pair import solve_crossing
 from speckle3d.correction.crossing.stack import ImageStack
 from speckle3d.correction.crossing.sweep import CrossingSweep
 
@@ -32,7 +32,7 @@ def test_finds_lengths_that_were_a_fifth_wrong():
     pair = made(seed=4)
     before = [errors(s.poses, t)[0] for s, t in zip((pair.first, pair.second), pair.truth, strict=True)]
     assert min(before) > 10
-    found = crossed(pair.first, pair.second)
+    found = solve_crossing(pair.first, pair.second)
     for side, truth in zip((found.first, found.second), pair.truth, strict=True):
         length, tilt = errors(side.poses, truth)
         # Targets of 90th percentiles over many pairs.
@@ -49,7 +49,7 @@ def test_finds_lengths_that_were_a_fifth_wrong():
 @pytest.mark.slow
 def test_finds_which_sweep_went_the_other_way():
     pair = made(seed=381, mirror=True)
-    found = crossed(pair.first, pair.second)
+    found = solve_crossing(pair.first, pair.second)
     assert found.mirrored == (False, True)
     assert abs(errors(found.second.poses, pair.truth[1])[0]) < 2.0
 
@@ -57,7 +57,7 @@ def test_finds_which_sweep_went_the_other_way():
 @pytest.mark.slow
 def test_a_sensor_tells_the_turns():
     pair = made(seed=1, with_sensor=True)
-    found = crossed(pair.first, pair.second)
+    found = solve_crossing(pair.first, pair.second)
     for side, truth in zip((found.first, found.second), pair.truth, strict=True):
         length, tilt = errors(side.poses, truth)
         assert abs(length) < 2.0
@@ -69,13 +69,13 @@ def test_a_sensor_tells_the_turns():
 def test_refuses_other_tissue():
     one, other = made(seed=4), made(seed=1, with_sensor=True)
     with pytest.raises((MismatchError, InsufficientDataError)):
-        crossed(one.first, replace(other.second, sensed=None))
+        solve_crossing(one.first, replace(other.second, orientation=None))
 
 
 @pytest.mark.slow
 def test_claims_for_tissue_that_moved_a_little():
     pair = made(seed=200, moved_mm=0.3)
-    found = crossed(pair.first, pair.second)
+    found = solve_crossing(pair.first, pair.second)
     # Known to a factor of 2; sweeps over still tissue show less than 0.2 mm.
     assert 0.2 < found.first.details["tissue_moved_mm"] < 0.6
     for side, truth in zip((found.first, found.second), pair.truth, strict=True):
@@ -96,7 +96,7 @@ REFUSED = {
 def test_refuses_what_determines_no_length_and_says_what_to_do(advice):
     pair = made(**REFUSED[advice])
     with pytest.raises(InsufficientDataError, match=advice):
-        crossed(pair.first, pair.second)
+        solve_crossing(pair.first, pair.second)
 
 
 def test_refuses_a_sweep_that_stands_still():
@@ -106,4 +106,4 @@ def test_refuses_a_sweep_that_stands_still():
     poses = RigidTransform.from_translation(np.outer(np.linspace(0, 1, 20), [0.0, 0.0, 1.0]))
     sweep = CrossingSweep("still", stack, poses, GRID.centre_mm, 0.1, 1e-3)
     with pytest.raises(InsufficientDataError, match="still"):
-        crossed(sweep, sweep)
+        solve_crossing(sweep, sweep)

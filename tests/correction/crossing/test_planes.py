@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.grid import ImageGrid
-from speckle3d.correction.crossing.planes import BENDS, straightened
+from speckle3d.correction.crossing.planes import BENDS, straighten
 from speckle3d.correction.crossing.stack import ImageStack
 from speckle3d.correction.crossing.sweep import CrossingSweep
 
@@ -26,7 +26,7 @@ def test_a_hand_that_dwells_does_not_draw_the_images():
     turns = []
     for pause in (np.zeros(0), np.full(60, 4.6)):
         travel = np.sort(np.concatenate([np.linspace(0.0, 10.0, 60), pause]))
-        sweep = straightened(straight_sweep(travel, lambda z: 10.0 ** (0.3 * np.tanh(z - 5.0) * stripes)))
+        sweep = straighten(straight_sweep(travel, lambda z: 10.0 ** (0.3 * np.tanh(z - 5.0) * stripes)))
         z, level = sweep.planes.poses(np.zeros(BENDS))[:, 2, 3], sweep.texture[:, 6, 9]
         turns.append(np.interp(0.0, level[8:-8] * np.sign(level[-9]), z[8:-8]))
     # 0.05 mm is a seventh of the planes' spacing; weighed alike, frames at the pause draw by 0.2.
@@ -36,7 +36,7 @@ def test_a_hand_that_dwells_does_not_draw_the_images():
 def test_frames_return_to_where_they_were_and_scale_stretches_about_the_middle():
     travel = np.linspace(0.0, 12.0, 80) + 0.05 * np.sin(np.arange(80))
     given = straight_sweep(travel, lambda z: np.full((12, 16), 1.0 + z))
-    straight = straightened(given)
+    straight = straighten(given)
     bends = np.zeros(BENDS)
     back = straight.bent_frames(bends) * RigidTransform.from_translation(-given.centre_mm)
     np.testing.assert_allclose((back[0].inv() * back).translation, given.poses.translation, atol=1e-9)
