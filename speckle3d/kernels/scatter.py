@@ -99,8 +99,8 @@ def _interpolate(table: Float32Array, row: int, corners: Any, weights: Any, out:
 def scatter_echoes(
     position_mm: FloatArray,
     strength: Float32Array,
-    image_from_medium: FloatArray,
     pitch_mm: float,
+    image_from_medium: FloatArray,
     table: FieldTable,
     echoes: EchoGrid,
     out: Float32Array,
@@ -113,9 +113,9 @@ def scatter_echoes(
     ----------
     position_mm, strength : ndarray, shape (n, 3) and (n,)
         Scatterers in the medium.
-    image_from_medium : float64, shape (4, 4)
     pitch_mm : float
         Of the vectors, of which the first is at zero.
+    image_from_medium : float64, shape (4, 4)
     out : float32, shape (vector, sample, nodes * 2)
         Real and imaginary parts in turn.
     """
@@ -210,7 +210,7 @@ def scatter_fan_echoes(
     position_mm: FloatArray,
     strength: Float32Array,
     fan: Fan,
-    far_mm: float,
+    image_from_medium: FloatArray,
     table: FieldTable,
     echoes: EchoGrid,
     out: Float32Array,
@@ -220,9 +220,8 @@ def scatter_fan_echoes(
     Parameters
     ----------
     position_mm, strength : ndarray, shape (n, 3) and (n,)
-        Scatterers in the image.
-    far_mm : float
-        How far a vector's beam reaches to the side.
+        Scatterers in the medium.
+    image_from_medium : float64, shape (4, 4)
     out : float32, shape (vector, sample, nodes * 2)
         Real and imaginary parts in turn.
     """
@@ -231,14 +230,16 @@ def scatter_fan_echoes(
     ny, nz, per_pitch = reached_vectors.shape[0], reached_vectors.shape[1], reach.shape[1]
     vectors, samples, width = out.shape
     value = np.empty(width, dtype=np.float32)
-    one = np.float32(1.0)
+    one, t, far_mm = np.float32(1.0), image_from_medium, reach.shape[2] * per_pitch * grid[2]
     for j in range(position_mm.shape[0]):
-        x, y = position_mm[j, 0] - fan.apex_mm[0], position_mm[j, 1] - fan.apex_mm[1]
-        z = position_mm[j, 2]
+        a, b, c = position_mm[j, 0], position_mm[j, 1], position_mm[j, 2]
+        z = t[2, 0] * a + t[2, 1] * b + t[2, 2] * c + t[2, 3]
         fz = abs(z) / grid[3]
         iz = int(fz)
         if iz >= nz - 1:
             continue
+        x = t[0, 0] * a + t[0, 1] * b + t[0, 2] * c + t[0, 3] - fan.apex_mm[0]
+        y = t[1, 0] * a + t[1, 1] * b + t[1, 2] * c + t[1, 3] - fan.apex_mm[1]
         wz = np.float32(fz - iz)
         for n in range(vectors):
             across_mm = abs(x * fan.cosine[n] - y * fan.sine[n])

@@ -39,8 +39,6 @@ _PAUSE_S = 0.3
 _FRAME_JITTER_S = 1e-3
 """Of the frame clock, at most, either way."""
 
-_WOBBLE_HZ = 3.0
-
 _SWINGS = np.array([2.3, 3.7, 2.9, 6.5, 1.6, 4.3])
 """Swings of each column during a calibration scan: incommensurate, so that all combinations occur."""
 
@@ -72,14 +70,11 @@ class HandMotion:
         Deliberate tilt, yaw and roll from the first frame to the last.
     reverse : bool
         Sweep forward, then back over the same tissue.
-    wobble_mm : float
-        Deliberate to and fro along the elevational axis: amplitude, uneven as the frequency is.
     """
 
     start_rad: tuple[float, float, float] = (0.0, 0.0, 0.0)
     turn_rad: tuple[float, float, float] = (0.0, 0.0, 0.0)
     reverse: bool = False
-    wobble_mm: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -107,7 +102,7 @@ class Trajectory:
     in_medium: FloatArray
     face_mm: float
     world_from_medium: RigidTransform
-    medium_from_start: RigidTransform = RigidTransform.identity()
+    medium_from_start: RigidTransform
 
     def medium_from_image(self, time_s: FloatArray) -> RigidTransform:
         """Pose in the medium at any times within the knots."""
@@ -163,13 +158,12 @@ def hand_sweep(
     columns[:, 0] = face_mm / 2.0
     columns[:, 2] += _progress(time, duration_s, motion.reverse, rng) * length_mm
     phase = np.clip(time / duration_s, 0.0, 1.0)
-    columns[:, 3:] = motion.start_rad + _smooth_step(phase)[:, None] * np.asarray(motion.turn_rad)
+    turn = phase * phase * (3.0 - 2.0 * phase)
+    columns[:, 3:] = motion.start_rad + turn[:, None] * motion.turn_rad
     for axis in range(6):
         if _WANDER[axis] > 0:
             columns[:, axis] += _WANDER[axis] * _band_noise(time, (0.0, 1.0 / duration_s), rng)
         columns[:, axis] += _TREMOR[axis] * _band_noise(time, _TREMOR_HZ, rng)
-    if motion.wobble_mm > 0:
-        columns[:, 2] += motion.wobble_mm * _wobble(time, duration_s, rng)
     spline = _spline(time, columns)
     return Trajectory(spline, "ZYX", np.ones(3), face_mm, world_from_medium, medium_from_start)
 
@@ -196,7 +190,8 @@ def calibration_scan(
         columns[:, axis] += _TREMOR[axis] * _band_noise(time, _TREMOR_HZ, rng)
     columns[:, 1] += (_NEAREST_MM + _FARTHEST_MM) / 2.0
     in_medium = np.array([1.0, 0.0, 1.0]) * over_floor
-    return Trajectory(_spline(time, columns), "YXZ", in_medium, face_mm, world)
+    spline = _spline(time, columns)
+    return Trajectory(spline, "YXZ", in_medium, face_mm, world, RigidTransform.identity())
 
 
 def stepped_poses(steps: int, step_mm: float, blocks: int, gap_mm: float) -> RigidTransform:
@@ -236,19 +231,6 @@ def _progress(time: FloatArray, duration_s: float, reverse: bool, rng: np.random
     # A hand accelerates over about a tenth of a second.
     start = np.hanning(13)[1:-1]
     return np.cumsum(np.convolve(speed, start / start.sum(), mode="same"))
-
-
-def _wobble(time: FloatArray, duration_s: float, rng: np.random.Generator) -> FloatArray:
-    """To and fro during the sweep, as evenly as a hand can: phase and amplitude wander."""
-    uneven = _band_noise(time, (0.0, 0.3), rng)
-    strength = 1.0 + 0.15 * np.tanh(_band_noise(time, (0.0, 0.5), rng))
-    during = np.clip(time / 0.5, 0.0, 1.0) * np.clip((duration_s - time) / 0.5, 0.0, 1.0)
-    phase = 2.0 * np.pi * _WOBBLE_HZ * time + uneven
-    return np.asarray(strength * _smooth_step(during) * np.sin(phase))
-
-
-def _smooth_step(u: FloatArray) -> FloatArray:
-    return u * u * (3.0 - 2.0 * u)
 
 
 def _band_noise(time: FloatArray, band_hz: tuple[float, float], rng: np.random.Generator) -> FloatArray:

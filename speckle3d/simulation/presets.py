@@ -183,7 +183,7 @@ def _hand_sweep(
         tilt, turns = -fan / 2.0, (fan, 0.0, 0.0)
     elif settings.preset == "rotation":
         turns = (turn, 0.0, 0.0) if settings.turn_axis == "tilt" else (0.0, turn, 0.0)
-    motion = HandMotion((tilt, 0.0, 0.0), turns, settings.preset == "reversal", settings.wobble_mm)
+    motion = HandMotion((tilt, 0.0, 0.0), turns, settings.preset == "reversal")
     centre = np.array([face_mm / 2.0, 0.0, settings.length_mm / 2.0])
     start = turned_about(centre, crossing * number)
     return hand_sweep(settings.length_mm, duration_s, face_mm, motion, start, world, rng)

@@ -95,20 +95,15 @@ class SimulatedFrames:
         out = np.zeros((image.vectors, self._length, len(self.beam.components)), np.complex64)
         carrier = 2e-3 * float(self._frequency_hz[self._carrier_bin]) / probe.speed_of_sound_m_s
         grid = EchoGrid(image.first_sample_depth_mm, image.sample_spacing_mm, carrier)
-        medium_from_image = self.medium_from_image[index]
-        image_from_medium = medium_from_image.inv()
-        field = self._field, grid, out.view(np.float32)
-        fan, angle = image.fan, image.angle_rad(np.arange(image.vectors))
+        medium_from_image, fan = self.medium_from_image[index], image.fan
+        angle = image.angle_rad(np.arange(image.vectors))
+        shared = medium_from_image.inv().as_matrix(), self._field, grid, out.view(np.float32)
         for position, strength in self.medium.scatterers(medium_from_image, self._box):
             if fan is None:
-                matrix = image_from_medium.as_matrix()
-                scatter_echoes(position, strength, matrix, image.vector_pitch_mm, *field)
-                continue
-            place = image_from_medium.apply(position)
-            inside = ((place > self._box[0]) & (place < self._box[1])).all(axis=1)
-            lines = Fan(fan.apex_mm, fan.radius_mm, np.sin(angle), np.cos(angle))
-            reach_mm = self.beam.lateral_extent_mm
-            scatter_fan_echoes(place[inside], strength[inside], lines, reach_mm, *field)
+                scatter_echoes(position, strength, image.vector_pitch_mm, *shared)
+            else:
+                vectors = Fan(fan.apex_mm, fan.radius_mm, np.sin(angle), np.cos(angle))
+                scatter_fan_echoes(position, strength, vectors, *shared)
         return out
 
     @cached_property

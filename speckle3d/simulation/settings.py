@@ -56,7 +56,6 @@ class SimulationSettings(BaseModel):
     uncalibrated: bool = Field(
         False, description="Do not say how the sensors sit on the probe: a calibration will."
     )
-    wobble_mm: float = Field(0.0, ge=0, le=5, description="Deliberate to and fro along the sweep, amplitude.")
     snr_db: float = Field(
         40.0, ge=-10, le=80, description="Speckle over electronic noise at the transmit focus."
     )

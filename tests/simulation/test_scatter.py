@@ -32,8 +32,8 @@ def test_echoes_match_every_scatterer_for_every_vector(seed):
     scatter_echoes(
         medium_mm,
         strength,
-        image_from_medium.as_matrix(),
         0.3,
+        image_from_medium.as_matrix(),
         field_table(*beam, 3),
         EchoGrid(0.0, 0.0115, 9.7),
         out,
