@@ -14,7 +14,16 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import FloatArray
-from speckle3d.simulation.medium import TILE_MM, Box, Layer, Scatterers, TiledMedium, tile_rng, tiles_near
+from speckle3d.simulation.medium import (
+    NO_WAVES,
+    TILE_MM,
+    Box,
+    Layer,
+    Scatterers,
+    TiledMedium,
+    tile_rng,
+    tiles_near,
+)
 from speckle3d.simulation.settings import Reflector
 
 _STEEPEST = np.cos(np.deg2rad(35.0))
@@ -79,12 +88,6 @@ class Level(NamedTuple):
     normal: FloatArray
     offset_mm: float
 
-    @classmethod
-    def floor(cls, medium_from_image: RigidTransform) -> Level:
-        """Where the floor is in an image."""
-        normal = medium_from_image.rotation.as_matrix()[1]
-        return cls(normal, -float(medium_from_image.translation[1]))
-
     def mirrored_in(self, mirror: Level) -> Level:
         """Return the mirror image of this plane in another, its normal turned to point away as well."""
         along = 2.0 * float(self.normal @ mirror.normal)
@@ -124,8 +127,10 @@ class WaterBath:
 
     def scatterers(self, medium_from_image: RigidTransform, box: Box) -> list[Scatterers]:
         """Reflector, its reverberations and the haze in a box of the image."""
-        level, strength = Level.floor(medium_from_image), _STRENGTH_PER_MM2 * _SPACING_MM**2
-        image_from_sheet, medium_from_sheet = medium_from_image.inv(), RigidTransform.identity()
+        translation, rotation = medium_from_image.as_components()
+        level = Level(rotation.as_matrix()[1], -float(translation[1]))
+        strength = _STRENGTH_PER_MM2 * _SPACING_MM**2
+        image_from_sheet = medium_from_image.inv()
         if self.reflector == "bar":
             # Perpendicular to the image. It stays where it is: the probe sees other parts of it as it slides.
             strength *= _BEAM_MM / _BAR_MM
@@ -135,9 +140,7 @@ class WaterBath:
             place = medium_from_image * level.image_from_sheet
             slid = float(place.translation @ place.rotation.as_matrix()[:, 0])
             image_from_sheet = level.image_from_sheet * RigidTransform.from_translation([-slid, 0.0, 0.0])
-            medium_from_sheet = medium_from_image * image_from_sheet
-        position = self._near(image_from_sheet, box)
-        sheets = [(medium_from_sheet.apply(position), 1.0)]
+        sheets = [((medium_from_image * image_from_sheet).apply(self._near(image_from_sheet, box)), 1.0)]
         # Virtual reflectors of the second and later round trips. Unfolding the path, the probe's face is
         # mirrored in the floor, the floor in that, and so on: from straight above these lie at twice and
         # three times the depth; elsewhere they seem turned further too.
@@ -182,8 +185,7 @@ class CrossedThreads:
 @cache
 def _haze(entropy: int, down_to_mm: float) -> TiledMedium:
     """Make a little dust in water, 34 dB weaker than speckle of unit strength."""
-    still = np.zeros((0, 5))
-    return TiledMedium(entropy, 2.0, 0.0, [Layer(-60.0, still, 0.02)], depth_mm=(-60.0, down_to_mm))
+    return TiledMedium(entropy, 2.0, 0.0, [Layer(-60.0, NO_WAVES, 0.02)], depth_mm=(-60.0, down_to_mm))
 
 
 @cache

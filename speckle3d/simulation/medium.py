@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import product
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -38,6 +39,9 @@ _FASCIA_PER_MM2 = 60.0
 _CELL_MM = 0.5
 """Lateral and elevational side of cells with one background scatterer each: the focused beam's width."""
 
+
+NO_WAVES: FloatArray = np.zeros((0, 5))
+"""Of what is level, or uniform: see `wave_sum`."""
 
 Box = tuple[FloatArray, FloatArray]
 """Opposite corners of a box of the image, the lower first, mm."""
@@ -193,7 +197,7 @@ class TiledMedium:
     per_mm3: float
     attenuation_db_cm_mhz: float
     layers: Sequence[Layer] = ()
-    texture: FloatArray | None = None
+    texture: FloatArray = NO_WAVES
     clusters: Sequence[Clusters] = ()
     spheres: Sequence[Sphere] = ()
     depth_mm: tuple[float, float] = (-3.0, 50.0)
@@ -215,16 +219,15 @@ class TiledMedium:
         across = round(TILE_MM / _CELL_MM)
         down = round(height * self.per_mm3 / 2.0 * _CELL_MM**2)
         cell = np.indices((across, down, across)).reshape(3, -1).T
-        celled = (cell + rng.random(cell.shape)) * [_CELL_MM, height / down, _CELL_MM]
-        position = np.concatenate([loose, celled])
+        spread = (cell + rng.random(cell.shape)) * [_CELL_MM, height / down, _CELL_MM]
+        position = np.concatenate([loose, spread])
         position += [i * TILE_MM, self.depth_mm[0], j * TILE_MM]
         n = len(position)
         strength, fill = np.ones(n), np.ones(n)
         for layer in self.layers:
             below = layer.covers(position)
             strength[below], fill[below] = layer.strength, layer.fill
-        if self.texture is not None:
-            strength *= np.exp(wave_sum(self.texture, position))
+        strength *= np.exp(wave_sum(self.texture, position))
         # Equal strengths of random sign give fully developed speckle with the fewest scatterers.
         strength *= rng.choice([-1.0, 1.0], n) / np.sqrt(self.per_mm3)
         present = rng.random(n) < fill
@@ -244,11 +247,11 @@ def _tile(medium: TiledMedium, i: int, j: int) -> Scatterers:
     parts = [medium._background(i, j)]
     parts += [medium._fascia(layer, n, i, j) for n, layer in enumerate(medium.layers) if layer.fascia]
     # Children of a neighbouring tile's parents may lie in this tile.
-    around = np.indices((3, 3)).reshape(2, -1).T + np.array([i - 1, j - 1])
-    for position, strength in [_family(medium, *tile) for tile in around.tolist()] if medium.clusters else ():
+    for di, dj in product((-1, 0, 1), repeat=2) if medium.clusters else ():
+        position, strength = _family(medium, i + di, j + dj)
         inside = (np.floor(position[:, [0, 2]] / TILE_MM) == [i, j]).all(axis=1)
         parts.append((position[inside], strength[inside]))
-    position, strength = _joined(parts)
+    position, strength = _concatenate(parts)
     for sphere in medium.spheres:
         inside = ((position - sphere.centre_mm) ** 2).sum(axis=1) < sphere.radius_mm**2
         strength[inside] *= sphere.factor
@@ -262,10 +265,10 @@ def _tile(medium: TiledMedium, i: int, j: int) -> Scatterers:
 @lru_cache(_KEPT_TILES)
 def _family(medium: TiledMedium, i: int, j: int) -> Scatterers:
     """Children of all parents in a tile; some lie outside it."""
-    return _joined([kind.draw(medium.entropy, n, i, j) for n, kind in enumerate(medium.clusters)])
+    return _concatenate([kind.draw(medium.entropy, n, i, j) for n, kind in enumerate(medium.clusters)])
 
 
-def _joined(parts: Sequence[Scatterers]) -> Scatterers:
+def _concatenate(parts: Sequence[Scatterers]) -> Scatterers:
     return np.concatenate([p for p, _ in parts]), np.concatenate([s for _, s in parts])
 
 
