@@ -15,7 +15,6 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.simulation.medium import (
-    NO_WAVES,
     TILE_MM,
     Box,
     Layer,
@@ -185,7 +184,9 @@ class CrossedThreads:
 @cache
 def _haze(entropy: int, down_to_mm: float) -> TiledMedium:
     """Make a little dust in water, 34 dB weaker than speckle of unit strength."""
-    return TiledMedium(entropy, 2.0, 0.0, [Layer(-60.0, NO_WAVES, 0.02)], depth_mm=(-60.0, down_to_mm))
+    return TiledMedium(
+        entropy, 2.0, 0.0, [Layer(-60.0, np.zeros((0, 5)), 0.02)], depth_mm=(-60.0, down_to_mm)
+    )
 
 
 @cache

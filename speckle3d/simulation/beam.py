@@ -218,8 +218,8 @@ def _sum_sources(probe: Probe, lateral: FloatArray, wavenumbers: FloatArray) -> 
             weight = np.full(away.size, depth[iy])
             lens_fields(distance, _ELEVATION_MM, strip, lens, wavenumbers, weight, 2, 0, away.size, line)
             field = line.view(complex)[..., 0].swapaxes(0, 1)
-            sent, heard = (way[iy][:, sources].sum(axis=1) @ field for way in ways)
-            out[iy] = np.moveaxis(sent * heard, 0, -1)
+            transmission, reception = (way[iy][:, sources].sum(axis=1) @ field for way in ways)
+            out[iy] = np.moveaxis(transmission * reception, 0, -1)
 
     in_parallel(sum_depths, depth.size)
     return out
@@ -230,16 +230,16 @@ def _focused(
 ) -> ComplexArray:
     """Weights and focusing phases of the sources, shape (depth, node, source)."""
     across = element / half_width[:, None]
-    raised = probe.edge_weight + (1.0 - probe.edge_weight) * np.cos(np.pi / 2.0 * across) ** 2
-    weight = np.where(np.abs(across) <= 1.0, raised, 0.0)
+    cosine = probe.edge_weight + (1.0 - probe.edge_weight) * np.cos(np.pi / 2.0 * across) ** 2
+    weight = np.where(np.abs(across) <= 1.0, cosine, 0.0)
     path = focus[:, None] - np.hypot(focus[:, None], element)
     return np.asarray(weight[:, None] * np.exp(-1j * path[:, None] * wavenumbers[:, None]))
 
 
 def _parabola(profile: ComplexArray, across: FloatArray, wavenumber: float) -> float:
     """Least-squares `a` of path = a x^2 over the main lobe (a third of the axis), by energy."""
-    fallen = np.flatnonzero(np.abs(profile) < np.abs(profile[0]) / 3.0)
-    lobe = slice(0, max(int(fallen[0]) if fallen.size else profile.size, 3))
+    below = np.flatnonzero(np.abs(profile) < np.abs(profile[0]) / 3.0)
+    lobe = slice(0, max(int(below[0]) if below.size else profile.size, 3))
     path = -np.unwrap(np.angle(profile[lobe] * np.conj(profile[0]))) / wavenumber
     weight = np.abs(profile[lobe]) ** 2
     return float((weight * path * across[lobe] ** 2).sum() / (weight * across[lobe] ** 4).sum())

@@ -40,9 +40,6 @@ _CELL_MM = 0.5
 """Lateral and elevational side of cells with one background scatterer each: the focused beam's width."""
 
 
-NO_WAVES: FloatArray = np.zeros((0, 5))
-"""Of what is level, or uniform: see `wave_sum`."""
-
 Box = tuple[FloatArray, FloatArray]
 """Opposite corners of a box of the image, the lower first, mm."""
 
@@ -197,7 +194,7 @@ class TiledMedium:
     per_mm3: float
     attenuation_db_cm_mhz: float
     layers: Sequence[Layer] = ()
-    texture: FloatArray = NO_WAVES
+    texture: FloatArray | None = None
     clusters: Sequence[Clusters] = ()
     spheres: Sequence[Sphere] = ()
     depth_mm: tuple[float, float] = (-3.0, 50.0)
@@ -227,7 +224,8 @@ class TiledMedium:
         for layer in self.layers:
             below = layer.covers(position)
             strength[below], fill[below] = layer.strength, layer.fill
-        strength *= np.exp(wave_sum(self.texture, position))
+        if self.texture is not None:
+            strength *= np.exp(wave_sum(self.texture, position))
         # Equal strengths of random sign give fully developed speckle with the fewest scatterers.
         strength *= rng.choice([-1.0, 1.0], n) / np.sqrt(self.per_mm3)
         present = rng.random(n) < fill
@@ -298,8 +296,8 @@ def tissue(entropy: int, length_mm: float) -> TiledMedium:
     fills = (1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 0.2)
     fascias = (0.0, 1.0, 1.6, 0.8, 2.0, 1.0, 1.6, 1.2)
     layers = [
-        Layer(float(top), random_waves(rng, 0.25, (0.25, 0.0, 0.2)), *rest)
-        for top, *rest in zip(tops, strengths, fills, fascias, strict=True)
+        Layer(float(top), random_waves(rng, 0.25, (0.25, 0.0, 0.2)), *properties)
+        for top, *properties in zip(tops, strengths, fills, fascias, strict=True)
     ]
     texture = random_waves(rng, 0.25, (2.0, 2.0, 2.0), 12)
     cysts = [_sphere(rng, length_mm, (1.0, 2.5), 0.0) for _ in range(6)]

@@ -68,8 +68,8 @@ class ReceivedFrames:
     def __getitem__(self, index: int) -> npt.NDArray[Any]:
         """One frame, shape (vector, sample)."""
         echoes = filters.hilbert(read_frame(self.frames, index), axis=1)
-        mixed = echoes * np.exp(-2j * np.pi * self.cycles_per_sample * np.arange(echoes.shape[1]))
-        counts = filters.resample_poly(mixed, 1, self.decimation, axis=1, window=_WINDOW)
+        baseband = echoes * np.exp(-2j * np.pi * self.cycles_per_sample * np.arange(echoes.shape[1]))
+        counts = filters.resample_poly(baseband, 1, self.decimation, axis=1, window=_WINDOW)
         if self.dynamic_range_db is None:
             limits = np.iinfo(np.int16)
             parts = np.clip(np.rint(counts.view(np.float64)), limits.min, limits.max)

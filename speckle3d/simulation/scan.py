@@ -97,13 +97,13 @@ class SimulatedFrames:
         grid = EchoGrid(image.first_sample_depth_mm, image.sample_spacing_mm, carrier)
         medium_from_image, fan = self.medium_from_image[index], image.fan
         angle = image.angle_rad(np.arange(image.vectors))
-        shared = medium_from_image.inv().as_matrix(), self._field, grid, out.view(np.float32)
+        arguments = medium_from_image.inv().as_matrix(), self._field, grid, out.view(np.float32)
         for position, strength in self.medium.scatterers(medium_from_image, self._box):
             if fan is None:
-                scatter_echoes(position, strength, image.vector_pitch_mm, *shared)
+                scatter_echoes(position, strength, image.vector_pitch_mm, *arguments)
             else:
                 vectors = Fan(fan.apex_mm, fan.radius_mm, np.sin(angle), np.cos(angle))
-                scatter_fan_echoes(position, strength, vectors, *shared)
+                scatter_fan_echoes(position, strength, vectors, *arguments)
         return out
 
     @cached_property

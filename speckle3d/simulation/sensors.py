@@ -52,8 +52,8 @@ def simulate_tracker(
     true = trajectory.world_from_image(clock) * TRACKER_FROM_IMAGE.inv()
     translation, rotation = true.as_components()
     jitter = Rotation.from_rotvec(noise * _JITTER_RAD * rng.standard_normal((clock.size, 3)))
-    moved = translation + noise * _JITTER_MM * rng.standard_normal((clock.size, 3))
-    readings = TimedPoses(clock + _LATENCY_S, RigidTransform.from_components(moved, rotation * jitter))
+    place = translation + noise * _JITTER_MM * rng.standard_normal((clock.size, 3))
+    readings = TimedPoses(clock + _LATENCY_S, RigidTransform.from_components(place, rotation * jitter))
     return Tracker(readings, TRACKER_FROM_IMAGE, -_LATENCY_S)
 
 
@@ -63,23 +63,23 @@ def simulate_orientation(
     """Orientation and raw inertial readings over `span_s` of image time; `noise` as of the tracker."""
     clock = _clock(span_s, 100.0, 1e-4, rng)
     poses = [trajectory.world_from_image(clock + shift) for shift in (-_DERIVATIVE_S, 0.0, _DERIVATIVE_S)]
-    before, now, after = (pose.rotation * ORIENTATION_FROM_IMAGE.inv() for pose in poses)
+    before, rotation, after = (pose.rotation * ORIENTATION_FROM_IMAGE.inv() for pose in poses)
     path = [pose.apply(LEVER_MM) for pose in poses]
     wander = _wander(clock, _WANDER_S, rng) * (noise * _SLOW_RAD)
     white = Rotation.from_rotvec(noise * _WHITE_RAD * rng.standard_normal((clock.size, 3)))
-    reported = Rotation.from_rotvec(wander) * now * white
+    readings = Rotation.from_rotvec(wander) * rotation * white
     # At rest the specific force, acceleration minus gravity, points up.
     acceleration = 1e-3 * (path[0] - 2.0 * path[1] + path[2]) / _DERIVATIVE_S**2
-    force = now.inv().apply(acceleration + np.array([0.0, 0.0, _GRAVITY_M_S2]))
+    force = rotation.inv().apply(acceleration + np.array([0.0, 0.0, _GRAVITY_M_S2]))
     rate = (before.inv() * after).as_rotvec() / (2.0 * _DERIVATIVE_S)
-    field = now.inv().apply([np.cos(_DIP_RAD), 0.0, -np.sin(_DIP_RAD)])
+    field = rotation.inv().apply([np.cos(_DIP_RAD), 0.0, -np.sin(_DIP_RAD)])
 
     def noisy(true: FloatArray, bias: float, white: float) -> FloatArray:
-        drawn = noise * bias * rng.standard_normal(3), noise * white * rng.standard_normal(true.shape)
-        return np.asarray(true + drawn[0] + drawn[1])
+        errors = noise * bias * rng.standard_normal(3), noise * white * rng.standard_normal(true.shape)
+        return np.asarray(true + errors[0] + errors[1])
 
     return OrientationSensor(
-        TimedRotations(clock - _OFFSET_S, reported),
+        TimedRotations(clock - _OFFSET_S, readings),
         ORIENTATION_FROM_IMAGE,
         _OFFSET_S,
         noisy(force, _ACCELEROMETER_BIAS_M_S2, _ACCELEROMETER_M_S2),

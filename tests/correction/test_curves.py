@@ -42,10 +42,10 @@ def test_twists_are_the_derivative_of_every_frame(seed, curves):
     poses = chain.poses(coefficients)
     turn, shift = chain.twists(coefficients, poses)
     where = poses[:, :3, :3] @ point + poses[:, :3, 3]
-    found = skew(where) @ -turn + shift
+    motion = skew(where) @ -turn + shift
     h = 1e-6
     for k, unit in enumerate(np.eye(30)):
-        moved = chain.poses(coefficients + h * unit) - chain.poses(coefficients - h * unit)
-        slope = (moved[:, :3, :3] @ point + moved[:, :3, 3]) / (2 * h)
+        difference = chain.poses(coefficients + h * unit) - chain.poses(coefficients - h * unit)
+        slope = (difference[:, :3, :3] @ point + difference[:, :3, 3]) / (2 * h)
         # Central differences: h^2 times third derivatives, and rounding 1e-14 / h; 60 mm lever.
-        np.testing.assert_allclose(found[:, :, k], slope, atol=2e-6)
+        np.testing.assert_allclose(motion[:, :, k], slope, atol=2e-6)

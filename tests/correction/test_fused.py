@@ -15,13 +15,13 @@ from speckle3d.corrections import correct
 from speckle3d.tracking import track
 
 
-def fused(tracking, sweep, scale_sigma=0.03, **evidence):
+def fuse_images(tracking, sweep, scale_sigma=0.03, **evidence):
     turns, centre_mm = tracking.shared.turn_sigma_per_mm, sweep.grid.centre_mm
     images = tracking.edges, tracking.image, 0.0, scale_sigma, 0.0
     return fuse(*images, turns, centre_mm, sweep.frame_time_s, **evidence)
 
 
-def moved(tracker, shift_mm=0.0, factor=1.0):
+def displace(tracker, shift_mm=0.0, factor=1.0):
     poses = tracker.readings.world_from_sensor
     places = factor * poses.translation + shift_mm
     readings = TimedPoses(tracker.readings.time_s, RigidTransform.from_components(places, poses.rotation))
@@ -30,12 +30,12 @@ def moved(tracker, shift_mm=0.0, factor=1.0):
 
 def test_evidence_of_the_scale_counts_by_its_information_against_the_images_claim(sweep, tracking):
     evidence = ScaleEvidence("crossing", np.array([0.04, 0.0, 0.0]), np.diag([1.0 / 0.01**2, 0.0, 0.0]))
-    found = fused(tracking, sweep, 0.02, evidence=[evidence])
+    poses = fuse_images(tracking, sweep, 0.02, evidence=[evidence])
     # Variances before: of the common scale, and of its changes along the sweep between nothing and as much.
     least, most = (0.04 * prior / (prior + 0.01**2) for prior in (0.02**2, 2 * 0.02**2))
-    assert least - 5e-4 < found.log_scale < most + 5e-4
-    assert found.log_scale_sigma == pytest.approx(0.01, rel=0.2)
-    assert found.used == ("images", "crossing")
+    assert least - 5e-4 < poses.log_scale < most + 5e-4
+    assert poses.log_scale_sigma == pytest.approx(0.01, rel=0.2)
+    assert poses.used == ("images", "crossing")
 
 
 def test_a_sensor_without_a_mounting_costs_itself_alone(sweep, tracking):
@@ -46,20 +46,22 @@ def test_a_sensor_without_a_mounting_costs_itself_alone(sweep, tracking):
 def test_a_loop_of_the_images_says_nothing_of_their_scale(sweep, curves):
     # Edges between both visits once made shrinking cheap: every edge counts in the images' own millimetres.
     loop = in_order(first_vectors(sweep), [*range(32), *range(31, -1, -1)])
-    found = fused(track(loop, curves), loop)
-    assert found.log_scale == pytest.approx(0.0, abs=1e-3)
-    assert found.log_scale_sigma > 0.8 * 0.03
+    poses = fuse_images(track(loop, curves), loop)
+    assert poses.log_scale == pytest.approx(0.0, abs=1e-3)
+    assert poses.log_scale_sigma > 0.8 * 0.03
 
 
 def test_a_tracker_much_too_far_from_the_images_is_not_averaged_with_them(sweep, tracking):
     with pytest.raises(MismatchError):
-        fused(tracking, sweep, tracker=moved(sweep.tracker, factor=1e-3))
+        fuse_images(tracking, sweep, tracker=displace(sweep.tracker, factor=1e-3))
 
 
 def test_outliers_of_a_tracker_move_the_poses_little(sweep, tracking):
     rng, many = np.random.default_rng(7), len(sweep.tracker.readings)
     wild = np.where(rng.random((many, 1)) < 0.05, rng.choice([-3.0, 3.0], (many, 3)), 0.0)
-    clean, spiked = (fused(tracking, sweep, tracker=moved(sweep.tracker, shift)) for shift in (0.0, wild))
-    ends = [(each.poses[0].inv() * each.poses[-1]).apply(sweep.grid.centre_mm)[2] for each in (clean, spiked)]
+    clean, outliers = (
+        fuse_images(tracking, sweep, tracker=displace(sweep.tracker, shift)) for shift in (0.0, wild)
+    )
+    ends = [(fit.poses[0].inv() * fit.poses[-1]).apply(sweep.grid.centre_mm)[2] for fit in (clean, outliers)]
     # A tenth of the readings near the end are off by ten claimed deviations of it and more.
     assert abs(ends[1] - ends[0]) < 2 * np.sqrt(clean.covariance[-1, 2, 2])

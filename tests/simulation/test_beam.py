@@ -72,19 +72,19 @@ def direct_echo(point_mm):
 @pytest.mark.parametrize("across_mm", [(0.0, 0.0), (0.5, 0.8)])
 def test_one_echo_has_the_right_shape_phase_and_delay(beam, depth_mm, across_mm):
     point = (across_mm[0], depth_mm, across_mm[1])
-    made, direct = echo(beam, point), direct_echo(point)
+    simulated, direct = echo(beam, point), direct_echo(point)
     # Four components over frequency and linear interpolation in the table: 0.98 and better was measured
     # with the table refined until it no longer mattered; a wrong sign or delay gives far less.
-    assert made @ direct / np.sqrt(made @ made * (direct @ direct)) > 0.975
+    assert simulated @ direct / np.sqrt(simulated @ simulated * (direct @ direct)) > 0.975
 
 
 @pytest.mark.parametrize("depth_mm", [10.0, 30.0])
 def test_elevational_energy_profile(beam, depth_mm):
     points = [(0.0, depth_mm, float(z)) for z in np.arange(0.0, 3.3, 0.2)]
-    made = np.array([(echo(beam, p) ** 2).sum() for p in points])
+    simulated = np.array([(echo(beam, p) ** 2).sum() for p in points])
     direct = (np.abs(direct_response(points) * pulse(NODES_HZ)) ** 2).sum(axis=1)
     # 3 % of the axis: linear interpolation over 0.08 mm (up to 2 % of the energy on a slope).
-    np.testing.assert_allclose(made / made[0], direct / direct[0], atol=0.03)
+    np.testing.assert_allclose(simulated / simulated[0], direct / direct[0], atol=0.03)
 
 
 def intensity_correlation(medium, beam, depths_mm, blocks):
@@ -119,11 +119,11 @@ def predicted_correlation(depth_mm):
 def test_decorrelation_is_what_diffraction_predicts_and_slower_in_fibres(beam):
     depths_mm = (10.0, 20.0, 30.0)
     rho, error = intensity_correlation(TiledMedium(5, 100.0, 0.0), beam, depths_mm, 5)
-    for measured, sigma, depth_mm in zip(rho, error, depths_mm, strict=True):
+    for curve, sigma, depth_mm in zip(rho, error, depths_mm, strict=True):
         # Three standard errors over five independent blocks (0.06 at most), and 0.02 for the beam table.
         # The standard error is itself known to a third only, hence the same for all lags.
-        assert np.abs(measured - predicted_correlation(depth_mm)).max() < 3.0 * sigma.max() + 0.02
+        assert np.abs(curve - predicted_correlation(depth_mm)).max() < 3.0 * sigma.max() + 0.02
     medium = tissue(5, 40.0)
-    attenuated = tabulate_beam(attenuation_db_cm_mhz=medium.attenuation_db_cm_mhz)
-    fibrous, _ = intensity_correlation(medium, attenuated, (20.0,), 2)
+    attenuating_beam = tabulate_beam(attenuation_db_cm_mhz=medium.attenuation_db_cm_mhz)
+    fibrous, _ = intensity_correlation(medium, attenuating_beam, (20.0,), 2)
     assert fibrous[0][3] > rho[1][3] + 0.05

@@ -9,12 +9,12 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.core.geometry import relative_poses, roll_yaw_tilt
 from speckle3d.simulation.movement import HandMotion, hand_sweep
 
-HERE = RigidTransform.identity()
+IDENTITY = RigidTransform.identity()
 
 
 def sweep(seed, motion=None, length_mm=20.0, duration_s=6.4):
     rng = np.random.default_rng(seed)
-    return hand_sweep(length_mm, duration_s, 37.8, motion or HandMotion(), HERE, HERE, rng)
+    return hand_sweep(length_mm, duration_s, 37.8, motion or HandMotion(), IDENTITY, IDENTITY, rng)
 
 
 @settings(deadline=None, max_examples=25)

@@ -25,7 +25,7 @@ def scan(preset="plane", **changes):
     return simulate(SimulationSettings(preset=preset, **{"seed": 3, **changes}))[0]
 
 
-def posed(beam, reflector, poses_deg_mm, vectors=64):
+def bath_frames(beam, reflector, poses_deg_mm, vectors=64):
     """Frames at given (tilt, roll, depth in the middle vector)."""
     image = ImageGrid(vectors, 3818, 0.3, beam.probe.signal.sample_spacing_mm)
     poses = []
@@ -58,7 +58,7 @@ def test_the_bars_echo_lies_in_the_plane_that_the_truth_says():
 
 
 def test_a_level_wall_reverberates_at_twice_the_depth(beam):
-    wall = posed(beam, "wall", [(0.0, 0.0, 14.0), (15.0, 0.0, 14.0)])
+    wall = bath_frames(beam, "wall", [(0.0, 0.0, 14.0), (15.0, 0.0, 14.0)])
     spacing = wall.image.sample_spacing_mm
     first = envelopes(wall[0]).max(axis=1)
     level, steep = (envelopes(frame)[:, round(21.0 / spacing) : round(35.0 / spacing)] for frame in wall)
@@ -76,8 +76,10 @@ def test_sensors_are_left_to_calibrate_and_read_where_the_truth_is():
     poses = tracker.readings.at(sweep.frame_time_s - tracker.time_offset_s) * TRACKER_FROM_IMAGE
     # Interpolation over 20 ms of tremor, with a lever of 280 mm on 0.016 deg: as in the sensors' own tests.
     assert np.abs((sweep.truth.inv() * poses).translation).max() < 0.2
-    turned = orientation.readings.at(sweep.frame_time_s - orientation.time_offset_s) * ORIENTATION_FROM_IMAGE
-    assert np.rad2deg((sweep.truth.rotation.inv() * turned).magnitude()).max() < 0.02
+    rotation = (
+        orientation.readings.at(sweep.frame_time_s - orientation.time_offset_s) * ORIENTATION_FROM_IMAGE
+    )
+    assert np.rad2deg((sweep.truth.rotation.inv() * rotation).magnitude()).max() < 0.02
 
 
 def test_crossing_threads_echo_where_the_truth_says():

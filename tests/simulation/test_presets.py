@@ -14,9 +14,9 @@ def small(preset, **changes):
 
 @pytest.mark.parametrize("preset", ["reversal", "crossed", "stepped"])
 def test_every_preset_makes_sweeps_with_truth_and_seed(preset):
-    made = simulate(small(preset))
-    assert len(made) == (2 if preset == "crossed" else 1)
-    for item in made:
+    sweeps = simulate(small(preset))
+    assert len(sweeps) == (2 if preset == "crossed" else 1)
+    for item in sweeps:
         sweep = item.sweep
         assert sweep.truth is not None
         assert item.settings.seed == 3
@@ -37,23 +37,23 @@ def test_the_same_seed_gives_the_same_sweep_and_another_another():
     assert not np.allclose(a.truth.as_matrix(), c.truth.as_matrix())
 
 
-def test_a_rotation_turns_as_far_as_asked():
+def test_a_rotation_turns_by_its_setting():
     with_turn, without = (
         simulate(small("rotation", turn_deg=t, turn_axis="yaw"))[0].sweep.truth.rotation for t in (6.0, 0.0)
     )
-    turned, plain = (roll_yaw_tilt(r[0].inv() * r[-1]) for r in (with_turn, without))
-    assert np.rad2deg(turned - plain)[1] == pytest.approx(6.0, abs=0.1)
+    turn, plain = (roll_yaw_tilt(r[0].inv() * r[-1]) for r in (with_turn, without))
+    assert np.rad2deg(turn - plain)[1] == pytest.approx(6.0, abs=0.1)
 
 
 @pytest.mark.parametrize(("kind", "range_db"), [("iq", None), ("bmode", 60.0)])
 def test_sweeps_are_stored_as_i_and_q_or_as_grey_levels_where_asked_for(kind, range_db):
-    rf, made = (simulate(small("phantom", frames=3, signal=signal))[0].sweep for signal in ("rf", kind))
+    rf, sweep = (simulate(small("phantom", frames=3, signal=signal))[0].sweep for signal in ("rf", kind))
     expected = received(rf, range_db)
-    np.testing.assert_array_equal(made.frames[1], expected.frames[1])
-    assert (made.grid, made.signal) == (expected.grid, expected.signal)
+    np.testing.assert_array_equal(sweep.frames[1], expected.frames[1])
+    assert (sweep.grid, sweep.signal) == (expected.grid, expected.signal)
 
 
-def test_a_sector_of_parallel_vectors_is_refused():
+def test_raises_on_a_sector_of_parallel_vectors():
     with pytest.raises(ValueError, match="sector_deg"):
         SimulationSettings(sector_deg=30.0)
     assert SimulationSettings(array="phased", sector_deg=30.0).sector_deg == 30.0

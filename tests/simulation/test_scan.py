@@ -39,12 +39,12 @@ def test_uniform_speckle_is_fully_developed_at_every_depth(beam):
 
 def test_a_frame_is_the_same_however_often_and_in_whatever_order_it_is_read(beam):
     poses = RigidTransform.from_translation([[0, 0, 0.0], [0, 0, 5.0], [0, 0, 0.4]])
-    one, other = (
+    first, second = (
         SimulatedFrames(beam, tissue(3, 20.0), poses, image(6, beam), noise_entropy=4) for _ in range(2)
     )
-    forward, backward = [one[i] for i in range(3)], [other[i] for i in (2, 1, 0)][::-1]
+    forward, backward = [first[i] for i in range(3)], [second[i] for i in (2, 1, 0)][::-1]
     np.testing.assert_array_equal(forward, backward)
-    np.testing.assert_array_equal(one[-1], forward[2])
+    np.testing.assert_array_equal(first[-1], forward[2])
     assert not np.array_equal(forward[0], forward[1])
 
 

@@ -15,7 +15,7 @@ from speckle3d.simulation.sensors import (
     simulate_tracker,
 )
 
-HERE = RigidTransform.identity()
+IDENTITY = RigidTransform.identity()
 SPAN_S = (-0.3, 20.3)
 FRAMES_S = np.arange(500) / 25.0
 
@@ -23,7 +23,7 @@ FRAMES_S = np.arange(500) / 25.0
 @pytest.fixture(scope="module")
 def trajectory():
     rng = np.random.default_rng(11)
-    return hand_sweep(20.0, 20.0, 37.8, HandMotion(), HERE, world_from_medium(0.6), rng)
+    return hand_sweep(20.0, 20.0, 37.8, HandMotion(), IDENTITY, world_from_medium(0.6), rng)
 
 
 def test_tracker_errors_are_the_stated_jitter(trajectory):
@@ -67,6 +67,6 @@ def test_exact_raw_readings_integrate_to_the_orientation_and_the_path(trajectory
     path = cumulative_trapezoid(speed, times, axis=0, initial=0)
     true = trajectory.world_from_image(times).apply(LEVER_MM)
     line = np.stack([np.ones_like(times), times], axis=1)
-    rest = (true - path) - line @ np.linalg.lstsq(line, true - path, rcond=None)[0]
+    residual = (true - path) - line @ np.linalg.lstsq(line, true - path, rcond=None)[0]
     # Half a percent of the 20 mm travelled: sums of 100 Hz samples are no integrals.
-    assert np.abs(rest).max() < 0.1
+    assert np.abs(residual).max() < 0.1

@@ -15,7 +15,7 @@ from speckle3d.correction.crossing.sweep import CrossingSweep
 
 
 @cache
-def made(**case):
+def pair_of(**case):
     return tissue_pair(PairCase(**case))
 
 
@@ -29,36 +29,36 @@ def errors(poses, truth):
 
 @pytest.mark.slow
 def test_finds_lengths_that_were_a_fifth_wrong():
-    pair = made(seed=4)
+    pair = pair_of(seed=4)
     before = [errors(s.poses, t)[0] for s, t in zip((pair.first, pair.second), pair.truth, strict=True)]
     assert min(before) > 10
-    found = solve_crossing(pair.first, pair.second)
-    for side, truth in zip((found.first, found.second), pair.truth, strict=True):
+    solution = solve_crossing(pair.first, pair.second)
+    for side, truth in zip((solution.first, solution.second), pair.truth, strict=True):
         length, tilt = errors(side.poses, truth)
         # Targets of 90th percentiles over many pairs.
         assert abs(length) < 2.0
         assert abs(tilt) < 1.0
         assert abs(length) < 3 * 100 * side.log_scale_sigma
-    assert found.mirrored == (False, False)
+    assert solution.mirrored == (False, False)
     expected = pair.truth[0][0].inv() * pair.truth[1][0]
-    away = expected.inv() * found.first_from_second
+    away = expected.inv() * solution.first_from_second
     # 24 mm of sweep at 2 per cent, and what false turns move its first frame by.
     assert np.linalg.norm(away.apply(GRID.centre_mm) - GRID.centre_mm) < 1.0
 
 
 @pytest.mark.slow
 def test_finds_which_sweep_went_the_other_way():
-    pair = made(seed=381, mirror=True)
-    found = solve_crossing(pair.first, pair.second)
-    assert found.mirrored == (False, True)
-    assert abs(errors(found.second.poses, pair.truth[1])[0]) < 2.0
+    pair = pair_of(seed=381, mirror=True)
+    solution = solve_crossing(pair.first, pair.second)
+    assert solution.mirrored == (False, True)
+    assert abs(errors(solution.second.poses, pair.truth[1])[0]) < 2.0
 
 
 @pytest.mark.slow
 def test_a_sensor_tells_the_turns():
-    pair = made(seed=1, with_sensor=True)
-    found = solve_crossing(pair.first, pair.second)
-    for side, truth in zip((found.first, found.second), pair.truth, strict=True):
+    pair = pair_of(seed=1, with_sensor=True)
+    solution = solve_crossing(pair.first, pair.second)
+    for side, truth in zip((solution.first, solution.second), pair.truth, strict=True):
         length, tilt = errors(side.poses, truth)
         assert abs(length) < 2.0
         # The sensor's own inclination wanders by 0.15 degrees at either end: three deviations.
@@ -67,18 +67,18 @@ def test_a_sensor_tells_the_turns():
 
 @pytest.mark.slow
 def test_refuses_other_tissue():
-    one, other = made(seed=4), made(seed=1, with_sensor=True)
+    first_pair, second_pair = pair_of(seed=4), pair_of(seed=1, with_sensor=True)
     with pytest.raises((MismatchError, InsufficientDataError)):
-        solve_crossing(one.first, replace(other.second, orientation=None))
+        solve_crossing(first_pair.first, replace(second_pair.second, orientation=None))
 
 
 @pytest.mark.slow
 def test_claims_for_tissue_that_moved_a_little():
-    pair = made(seed=200, moved_mm=0.3)
-    found = solve_crossing(pair.first, pair.second)
+    pair = pair_of(seed=200, moved_mm=0.3)
+    solution = solve_crossing(pair.first, pair.second)
     # Known to a factor of 2; sweeps over still tissue show less than 0.2 mm.
-    assert 0.2 < found.first.details["tissue_moved_mm"] < 0.6
-    for side, truth in zip((found.first, found.second), pair.truth, strict=True):
+    assert 0.2 < solution.first.details["tissue_moved_mm"] < 0.6
+    for side, truth in zip((solution.first, solution.second), pair.truth, strict=True):
         # 0.3 mm either way, smooth over 8 mm, make a per cent of 24 mm; without them 0.7 % were claimed.
         assert side.log_scale_sigma > 0.01
         assert abs(errors(side.poses, truth)[0]) < 2 * 100 * side.log_scale_sigma
@@ -94,7 +94,7 @@ REFUSED = {
 @pytest.mark.slow
 @pytest.mark.parametrize("advice", REFUSED)
 def test_refuses_what_determines_no_length_and_says_what_to_do(advice):
-    pair = made(**REFUSED[advice])
+    pair = pair_of(**REFUSED[advice])
     with pytest.raises(InsufficientDataError, match=advice):
         solve_crossing(pair.first, pair.second)
 

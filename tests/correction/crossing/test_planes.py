@@ -35,11 +35,11 @@ def test_a_hand_that_dwells_does_not_draw_the_images():
 
 def test_frames_return_to_where_they_were_and_scale_stretches_about_the_middle():
     travel = np.linspace(0.0, 12.0, 80) + 0.05 * np.sin(np.arange(80))
-    given = straight_sweep(travel, lambda z: np.full((12, 16), 1.0 + z))
-    straight = straighten(given)
+    sweep = straight_sweep(travel, lambda z: np.full((12, 16), 1.0 + z))
+    straight = straighten(sweep)
     bends = np.zeros(BENDS)
-    back = straight.bent_frames(bends) * RigidTransform.from_translation(-given.centre_mm)
-    np.testing.assert_allclose((back[0].inv() * back).translation, given.poses.translation, atol=1e-9)
+    back = straight.bent_frames(bends) * RigidTransform.from_translation(-sweep.centre_mm)
+    np.testing.assert_allclose((back[0].inv() * back).translation, sweep.poses.translation, atol=1e-9)
     bends[0] = 0.1
     ends, before = (
         straight.bent_frames(b).translation[[0, straight.nearest, -1], 2] for b in (bends, 0 * bends)
