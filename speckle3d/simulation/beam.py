@@ -10,7 +10,6 @@ import numpy as np
 
 from speckle3d.core.arrays import Complex64Array, ComplexArray, FloatArray, IntArray
 from speckle3d.core.sweep import RFSettings
-from speckle3d.core.threads import in_parallel
 from speckle3d.kernels.diffraction import lens_fields
 
 _NEPER_PER_DB = np.log(10.0) / 20.0
@@ -142,7 +141,7 @@ class BeamTable:
         inside = np.arange(self.elevation_mm.size) < self.reach[:, :, None]
         field = self.residual * inside[..., None]
         # Both mirror halves count, the axis once.
-        sides = np.outer(_sides(self.lateral_mm), _sides(self.elevation_mm))
+        sides = np.outer(*(np.where(at > 0.0, 2.0, 1.0) for at in (self.lateral_mm, self.elevation_mm)))
         cell_mm2 = self.lateral_mm[1] * self.elevation_mm[1]
         power = np.einsum("yxzk,kl,yxzl,xz->y", field, gram, field.conj(), sides, optimize=True).real
         return np.asarray(power * cell_mm2 * self.probe.signal.sample_spacing_mm)
@@ -185,10 +184,6 @@ def tabulate_beam(probe: Probe = Probe(), attenuation_db_cm_mhz: float = 0.0) ->
     return BeamTable(probe, lateral, residual, components, reach, curvature)
 
 
-def _sides(coordinate: FloatArray) -> FloatArray:
-    return np.where(coordinate > 0.0, 2.0, 1.0)
-
-
 def _sum_sources(probe: Probe, lateral: FloatArray, wavenumbers: FloatArray) -> ComplexArray:
     """Two-way field, shape (depth, lateral, elevation, node)."""
     depth, step = _DEPTH_MM, probe.pitch_mm / PER_PITCH
@@ -210,18 +205,15 @@ def _sum_sources(probe: Probe, lateral: FloatArray, wavenumbers: FloatArray) -> 
     lens = probe.elevation_focus_mm - np.hypot(probe.elevation_focus_mm, strip)
     out = np.empty((depth.size, lateral.size, _ELEVATION_MM.size, wavenumbers.size), dtype=complex)
 
-    def sum_depths(first: int, stop: int) -> None:
-        line = np.empty((away.size, wavenumbers.size, _ELEVATION_MM.size, 2))
-        for iy in range(first, stop):
-            distance = np.hypot(depth[iy], (away + 0.5) * step)
-            # Obliquity depth / r and spreading 1 / r of a source in a pressure-release plane.
-            weight = np.full(away.size, depth[iy])
-            lens_fields(distance, _ELEVATION_MM, strip, lens, wavenumbers, weight, 2, 0, away.size, line)
-            field = line.view(complex)[..., 0].swapaxes(0, 1)
-            transmission, reception = (way[iy][:, sources].sum(axis=1) @ field for way in ways)
-            out[iy] = np.moveaxis(transmission * reception, 0, -1)
-
-    in_parallel(sum_depths, depth.size)
+    line = np.empty((away.size, wavenumbers.size, _ELEVATION_MM.size, 2))
+    for iy in range(depth.size):
+        distance = np.hypot(depth[iy], (away + 0.5) * step)
+        # Obliquity depth / r and spreading 1 / r of a source in a pressure-release plane.
+        weight = np.full(away.size, depth[iy])
+        lens_fields(distance, _ELEVATION_MM, strip, lens, wavenumbers, weight, 2, 0, away.size, line)
+        field = line.view(complex)[..., 0].swapaxes(0, 1)
+        transmission, reception = (way[iy][:, sources].sum(axis=1) @ field for way in ways)
+        out[iy] = np.moveaxis(transmission * reception, 0, -1)
     return out
 
 
