@@ -250,7 +250,7 @@ class SensorReadings:
         return matrix @ unknowns, matrix
 
     def strain(self, unknowns: FloatArray) -> float:
-        """How many of their deviations a tracker's millimetres are off, to please the images, too."""
+        """Error of a tracker's millimetres over its standard deviation beforehand."""
         return float(abs(unknowns[MILLIMETRES])) / self.settings.tracker_scale_sigma
 
     def with_jitter_along(self, path: FloatArray, unknowns: FloatArray) -> SensorReadings:

@@ -98,7 +98,7 @@ class Sphere(NamedTuple):
 
 
 class Layer(NamedTuple):
-    """What lies below an undulating boundary, down to the next layer's.
+    """Tissue from an undulating boundary down to that of the next layer.
 
     Attributes
     ----------

@@ -58,7 +58,7 @@ SCALES = [RIGID, RIGID + BENDS]
 
 @dataclass(frozen=True)
 class Prior:
-    """What is known of the parameters before looking.
+    """Gaussian prior of the parameters.
 
     Attributes
     ----------
@@ -179,7 +179,7 @@ class CrossingFit:
 
 @dataclass(frozen=True)
 class Parts:
-    """What parts of the tissue say about the parameters and about a shift of their own.
+    """Gradient and curvature of the cost, summed over cubes of tissue.
 
     Attributes
     ----------
