@@ -253,7 +253,8 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
             plot.plot.title.text = str(error).split(";")[0]
             return
         plot.show_cut(picture, *self._pair)
-        words = "".join(f"{label_of(mode)}: {length}<br>" for mode, length in picture.lengths.items())
+        lengths = {mode: text.replace("\n", ", ") for mode, text in picture.lengths.items()}
+        words = "".join(f"{label_of(mode)}: {text}<br>" for mode, text in lengths.items())
         if self._pair[1]:
             words += "green: this mode alone, magenta: the other alone, grey: both"
         self._lengths.object = words
