@@ -112,7 +112,7 @@ def load_estimate(path: Path, mode: str | None = None, length_unit: LengthUnit |
 def poses_of(reconstruction: Reconstruction, mode: str) -> RigidTransform:
     """Poses of one mode, or an `InvalidInputError` that lists the modes there are."""
     if mode not in reconstruction.poses:
-        raise InvalidInputError(f"expected a mode among {', '.join(reconstruction.poses)}, got {mode!r}")
+        raise InvalidInputError(f"mode: expected one of {', '.join(reconstruction.poses)}, got {mode!r}")
     return reconstruction.poses[mode]
 
 
