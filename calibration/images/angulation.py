@@ -77,7 +77,7 @@ class Angulation:
         if share >= WEAK:
             return "sufficient"
         kind = "insufficient" if share < LEAST else "weak"
-        return f"{kind}: an error of 1 mm in {name} shifts the sweeps by {share:.2f} mm only; {self.advice}"
+        return f"{kind}: 1 mm of error in {name} shows by {share:.2f} mm; {self.advice}"
 
     def require(self, part: float = 1.0) -> None:
         """Refuse sweeps that cannot determine every parameter.
