@@ -28,7 +28,7 @@ def distance_mm(sweep, poses, reference):
 
 
 def example_part(folder, frames=FRAMES):
-    """The first frames of the data_folder sweep, and its curves."""
+    """The first frames of the shipped sweep, and its curves."""
     return s3.load_sweep(folder / "phantom.h5").part(0, frames), s3.load_curves(folder / "curves.h5")
 
 
