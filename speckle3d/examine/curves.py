@@ -92,7 +92,7 @@ def require_usable(doubts: Iterable[Doubt | None], error: type[Speckle3DError]) 
 def examine_curves(texture: Texture, motion: Motion, usable: BoolArray) -> tuple[Doubt | None, ...]:
     """Hold the curves against a sweep's own speckle and steps."""
     rows, patches = rows_without_tilt(motion), motion.problem.patches
-    gain = np.ones(patches.row_depth_mm.size) if rows is None else np.nan_to_num(rows.gain, nan=1.0)
+    gain = np.ones(patches.row_depth_mm.size) if rows is None else np.nan_to_num(rows.gain)
     return (
         *doubt_size(texture.speckle_size(usable), motion.problem.curves, patches, gain),
         doubt_bend(rows),

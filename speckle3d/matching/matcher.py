@@ -37,6 +37,11 @@ _OVERLAID, _OVER_SPECKLE = 0.1, 10.0
 median patch. Simulated sweeps of two physics have up to 0.009 where nothing stands, by chance; a white pixel
 of text among a thousand has 0.1. On a probe that hardly moves speckle stays, but all over the image."""
 
+_SILENT = 0.01
+"""Power of a vector along a row of patches, over that of the row's brighter quarter, up to which it holds no
+echo: -20 dB, where speckle has -6 dB at the least. Simulated tissue is silent in up
+to 0.3 % (vessels); half and twice move the rms error of eight sweeps by up to 0.4 %."""
+
 
 class MatchingSettings(BaseModel):
     """What of two frames is correlated once their in-plane motion is known."""
@@ -176,8 +181,9 @@ class FrameMatcher:
         """Make a frame, as read, ready to be matched; on any thread."""
         echo, is_bmode = self.echo(samples), isinstance(self.signal, BModeSettings)
         features = inspect_frame(samples, echo.intensity, self.patches, is_bmode, self.quality)
-        features = replace(features, usable=features.usable & ~self.overlaid)
-        return ReadyFrame(echo, features, self.prepare(echo, features.usable))
+        echoing = 1.0 - self.patches.tiles(self._silent(echo.intensity)).mean(axis=(1, 2))
+        usable = features.usable & ~self.overlaid & (echoing >= self._least_overlap)
+        return ReadyFrame(echo, replace(features, usable=usable), self.prepare(echo, usable))
 
     def echo(self, frame: npt.NDArray[Any]) -> Echo:
         """Echo of a frame as read."""
@@ -185,15 +191,33 @@ class FrameMatcher:
         return echo if self.of_echo else Echo(echo.intensity, None)
 
     def equalised(self, echo: Echo) -> tuple[Float32Array, Float32Array]:
-        """Intensity and, where there is phase, echo over their local mean; see `Frame`."""
-        gain = self.extractor.gain(echo.intensity, self._mask)
+        """Intensity and, where there is phase, echo over their local mean; see `Frame`.
+
+        What is silent or stands still counts in no mean and departs from none: a shadow's edge would be a
+        pattern that stays.
+        """
+        left_out, mask = self._silent(echo.intensity), self._mask
+        if left_out.any():
+            mask = ~left_out if mask is None else mask & ~left_out
         if self._standing is not None:
-            gain[self._standing] = 0.0
+            left_out |= self._standing
+        gain = self.extractor.gain(echo.intensity, mask)
+        gain[left_out] = 0.0
         if echo.analytic is None:
-            return echo.intensity * gain, np.empty((2, 0, 0), np.float32)
-        image, parts = np.empty_like(gain), np.empty((2, *gain.shape), np.float32)
-        amplify(echo.analytic, gain, image, parts)
+            image, parts = echo.intensity * gain, np.empty((2, 0, 0), np.float32)
+        else:
+            image, parts = np.empty_like(gain), np.empty((2, *gain.shape), np.float32)
+            amplify(echo.analytic, gain, image, parts)
+        image[left_out] = 1.0
         return image, parts
+
+    def _silent(self, intensity: Float32Array) -> BoolArray:
+        """Samples in rows of patches whose vector holds no echo there: a shadow, no contact."""
+        high, silent = self.patches.size[1], np.zeros(intensity.shape, dtype=bool)
+        for top in np.unique(self.patches.first[:, 1]):
+            power = intensity[:, top : top + high].mean(axis=1)
+            silent[:, top : top + high] = (power < _SILENT * np.sort(power)[3 * power.size // 4])[:, None]
+        return silent
 
     def prepare(self, echo: Echo, usable: BoolArray | None = None) -> Frame:
         """Equalise an echo and transform it for the coarse search.

@@ -259,20 +259,21 @@ def estimate_coherence(
         return Coherence(np.zeros(1), *fully_developed(len(problem.patches)), scale_sigma=PHANTOM_SIGMA)
     most_share = MOST_SHARE["echo" if of_echo else "intensity"]
 
+    static_fit = binning.fit(most_share)
+    # Where noise is most of the correlation, its course tells nothing of the scale.
+    clear = is_determined & (static_fit[:, 1] >= LEAST_GAIN)
+    clear = clear if clear.any() else is_determined
+
     def row_medians(values: FloatArray) -> FloatArray:
-        by_piece = np.where(is_determined, values, np.nan).reshape(centres.size, -1)
+        by_piece = np.where(clear, values, np.nan).reshape(centres.size, -1)
         by_row = np.moveaxis(problem.patches.rows_of(by_piece), 1, 0)
         finite = (row[np.isfinite(row)] for row in by_row)
         return np.array([np.median(row) if row.size else np.nan for row in finite])
 
-    static_fit = binning.fit(most_share)
     typical = float(np.nanmean(row_medians(static_fit[:, 2])))
     if typical < NO_STRUCTURE:
         most_share = 0.0
     fits = [binning.fit(most_share, MOST_POWER), *([static_fit] if most_share and not of_echo else [])]
-    # Where noise is most of the correlation, its course tells nothing of the scale.
-    clear = is_determined & (static_fit[:, 1] >= LEAST_GAIN)
-    clear = clear if clear.any() else is_determined
     medians = [float(np.median(fit[clear, 0])) for fit in fits]
     log_scale = float(np.mean(medians))
     gain, share = binning.fit(most_share, 0.0, log_scale, max(typical, NO_STRUCTURE))[:, 1:3].T
