@@ -39,8 +39,8 @@ of text among a thousand has 0.1. On a probe that hardly moves speckle stays, bu
 
 _SILENT = 0.01
 """Power of a vector along a row of patches, over that of the row's brighter quarter, up to which it holds no
-echo: -20 dB, where speckle has -6 dB at the least. Simulated tissue is silent in up
-to 0.3 % (vessels); half and twice move the rms error of eight sweeps by up to 0.4 %."""
+echo: -20 dB, where speckle has -6 dB at the least. Simulated tissue is silent in up to 0.3 % (vessels). Half
+and twice of it move no length over tissue by more than 0.6 %, in RF or B-mode, in part in shadow or not."""
 
 
 class MatchingSettings(BaseModel):
