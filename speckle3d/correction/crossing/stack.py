@@ -24,9 +24,7 @@ class ImageStack:
     Parameters
     ----------
     grid : ImageGrid
-        Of the speckle intensity images that `keep` gets.
-    pixel_mm : float
-        Pooled pixels are at most about so wide, but never finer than the vectors.
+        Of the speckle intensity images that `keep` gets. Pooled pixels are never finer than its vectors.
 
     Attributes
     ----------
@@ -34,13 +32,13 @@ class ImageStack:
         Of the pooled images, in the frame of the whole ones.
     """
 
-    def __init__(self, grid: ImageGrid, pixel_mm: float = PIXEL_MM) -> None:
+    def __init__(self, grid: ImageGrid) -> None:
         self._convert = None
         if grid.fan is not None:
-            self._convert = ScanConversion(grid, box_grid(grid, pixel_mm))
+            self._convert = ScanConversion(grid, box_grid(grid, PIXEL_MM))
             grid = self._convert.grid
-        across = max(1, min(grid.vectors, round(pixel_mm / grid.vector_pitch_mm)))
-        deep = max(1, min(grid.samples, round(pixel_mm / grid.sample_spacing_mm)))
+        across = max(1, min(grid.vectors, round(PIXEL_MM / grid.vector_pitch_mm)))
+        deep = max(1, min(grid.samples, round(PIXEL_MM / grid.sample_spacing_mm)))
         self._pool = across, deep
         self.grid = ImageGrid(
             grid.vectors // across,

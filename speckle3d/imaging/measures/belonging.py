@@ -40,10 +40,8 @@ def belonging_of(points_mm: FloatArray, grid: ImageGrid, world_from_image: Rigid
     return Belonging(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
 
-def require_inside(
-    points_mm: FloatArray, grid: ImageGrid, world_from_image: RigidTransform, reach_mm: float = REACH_MM
-) -> Belonging:
-    """Find frames of points in the sweep: between two frames, or within `reach_mm` of that.
+def require_inside(points_mm: FloatArray, grid: ImageGrid, world_from_image: RigidTransform) -> Belonging:
+    """Find frames of points in the sweep: between two frames, or within `REACH_MM` of that.
 
     Raises
     ------
@@ -56,7 +54,7 @@ def require_inside(
             f"point {beyond[0] + 1}: expected a point in the sweep, got one beyond the cut"
         )
     near = belonging_of(points_mm, grid, world_from_image)
-    outside = np.flatnonzero(near.gap_mm > reach_mm)
+    outside = np.flatnonzero(near.gap_mm > REACH_MM)
     if outside.size:
         row = int(outside[0])
         x, y, z = points_mm[row]

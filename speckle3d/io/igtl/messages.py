@@ -162,12 +162,9 @@ def packed_image(
     return _pack(ImageMessage(native, image_to_world, "ras"), device, time_s)
 
 
-def packed_transform(device: str, time_s: float, matrix: FloatArray, valid: bool = True) -> bytes:
-    """Pack a TRANSFORM, shape (4, 4), mm; one that is not valid says so as PLUS's do."""
-    message = TransformMessage(matrix)
-    if not valid:
-        message.metadata = {"TransformValid": "False", "TransformStatus": "MISSING"}
-    return _pack(message, device, time_s)
+def packed_transform(device: str, time_s: float, matrix: FloatArray) -> bytes:
+    """Pack a TRANSFORM, shape (4, 4), mm."""
+    return _pack(TransformMessage(matrix), device, time_s)
 
 
 def packed_text(device: str, time_s: float, text: str) -> bytes:
