@@ -59,8 +59,9 @@ _CHUNK_CACHE_BYTES = 32 * 2**20
 _KINDS = {"f": "fiu", "i": "iu", "b": "biu"}
 """Kinds in a file that may become a kind of result."""
 
-_LEAST_BYTES, _BYTES_OF_ONE = 2**24, 1032
-"""Size of data sets that may be unwritten, and what a byte stands for at most, as deflate packs zeros."""
+_LEAST_BYTES, _BYTES_OF_ONE = 2**24, 2**15
+"""Size of data sets that may be unwritten, and what a byte stands for at most, as Zstandard packs zeros: 128
+KiB in four bytes."""
 
 
 @contextmanager

@@ -157,7 +157,7 @@ def _children(node: Any) -> Iterator[tuple[str, Any]]:
         if not lists:
             yield from fields.items()
         for k in range(lists[0].size if lists else 0):
-            yield f"({k + 1})", ((name, _element(field, k)) for name, field in fields.items())
+            yield f"({k + 1})", iter([(name, _element(field, k)) for name, field in fields.items()])
 
 
 def _element(node: h5py.Dataset, k: int) -> Any:

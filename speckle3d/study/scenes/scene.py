@@ -80,8 +80,8 @@ def write_scene(
     request, target = request or VolumeRequest(), Path(folder)
     choices = {"deviation": with_deviation, "images": with_images, "poses": with_images}
     kinds = [kind for kind in _NAMES if choices.get(kind, True)]
-    names = {_NAMES[kind].format(posed_sweep.mode) for posed_sweep in posed for kind in kinds}
-    old_names = {name.format(mode) for mode in (*MODES, *REFERENCES) for name in _NAMES.values()} - names
+    names = dict.fromkeys(_NAMES[kind].format(posed_sweep.mode) for posed_sweep in posed for kind in kinds)
+    old_names = {name.format(mode) for mode in (*MODES, *REFERENCES) for name in _NAMES.values()} - {*names}
     scene: list[dict[str, Any]] = []
     reports = []
     with FileSet(SCENE, tuple(names), tuple(old_names)).replaced(target) as part:
