@@ -69,7 +69,7 @@ def track(
     subset = consistent_poses(motion, sensors.credible, settings.sensors)
 
     mismatch = motion.problem.curves.mismatch(settings.curves.same_probe, tissue.attenuation.log_length_sigma)
-    averaging = averaging_loss(matches.table, matches.features)
+    averaging = averaging_loss(matches.table.where(matches.sound), matches.features)
     compression = _compression_error(sweep, matcher.signal, settings, motion)
     error = float(np.linalg.norm([mismatch, averaging, compression]))
     shared, covariance = motion.claims(float(np.hypot(error, tissue.structure)))
