@@ -221,16 +221,22 @@ def _degrees(angles: FloatArray, force: FloatArray | None) -> float:
 
 
 def _utc_s(columns: dict[str, FloatArray]) -> FloatArray | None:
-    """Seconds since 1970, or since midnight, of columns of UTC; None without any."""
+    """Seconds since 1970, or since a minute, hour or day began, of columns of UTC; None without any."""
     if "utc_s" not in columns:
         return None
+    start = {"day": 1, "month": 1, "year": 1970, "hour": 0, "minute": 0, "s": 0, "nano": 0}
     day, month, year, hour, minute, seconds, nano = (
-        columns.get(f"utc_{part}", np.zeros(1))
-        for part in ("day", "month", "year", "hour", "minute", "s", "nano")
+        columns.get(f"utc_{part}", np.full(1, float(least))) for part, least in start.items()
     )
     months = np.nan_to_num(12.0 * (year - 1970.0) + month - 1.0).astype("M8[M]")
     days = months.astype("M8[D]").astype(float) + day
-    return np.asarray(86400.0 * days + 3600.0 * hour + 60.0 * minute + seconds + 1e-9 * nano)
+    times = 86400.0 * days + 3600.0 * hour + 60.0 * minute + seconds + 1e-9 * nano
+    spans = {"minute": 60, "hour": 3600, "day": 86400}
+    span = next((span for part, span in spans.items() if f"utc_{part}" not in columns), None)
+    if span is not None:
+        finite = np.isfinite(times)
+        times[finite] = unwrap(times[finite], span)
+    return np.asarray(times)
 
 
 def _side_by_side(columns: dict[str, FloatArray], keys: list[str]) -> FloatArray | None:

@@ -194,6 +194,9 @@ def test_columns_of_utc_are_a_clock():
     rows = ["990000000 2024 12 31 23 59 59 0 0 9.8", "0 2025 1 1 0 0 0 0 0 9.8"]
     log = parse_text("\n".join([names, *rows]))
     assert log.duration_s == pytest.approx(0.01, abs=1e-6)
+    for first in (4, 6):  # of a day or a minute without a date
+        parts = [" ".join([line.split()[0], *line.split()[first:]]) for line in (names, *rows)]
+        assert parse_text("\n".join(parts)).duration_s == pytest.approx(0.01, abs=1e-6)
 
 
 def test_acceleration_without_gravity_is_no_accelerometers_reading(s):
