@@ -72,10 +72,13 @@ def read_plane(path: PathLike, mode: str | None = None) -> PicturedPlane:
 
     try:
         with reading(path), open_regular(path) as stream:
-            text = dict(getattr(Image.open(stream, formats=["PNG"]), "text", {}))
+            try:
+                text = dict(getattr(Image.open(stream, formats=["PNG"]), "text", {}))
+            except UnidentifiedImageError:  # an OSError, but not of the disk
+                text = {}
         cuts = json.loads(text[KEYWORD])["cuts"]
         planes = [_plane(cut) for cut in cuts if cut["kind"] == "plane"]
-    except (UnidentifiedImageError, SyntaxError, KeyError, TypeError, ValueError, RecursionError) as error:
+    except (SyntaxError, KeyError, TypeError, ValueError, RecursionError) as error:
         raise InvalidInputError(
             f"{path}: expected a PNG that `speckle3d reslice` wrote, got another or a damaged one"
         ) from error

@@ -58,3 +58,6 @@ def test_where_a_plane_lies_comes_back_from_the_file(tmp_path):
     np.testing.assert_allclose(plane.world_mm(picks), PLANE.world_from_mm(*picks.T), atol=1e-9)
     with pytest.raises(InvalidInputError):
         read_plane(path, "truth")
+    path.write_bytes(b"no picture")
+    with pytest.raises(InvalidInputError, match="speckle3d reslice"):
+        read_plane(path)
