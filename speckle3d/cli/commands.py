@@ -205,7 +205,10 @@ def _flag(name: str) -> str:
 def _flag_of(option: inspect.Parameter) -> str:
     """Name of an option, or of an argument, in a help."""
     (info,) = option.annotation.__metadata__
-    return _flag(option.name) if isinstance(info, typer.models.OptionInfo) else option.name.upper()
+    if not isinstance(info, typer.models.OptionInfo):
+        return option.name.upper()
+    names = [name for name in info.param_decls or () if name.startswith("--")]
+    return names[0].partition("/")[0] if names else _flag(option.name)
 
 
 def _check(flag: str, option: inspect.Parameter, value: Any, flags: Mapping[str, Any]) -> Any:
