@@ -45,6 +45,7 @@ def write_transform(path: PathLike, world_from_image: RigidTransform) -> None:
     Examples
     --------
     >>> import tempfile
+    >>> from pathlib import Path
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     write_transform(f"{folder}/t.tfm", RigidTransform.from_translation([1.0, 2.0, 3.0]))
     ...     print(Path(f"{folder}/t.tfm").read_text().splitlines()[3])
