@@ -11,7 +11,6 @@ import numpy as np
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.files import PathLike
-from speckle3d.core.geometry import elevational_steps
 from speckle3d.core.labels import LabelMap
 from speckle3d.core.printable import printable
 from speckle3d.core.sweep import BModeSettings, RFSettings, Sweep, stored_dtype
@@ -119,9 +118,6 @@ def _reconstruction_rows(path: Source) -> Iterator[Row]:
     pairs, times = result.pairs, result.frame_time_s
     yield "frames", str(times.size), ""
     yield from _rate_rows("", times, "frames/s")
-    for mode, poses in result.poses.items() if times.size else ():
-        length_mm = abs(elevational_steps(poses, result.grid.centre_mm).sum())
-        yield f"length, mode {mode}", f"{length_mm:.2f}", "mm"
     yield "frame pairs", str(0 if pairs is None else len(pairs)), ""
     yield "patches", str(0 if pairs is None else len(pairs.patch_centre_mm)), ""
     yield from _source_rows(result.provenance)
