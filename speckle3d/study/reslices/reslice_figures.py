@@ -107,12 +107,15 @@ def draw_cuts(picture: CutPicture, part_mm: Extent | None = None) -> Figure:
     figure.set_layout_engine("compressed")
     places = figure.subplots(down, across, squeeze=False).ravel()
     greys = colormaps["gray"].with_extremes(bad=UNSEEN)
-    for (mode, panel), axes in zip(cuts.items(), places, strict=False):
+    titles = ["\n".join(filter(None, [label_of(mode), picture.lengths.get(mode, "")])) for mode in cuts]
+    longest = max(len(line) for title in titles for line in title.split("\n"))
+    # Beside each other where panels are narrow, too: 0.6 of the size a letter, and 0.3 inches between panels.
+    title_size = min(8.33, 72.0 * (scale * size[0] + 0.3) / (0.62 * longest))
+    for (mode, panel), title, axes in zip(cuts.items(), titles, places, strict=False):
         look = {"cmap": greys, "interpolation": "nearest", "extent": panel.cut.extent_mm}
         low, high = picture.levels
         image = axes.imshow(panel.image, vmin=low, vmax=high, **look)
-        title = "\n".join(filter(None, [label_of(mode), picture.lengths.get(mode, "")]))
-        axes.set_title(title, fontsize="small", color=colour_of(mode), parse_math=False)
+        axes.set_title(title, fontsize=title_size, color=colour_of(mode), parse_math=False)
         lines = list(panel.frames[spread_frames(len(panel.frames), 8)])
         axes.add_collection(LineCollection(lines, colors="#FFD700", linewidths=0.6, alpha=0.6), autolim=False)
         axes.set(xlim=(left, right), ylim=(bottom, top))

@@ -1,5 +1,7 @@
 """Pictures of cuts: one scale, true axes, how long each mode is, and where the picture's points lie."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -45,6 +47,14 @@ def test_many_cuts_stand_in_rows_that_show_them_large():
     widths = [axes.get_position().width * figure.get_figwidth() for axes in figure.axes[:7]]
     # In one row of 11 inches each had 1.6.
     assert min(widths) > 2.2
+
+
+def test_lengths_over_narrow_cuts_do_not_overlap():
+    lengths = dict.fromkeys("abc", "13.58 mm +14.6 %\n13.00 mm -11.5 %")
+    figure = draw_cuts(picture_of("abc", lengths=lengths), (-1.0, 1.0, 44.0, 0.0))
+    figure.draw_without_rendering()
+    spans = [axes.title.get_window_extent() for axes in figure.axes[:3]]
+    assert all(a.x1 < b.x0 for a, b in pairwise(spans))
 
 
 def test_where_a_plane_lies_comes_back_from_the_file(tmp_path):
