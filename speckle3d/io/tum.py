@@ -6,6 +6,7 @@ otherwise; poses in memory are in mm.
 
 from __future__ import annotations
 
+import re
 import warnings
 from contextlib import suppress
 from typing import Literal
@@ -65,7 +66,8 @@ def read_tum(path: PathLike, length_unit: LengthUnit | None = None) -> TimedPose
         whose time is not after the one before, are left out with a warning that counts them.
     """
     lines = [text for _, text in text_lines(path)]
-    heading = [word for text in lines if "qw" in text or text.startswith("#") for word in text.split()]
+    texts = [text.replace("q_", "q") for text in lines if "qw" in text or "q_w" in text or text[0] == "#"]
+    heading = [word for text in texts for word in re.split(r"[\s,;#]+", text)]
     unit = next((unit for unit in _MM_PER_UNIT if f"x_{unit}" in heading), length_unit or "m")
     scalar_first = "qw" in heading and "qx" in heading[heading.index("qw") :]
     table = np.array([_eight(text) for text in lines if not text.startswith("#")]).reshape(-1, _COLUMNS)

@@ -43,11 +43,17 @@ def test_a_bad_line_costs_that_line(tmp_path, bad):
     np.testing.assert_array_equal(poses.world_from_sensor.translation[:, 0], np.arange(6.0))
 
 
-@pytest.mark.parametrize("sign", ["# ", ""])
-def test_a_heading_says_that_quaternions_are_scalar_first(tmp_path, sign):
-    (tmp_path / "a.tum").write_text(
-        f"{sign}timestamp tx ty tz qw qx qy qz\n0 0 0 0 1 0 0 0\n1 0 0 0 0 0 0 1\n"
-    )
+@pytest.mark.parametrize(
+    "heading",
+    [
+        "# timestamp tx ty tz qw qx qy qz",
+        "timestamp tx ty tz qw qx qy qz",
+        "#timestamp,tx,ty,tz,qw,qx,qy,qz",
+        "# t, x, y, z, q_w, q_x, q_y, q_z",
+    ],
+)
+def test_a_heading_says_that_quaternions_are_scalar_first(tmp_path, heading):
+    (tmp_path / "a.tum").write_text(f"{heading}\n0 0 0 0 1 0 0 0\n1 0 0 0 0 0 0 1\n")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # a heading that is no comment is a line of no use
         rotation = read_tum(tmp_path / "a.tum").world_from_sensor.rotation
