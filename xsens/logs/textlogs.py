@@ -138,6 +138,12 @@ def _samples(table: TextTable, rate_hz: float | None) -> Parts:
             notes.append("times without a unit: taken for the samples' numbers")
     if not columns.keys() & {"time", "ticks"} and (utc_s := _utc_s(columns)) is not None:
         columns["time"] = utc_s
+    if table.names and np.isnan(period_s) and not columns.keys() & set(STAMPS):
+        unknown = [name[:40] for name in table.names if column_of(name) is None]
+        raise InvalidInputError(
+            f"expected a column of time with its unit, as time_s, got {', '.join(unknown[:9]) or 'none'}: "
+            "name it so, or give --rate-hz"
+        )
     timely = np.ones(len(next(iter(columns.values()), ())), dtype=bool)
     for key in columns.keys() & set(STAMPS):
         timely &= np.abs(columns[key]) < (np.inf if key == "time" else 2.0**53)

@@ -199,6 +199,11 @@ def test_columns_of_utc_are_a_clock():
         assert parse_text("\n".join(parts)).duration_s == pytest.approx(0.01, abs=1e-6)
 
 
+def test_tables_without_a_time_name_the_columns_that_may_be_it():
+    with pytest.raises(InvalidInputError, match="got clock of day: name it so, or give --rate-hz"):
+        parse_text("clock of day,acc_x,acc_y,acc_z\n1,0,0,9.8\n2,0,0,9.8")
+
+
 def test_acceleration_without_gravity_is_no_accelerometers_reading(s):
     for name, gravity in (("linear_acc", 0.0), ("User Acceleration", 0.0), ("linear_acceleration.", 9.8)):
         columns = [s["time_s"], s["gyroscope_rad_s"], np.tile([0.1, 0.2, gravity], (60, 1))]
