@@ -112,10 +112,10 @@ def usable_samples(log: ImuLog) -> tuple[IntArray, Samples, list[str]]:
     source = log.source or "log"
     before, log = len(log.notes), without_faults(log)
     notes, rate, force = list(log.notes[before:]), log.gyroscope_rad_s, log.accelerometer_m_s2
+    faults = [note for note in log.notes if note.startswith(("columns", "gyro", "accel"))]
     if rate is None or force is None:
         missing = (name for name, rows in (("gyroscope", rate), ("accelerometer", force)) if rows is None)
-        problems = [f"no {' and no '.join(missing)}"]
-        problems += [note for note in log.notes if note.startswith(("columns", "gyro", "accel"))]
+        problems = [f"no {' and no '.join(missing)}", *faults]
         if log.oriented.any():
             problems.append("--method sensor takes the sensor's own orientation")
         raise InsufficientDataError(
@@ -126,7 +126,8 @@ def usable_samples(log: ImuLog) -> tuple[IntArray, Samples, list[str]]:
     count = min(turns[rows].sum(), pulls[rows].sum())
     if count < 2:
         raise InsufficientDataError(
-            f"{source}: expected two samples of gyroscope and accelerometer or more, got {count}"
+            f"{source}: expected two samples of gyroscope and accelerometer or more, got "
+            + "; ".join([str(count), *faults])
         )
     steps_s = np.diff(log.time_s)
     median_s, fast = np.median(steps_s), np.percentile(np.linalg.norm(rate[turns], axis=1), _SHOWN_BY)
