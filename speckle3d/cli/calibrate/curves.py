@@ -108,5 +108,6 @@ def _report(curves: DecorrelationCurves) -> Result:
     error = f"+- {196 * curves.scale_sigma:.1f} % (95 %)"
     lines.append(f"lengths read with them on sweeps of a probe like this: {error}")
     if curves.tilt is None:
-        note("the phantom sweeps hardly turned: tilt will be taken to be about the image's centre")
+        why = "the phantom sweeps hardly turned" if curves.pairs_used else "no phantom was turned"
+        note(f"{why}: tilt will be taken to be about the image's centre")
     return by_depth | tilt | about, "\n".join(lines)
