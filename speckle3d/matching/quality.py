@@ -234,7 +234,7 @@ def describe(flags: npt.ArrayLike) -> list[str]:
     for flag, words in _WORDS.items():
         frames = np.flatnonzero(values & int(flag)).tolist()
         if frames:
-            rest_words = f" and {len(frames) - _LONGEST_LIST} more" if len(frames) > _LONGEST_LIST else ""
+            remainder = f" and {len(frames) - _LONGEST_LIST} more" if len(frames) > _LONGEST_LIST else ""
             numbers = ", ".join(map(str, frames[:_LONGEST_LIST]))
-            lines.append(f"{len(frames)} frame{'s' * (len(frames) > 1)} {words}: {numbers}{rest_words}")
+            lines.append(f"{len(frames)} frame{'s' * (len(frames) > 1)} {words}: {numbers}{remainder}")
     return lines

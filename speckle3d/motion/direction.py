@@ -115,11 +115,13 @@ def same_turns(sensor_turns: FloatArray, image_turns: FloatArray) -> int | None:
     """
     n = len(sensor_turns)
     trend = np.vander(np.linspace(-1, 1, n), 3)
-    ours, images = (v - trend @ np.linalg.lstsq(trend, v, rcond=None)[0] for v in (sensor_turns, image_turns))
-    product = float(np.sum(ours * images))
+    sensor_part, image_part = (
+        v - trend @ np.linalg.lstsq(trend, v, rcond=None)[0] for v in (sensor_turns, image_turns)
+    )
+    product = float(np.sum(sensor_part * image_part))
     # Variance of the sum of products of independent series with these autocovariances (Bartlett).
-    columns = zip(ours.T, images.T, strict=True)
+    columns = zip(sensor_part.T, image_part.T, strict=True)
     by_lag = sum(np.correlate(a, a, "full") * np.correlate(b, b, "full") for a, b in columns)
     by_chance = np.sqrt(max(float((1.0 - np.abs(np.arange(1 - n, n)) / n) @ by_lag) / n, 0.0))
-    nearly_equal = abs(product) > SAME_CORRELATION * np.linalg.norm(ours) * np.linalg.norm(images)
+    nearly_equal = abs(product) > SAME_CORRELATION * np.linalg.norm(sensor_part) * np.linalg.norm(image_part)
     return int(np.sign(product)) if nearly_equal or abs(product) > LEAST_DEVIATIONS * by_chance else None
