@@ -27,11 +27,8 @@ def length_claims(
     poses: Mapping[str, RigidTransform], claims: Mapping[str, float], centre_mm: FloatArray
 ) -> dict[str, tuple[float, float]]:
     """Length of each mode with a relative claim, all parts together, and its standard deviation, mm."""
-    lengths = part_lengths(poses, centre_mm)[1]
-    return {
-        mode: (float(lengths[mode].sum()), claim * float(lengths[mode].sum()))
-        for mode, claim in claims.items()
-    }
+    lengths = {mode: float(parts.sum()) for mode, parts in part_lengths(poses, centre_mm)[1].items()}
+    return {mode: (lengths[mode], claim * lengths[mode]) for mode, claim in claims.items()}
 
 
 def default_mode(reconstruction: Reconstruction) -> tuple[str, str]:

@@ -37,23 +37,6 @@ def test_fan_is_between_its_angles_and_radii(apex, angles, radii):
     np.testing.assert_array_equal(mask[sure], least[sure] > 0)
 
 
-@settings(max_examples=10, deadline=None)
-@given(seed=st.integers(0, 2**32 - 1), corners=st.integers(3, 8))
-def test_polygon_is_what_it_goes_round(seed, corners):
-    rng = np.random.default_rng(seed)
-    # A star round a point is simple, and mostly not convex.
-    turn = np.linspace(0, 2 * np.pi, corners, endpoint=False)
-    reach = rng.uniform(0.5, 5.0, corners)
-    outline = [4.5, 3.5] + reach[:, None] * np.column_stack([np.cos(turn), np.sin(turn)])
-    # Times a polygon goes round a point: angles between successive corners, summed.
-    away = outline - np.stack([X, Y], axis=-1)[..., None, :]
-    angle = np.arctan2(away[..., 1], away[..., 0])
-    steps = np.diff(np.concatenate([angle, angle[..., :1]], axis=-1))
-    rounds = np.rint(((steps + np.pi) % (2 * np.pi) - np.pi).sum(axis=-1) / (2 * np.pi))
-    # A corner of a star in general position hits no sample.
-    np.testing.assert_array_equal(Region("polygon " + _text(outline)).mask(GRID), rounds != 0)
-
-
 def test_the_part_of_the_images_that_a_region_needs():
     grid = ImageGrid(31, 57, 0.3, 0.1, 0.7, 0.06)
     region = Region("fan 4.5,-5 -20,25 7,9.5")
