@@ -41,9 +41,3 @@ def test_modules_that_a_page_names_exist(page):
     text = page.read_text()
     for path in re.findall(r"`((?:speckle3d|calibration|xsens)/[\w/]+(?:\.py)?)`", text):
         assert (ROOT / path).exists(), f"{page.name}: {path}"
-    for folder, names in re.findall(
-        r"`((?:speckle3d|calibration|xsens)/[\w/]+)` \((`\w+`(?:, `\w+`)*)\)", text
-    ):
-        for name in re.findall(r"`(\w+)`", names):
-            module = ROOT / folder / name
-            assert module.is_dir() or module.with_suffix(".py").exists(), f"{page.name}: {folder}/{name}"

@@ -37,6 +37,11 @@ def test_fan_is_between_its_angles_and_radii(apex, angles, radii):
     np.testing.assert_array_equal(mask[sure], least[sure] > 0)
 
 
+def test_a_polygon_with_the_corners_of_a_rectangle_is_that_rectangle():
+    masks = [Region(text).mask(GRID) for text in ("polygon 1,2 5,2 5,4.05 1,4.05", "rectangle 1,2 5,4.05")]
+    np.testing.assert_array_equal(*masks)
+
+
 def test_the_part_of_the_images_that_a_region_needs():
     grid = ImageGrid(31, 57, 0.3, 0.1, 0.7, 0.06)
     region = Region("fan 4.5,-5 -20,25 7,9.5")
