@@ -11,7 +11,7 @@ from speckle3d.core.arrays import FloatArray
 from xsens.logs.clocks import Stamps, require_rate, spread, timeline
 from xsens.logs.faults import without_faults
 from xsens.logs.samples import ImuLog
-from xsens.logs.worlds import Claim, nwu_from, quaternions_of, world_of
+from xsens.logs.worlds import Claim, nwu_from, quaternions_of, scalar_first, world_of
 
 
 @dataclass(frozen=True)
@@ -92,6 +92,10 @@ def assemble_log(parts: Parts, hints: Hints, source: str) -> ImuLog:
         oriented = np.asarray(np.isfinite(wxyz).all(axis=1))
         claim = parts.claim if hints.world is None else Claim(hints.world, "as given", final=True)
         world = "NWU" if claim is None else claim.world
+        if rows.shape[1] == 4 and not hints.as_stated:
+            wxyz, was_last = scalar_first(wxyz, parts.vectors[0])
+            if was_last:
+                notes.append("orientation: the scalar is the last number by its own accelerometer")
         if claim is not None and not hints.as_stated and oriented.any():
             world, world_notes = world_of(claim, wxyz, parts.vectors[0], parts.vectors[2])
             notes += world_notes

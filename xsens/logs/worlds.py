@@ -40,6 +40,10 @@ _UPRIGHT = 0.87
 _STEADY = 0.5
 """Shortest mean of the field's horizontal unit vectors that tells a direction: drift scatters them."""
 
+_TILT_DEG, _BETTER = 20.0, 3.0
+"""Tilt of the acceleration at rest, turned into the world, 90th percentile, beyond what movement makes of it
+(18 degrees where it adds 5 % to its length), and by how much less it is if the scalar stands last."""
+
 _NORTH_DEG = 30.0
 """A field within this of a world's north belongs to it: declinations where people live are less."""
 
@@ -101,6 +105,32 @@ def are_rotations(numbers: FloatArray) -> BoolArray:
 # -- worlds
 
 
+def scalar_first(quaternions: FloatArray, acceleration: FloatArray | None) -> tuple[FloatArray, bool]:
+    """Quaternions with the scalar first, and whether the acceleration shows that it was last."""
+    moved = np.roll(quaternions, 1, axis=1)
+    tilt, moved_tilt = (_tilt_deg(wxyz, acceleration) for wxyz in (quaternions, moved))
+    was_last = tilt > max(_TILT_DEG, _BETTER * moved_tilt)
+    return (moved if was_last else quaternions), was_last
+
+
+def _tilt_deg(wxyz: FloatArray, acceleration: FloatArray | None) -> float:
+    """Tilt of the acceleration at rest, turned into the world, 90th percentile; NaN if nothing tells it."""
+    vectors = _in_world(wxyz, acceleration)
+    if vectors is None:
+        return float("nan")
+    upright = np.abs(_at_rest(vectors) @ [0.0, 0.0, 1.0])
+    return float(np.degrees(np.arccos(np.clip(np.percentile(upright, 10), 0.0, 1.0))))
+
+
+def _at_rest(vectors: FloatArray) -> FloatArray:
+    """Directions of the accelerations whose length is the usual, of all if these are few, shape (n, 3)."""
+    length = np.linalg.norm(vectors, axis=1)
+    calm = np.abs(length - np.median(length)) < _AT_REST * np.median(length)
+    return np.asarray(
+        vectors[calm] / length[calm, None] if calm.sum() >= _FEWEST else vectors / length[:, None]
+    )
+
+
 def world_of(
     claim: Claim, wxyz: FloatArray, acceleration: FloatArray | None, field: FloatArray | None
 ) -> tuple[str, tuple[str, ...]]:
@@ -122,9 +152,7 @@ def world_of(
     if vectors is None:
         note = f"orientation: taken as {world}, {claim.by}: no accelerometer's reading tells"
         return world, ((note,) if claim.by_default else ())
-    length = np.linalg.norm(vectors, axis=1)
-    calm = np.abs(length - np.median(length)) < _AT_REST * np.median(length)
-    up = float(np.median(vectors[calm if calm.sum() >= _FEWEST else slice(None), 2]) / np.median(length))
+    up = float(np.median(_at_rest(vectors)[:, 2]))
     if abs(up) < _UPRIGHT:
         tilt = np.degrees(np.arccos(up))
         off = f"the orientation turns the accelerometer's reading {tilt:.0f} degrees from the vertical"

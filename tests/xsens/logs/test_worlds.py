@@ -43,6 +43,13 @@ def test_the_readings_say_which_world_it_is(s, world):
     assert ("not ENU" in note) == (world != "ENU")
 
 
+def test_the_accelerometer_tells_where_the_scalar_stands(s):
+    last_first = Rotation.from_quat(np.roll(s["world_from_sensor"].as_quat(), -1, axis=1))
+    log = parse_text(mt_manager(s, last_first))
+    assert off_deg(log, s["world_from_sensor"]) < UNNOTICED_DEG
+    assert "the scalar is the last number" in log.notes[0]
+
+
 def test_readings_against_the_orientation_raise_unless_hints_name_a_world(s):
     text = mt_manager(s, s["world_from_sensor"].inv())
     with pytest.raises(InvalidInputError, match=r"^text: .*ENU, NWU or NED, but .*vertical.*--world$"):
