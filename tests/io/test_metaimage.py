@@ -168,9 +168,10 @@ def test_a_number_of_a_frame_that_no_header_has_is_refused_at_once(tmp_path):
 def test_transforms_are_chosen_by_name(tmp_path):
     probe, reference, frames = frame_fields(3)
     path = write_mha(tmp_path / "a.mha", grey(), frames=frames)
-    relative = read_poses(path).readings.world_from_sensor
-    # Six digits were written: 1e-6 of a rotation, 1e-3 of hundreds of mm.
-    np.testing.assert_allclose(relative.as_matrix(), (reference.inv() * probe).as_matrix(), atol=3e-3)
+    for name in (None, "ProbeToReference"):
+        relative = read_poses(path, ImportSettings(tracker_transform=name)).readings.world_from_sensor
+        # Six digits were written: 1e-6 of a rotation, 1e-3 of hundreds of mm.
+        np.testing.assert_allclose(relative.as_matrix(), (reference.inv() * probe).as_matrix(), atol=3e-3)
     alone = read_poses(path, ImportSettings(reference_transform="none")).readings.world_from_sensor
     np.testing.assert_allclose(alone.as_matrix(), probe.as_matrix(), atol=1e-3)
     assert load_sweep(path, given_over(BMODE, tracker_transform="none")).tracker is None

@@ -94,13 +94,19 @@ def tracked_poses(
     name = _usual_pose(transforms, names) if tool_pose is None else tool_pose.removesuffix("Transform")
     if name is None or name == "none":
         return None
+    if reference is None and not _holds(transforms, name):
+        # Both may be there in a third frame: ProbeToReference is ProbeToTracker, from the reference.
+        tool, target = ends(name)
+        for world in dict.fromkeys(frame for transform in transforms for frame in ends(transform)):
+            if _holds(transforms, f"{tool}To{world}") and _holds(transforms, f"{target}To{world}"):
+                name, reference = f"{tool}To{world}", f"{target}To{world}"
     tool, world = ends(name)
     # A reference counts if both are tracked in the same world.
     fixed = f"ReferenceTo{world}" if reference is None else reference.removesuffix("Transform")
-    if reference is None and (tool == "Reference" or not {fixed, _back(fixed)} & {*transforms}):
+    if reference is None and (tool == "Reference" or not _holds(transforms, fixed)):
         fixed = "none"
     for transform in {name, fixed} - {"none"}:
-        if not {transform, _back(transform)} & {*transforms}:
+        if not _holds(transforms, transform):
             raise InvalidInputError(
                 f"{header.path}: expected a transform {transform}, got {', '.join(transforms) or 'none'}"
             )
@@ -116,6 +122,11 @@ def tracked_poses(
         faults = [next(filter(None, of_frame), "") for of_frame in reasons]
         chain.append(_back(fixed))
     return Poses(tool, tuple(chain), matrices, faults, pixels)
+
+
+def _holds(transforms: Sequence[str], name: str) -> bool:
+    """Whether a transform is among some, itself or its inverse."""
+    return name in transforms or _back(name) in transforms
 
 
 def fixed_transform(header: SequenceHeader, name: str) -> FloatArray | None:
