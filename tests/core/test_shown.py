@@ -16,7 +16,6 @@ def test_a_table_has_a_row_for_each_frame(tracking, sweep):
     pytest.importorskip("pandas")
     table = tracking.to_dataframe()
     assert len(table) == len(sweep)
-    assert table["length_mm"].iloc[-1] == pytest.approx(table["length_mm"].max(), abs=0.1)
     truth = np.abs(np.diff(sweep.truth.apply(sweep.grid.centre_mm), axis=0)).sum()
     assert table["length_mm"].iloc[-1] < truth
     assert (table["sigma_z_mm"].iloc[1:] > 0).all()

@@ -212,6 +212,11 @@ def _build(stamps: Stamps, key: Any, anew: BoolArray, notes: list[str]) -> Timel
         period_s = float(np.median(seconds[~anew])) if (~anew).any() else float("nan")
         if periods is None:
             periods, irregular = _by_clock(seconds, anew)
+            if stamps.period_s > 0.0 and not 1.0 / _AGREES < stamps.period_s / period_s < _AGREES:
+                stated_hz, rate_hz = 1.0 / stamps.period_s, 1.0 / period_s
+                notes.append(
+                    f"stated rate {stated_hz:g} Hz: by the times it is {rate_hz:.4g} Hz, which holds"
+                )
         else:
             _require_agreement(seconds[~anew], counts[~anew], 1.0 / stamps.period_s)
     else:

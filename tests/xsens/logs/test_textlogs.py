@@ -166,7 +166,9 @@ def test_steps_of_one_are_samples_unless_they_count_from_1970():
     with pytest.raises(InvalidInputError, match="--rate-hz"):
         parse_text(table(range(50)))
     assert parse_text(table(range(50)), Hints(rate_hz=100.0)).rate_hz == pytest.approx(100.0)
-    assert parse_text(table(1_714_600_000_000 + np.arange(50))).rate_hz == pytest.approx(1000.0)
+    contradiction = parse_text(table(1_714_600_000_000 + np.arange(50)), Hints(rate_hz=50.0))
+    assert contradiction.rate_hz == pytest.approx(1000.0)
+    assert "50 Hz" in contradiction.notes[-1]
     # Stamps of whole seconds: the samples of each are spread over it.
     assert parse_text(table(1_714_600_000 + np.arange(300) // 60)).rate_hz == pytest.approx(60.0)
     assert len(parse_text(table([5]))) == 1
