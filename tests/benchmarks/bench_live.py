@@ -71,7 +71,7 @@ def main():
     playing = context.Process(target=play, args=(options.sweep, options.seconds, answers))
     playing.start()
     with tempfile.TemporaryDirectory() as folder, Connection("127.0.0.1", answers.get()) as connection:
-        settings = SessionSettings(Path(folder) / "sweep.h5", imported=geometry, volume=True, check=True)
+        settings = SessionSettings(Path(folder) / "sweep.h5", importing=geometry, volume=True, check=True)
         Session(connection, [connection.send], curves, settings).run(options.seconds + 3.0)
         count, delays = answers.get()
         length = len(s3.load_sweep(settings.recording))
