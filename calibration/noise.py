@@ -235,21 +235,21 @@ def fit_noise(
     first = np.flatnonzero(np.diff(points.frame, prepend=points.frame[0] - 1))
     starts = several * np.append(first, len(points))
     frame_time_s = points.times[starts[:-1] // several]
-    beside = np.zeros((equations.offsets.size, 0)) if slopes is None else slopes
-    further, count = np.zeros(beside.shape[1]), len(free)
-    exact, expected = equations, np.zeros(len(beside))
-    effects = sensor_effects(equations, chain).reshape(len(beside), 6)
+    further_slopes = np.zeros((equations.offsets.size, 0)) if slopes is None else slopes
+    further, count = np.zeros(further_slopes.shape[1]), len(free)
+    exact, expected = equations, np.zeros(len(further_slopes))
+    effects = sensor_effects(equations, chain).reshape(len(further_slopes), 6)
     axes, shifts = _error_axes(effects, seen_as == "direction")
     in_mm = PROPORTIONS_MM if shifts.any() else PROPORTIONS_MM[:1]
     proportions = [np.where(shifts, np.rad2deg(mm), 1.0) for mm in in_mm]
-    lonely = len(starts) - 1 == len(beside)
+    lonely = len(starts) - 1 == len(further_slopes)
     grid = make_grid(effects @ axes.T, frame_time_s, proportions, (0.0,) if lonely else JITTER)
     for number in range(_STEPS):
         values, derivatives = exact.at(chain)
         # What was taken out of the points, put back as the small thing that it is.
-        residuals = values.ravel() + expected + beside @ further
-        jacobian = np.hstack([derivatives.reshape(len(beside), -1)[:, columns], beside])
-        effects = sensor_effects(exact, chain).reshape(len(beside), 6) @ axes.T
+        residuals = values.ravel() + expected + further_slopes @ further
+        jacobian = np.hstack([derivatives.reshape(len(further_slopes), -1)[:, columns], further_slopes])
+        effects = sensor_effects(exact, chain).reshape(len(further_slopes), 6) @ axes.T
         certainty, excess = np.zeros((2, count + len(further)))
         if prior is not None:
             certainty[:2] = (prior.pixel_mm * prior.error) ** -2.0

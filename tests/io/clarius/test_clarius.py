@@ -31,8 +31,8 @@ def require_equal(back, expected):
     assert back.signal == expected.signal
     ours, reference = back.orientation, expected.orientation
     np.testing.assert_array_equal(ours.readings.time_s, reference.readings.time_s)
-    apart = ours.readings.world_from_sensor.inv() * reference.readings.world_from_sensor
-    assert apart.magnitude().max() < 1e-9
+    difference = ours.readings.world_from_sensor.inv() * reference.readings.world_from_sensor
+    assert difference.magnitude().max() < 1e-9
     for name in ("accelerometer_m_s2", "gyroscope_rad_s", "magnetometer_au"):
         np.testing.assert_allclose(getattr(ours, name), getattr(reference, name), rtol=1e-12, atol=1e-14)
 
