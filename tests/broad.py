@@ -3,14 +3,15 @@
 from typing import NamedTuple
 
 import numpy as np
+import pytest
 import scipy.io
 from scipy.spatial.transform import Rotation
-from vqf import VQF, offlineVQF
 
 from xsens.fusion.orient import orient
 from xsens.logs.samples import ImuLog
 from xsens.logs.worlds import nwu_from
 
+vqf = pytest.importorskip("vqf")
 ONLINE = ("VQF on-line", "filter")
 OFFLINE = ("VQF off-line", "smoother")
 """VQF itself, as its authors publish it, and ours."""
@@ -51,8 +52,8 @@ def by_vqf(log, method):
     field = np.where(np.isfinite(log.magnetometer_au), log.magnetometer_au, 0.0)
     readings = [np.ascontiguousarray(v) for v in (log.gyroscope_rad_s, log.accelerometer_m_s2, field)]
     if method == "VQF on-line":
-        return VQF(1.0 / log.rate_hz).updateBatch(*readings)["quat9D"]
-    return offlineVQF(*readings, 1.0 / log.rate_hz)["quat9D"]
+        return vqf.VQF(1.0 / log.rate_hz).updateBatch(*readings)["quat9D"]
+    return vqf.offlineVQF(*readings, 1.0 / log.rate_hz)["quat9D"]
 
 
 def east_first(rotations):
