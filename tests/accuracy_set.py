@@ -127,6 +127,13 @@ def backwards(sweep):
     )
 
 
+def rounded_otherwise(sweep, seed):
+    """One sample in ten thousand is one more or less, as another processor's arithmetic would have it."""
+    frames = frames_of(sweep)
+    draw = np.random.default_rng(seed).integers(20_000, size=frames.shape, dtype=np.uint16)
+    return replace(sweep, frames=frames + (draw == 0).astype(frames.dtype) - (draw == 1).astype(frames.dtype))
+
+
 def grey(sweep):
     return received(sweep, 60.0)
 
@@ -161,10 +168,13 @@ CASES = {
 
 
 class AccuracySet:
-    """The sweeps of a folder that `simulate_set` has filled, tracked when they are asked for."""
+    """The sweeps of a folder that `simulate_set` has filled, tracked when they are asked for.
 
-    def __init__(self, folder, data_folder):
-        self.folder, self.data_folder, self.config = folder, data_folder, Config()
+    With a seed each is first `rounded_otherwise`.
+    """
+
+    def __init__(self, folder, data_folder, seed=None):
+        self.folder, self.data_folder, self.seed, self.config = folder, data_folder, seed, Config()
         # Of the instance, so that a test's change to another leaves this one alone.
         self.errors, self.curves = cache(self._errors), cache(self._curves)
 
@@ -176,6 +186,7 @@ class AccuracySet:
         elif file == "phantom":
             folder = self.data_folder
         sweep = load_sweep(folder / f"{file}.h5")
+        sweep = sweep if self.seed is None else rounded_otherwise(sweep, self.seed)
         return sweep if change is None else change(sweep)
 
     def _curves(self, kind, name):
