@@ -14,8 +14,9 @@ from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError, MismatchError
 from speckle3d.core.shown import shown
 from xsens.fusion.engines import Filter
-from xsens.fusion.readings import FASTEST_RAD_S, PAUSE_S, Samples, lost_variance, require_metres
+from xsens.fusion.readings import FASTEST_RAD_S, PAUSE_S, Samples, lost_variance
 from xsens.fusion.settings import LOST, FusionSettings
+from xsens.logs.contradictions import not_in_metres
 from xsens.logs.faults import LIMITS
 from xsens.logs.samples import VECTORS
 
@@ -137,8 +138,8 @@ class OnlineFilter:
         estimate = self._filter.run(Samples(*map(np.array, zip(*self._pending, strict=True))))
         self._pending = []
         if len(last := self._filter.last):
-            if last["started"][0]:
-                require_metres(self._filter.start_force_m_s2, "accelerometer_m_s2")
+            if last["started"][0] and (problem := not_in_metres(self._filter.start_force_m_s2)):
+                raise InvalidInputError(f"accelerometer_m_s2: {problem}")
             self._state = OnlineState(
                 Rotation.from_quat(estimate.xyzw[-1]),
                 estimate.sd_rad[-1],

@@ -14,9 +14,6 @@ from xsens.logs.contradictions import contradictions
 from xsens.logs.faults import without_faults
 from xsens.logs.samples import ImuLog, finite_rows
 
-FORCE_M_S2 = (4.0, 25.0)
-"""Limits of the median of the accelerometer's norm if it is in m/s^2."""
-
 PAUSE_S = 1.25 * BRIDGED_S
 """A longer step is a pause. Steps of a clock of 10 Hz vary by rounding, and by jitter."""
 
@@ -136,19 +133,27 @@ def usable_samples(log: ImuLog) -> tuple[IntArray, Samples, list[str]]:
             f"{source}: expected samples {SHORTEST_S:g} to {BRIDGED_S:g} s apart, got a median of "
             f"{median_s:.4g} s: times in milliseconds?"
         )
-    require_metres(force[pulls], source)
     if fast > FASTEST_RAD_S:
         raise InvalidInputError(
             f"{source}: expected a gyroscope in rad/s, got one in a hundred over {fast:.3g}: in deg/s?"
         )
-    notes += _agreement(log, source)
+    against = contradictions(log)
+    agrees = against.get("accelerometer") == ""
+    fatal = ("gravity", *(() if agrees else ("accelerometer", "own orientation")))
+    if problem := next(filter(None, map(against.get, fatal)), ""):
+        raise InvalidInputError(f"{source}: {problem}")
+    notes += filter(None, against.values())
+    field = log.magnetometer_au
+    if against.get("magnetometer"):
+        field = None
+        notes.append("the magnetometer is left out")
     if left_out := len(log) - rows.size:
         notes.append(f"{left_out} samples without gyroscope or accelerometer left out")
     rate, force, turns, pulls, time_s = rate[rows], force[rows], turns[rows], pulls[rows], log.time_s[rows]
     for name, valid in (("gyroscope", turns), ("accelerometer", pulls)):
         if not valid.all():
             notes.append(f"{int((~valid).sum())} {name} readings missing: interpolated")
-    field = np.full((rows.size, 3), np.nan) if log.magnetometer_au is None else log.magnetometer_au[rows]
+    field = np.full((rows.size, 3), np.nan) if field is None else field[rows]
     step_s = np.diff(time_s, prepend=time_s[0] - np.median(np.diff(time_s)))
     lost_rad2 = np.zeros(rows.size)
     lost_rad2[np.flatnonzero(turns)[1:]] = lost_variance(time_s[turns], rate[turns], float(np.median(step_s)))
@@ -164,18 +169,6 @@ def lost_variance(time_s: FloatArray, rate_rad_s: FloatArray, usual_s: float) ->
     step_s, change = np.diff(time_s), np.diff(rate_rad_s, axis=0)
     gap = (step_s > LOST * usual_s) & (step_s <= PAUSE_S)
     return np.where(gap, step_s**2 * np.einsum("ij,ij->i", change, change), 0.0)
-
-
-def _agreement(log: ImuLog, source: str) -> list[str]:
-    """Refuse a log whose gyroscope the accelerometer contradicts, or else its own orientation.
-
-    An orientation that contradicts both is noted.
-    """
-    sentences = contradictions(log)
-    against = [text for text in sentences.values() if text]
-    if not against or sentences.get("accelerometer") == "":
-        return against
-    raise InvalidInputError(f"{source}: {against[0]}")
 
 
 def _interpolated_means(
@@ -195,17 +188,6 @@ def _interpolated_means(
     means = readings.copy()
     means[late] = 0.5 * ((1.0 + share) * readings[late] + (1.0 - share) * readings[late - 1])
     return means
-
-
-def require_metres(force_m_s2: FloatArray, source: str) -> None:
-    """Raise `InvalidInputError` if an accelerometer, shape (m, 3), is not in m/s^2."""
-    median = float(np.median(np.linalg.norm(force_m_s2, axis=1)))
-    low, high = FORCE_M_S2
-    if not low < median < high:
-        raise InvalidInputError(
-            f"{source}: expected an accelerometer in m/s^2, with norm near 9.8, got a median of {median:.3g}"
-            + (": in g, without saying so?" if 0.9 < median < 1.1 else "")
-        )
 
 
 def _near(time_s: FloatArray, valid: BoolArray) -> BoolArray:

@@ -144,29 +144,33 @@ def timeline(stamps: Stamps) -> Timeline:
         If there is neither a clock nor a counter with a known and possible period, or the times contradict
         the period.
     """
-    if stamps.time_s is None and stamps.period_s > 0.0:
+    numbers = None if stamps.counter is None else _sample_numbers(stamps.counter, stamps.extras)
+    values = stamps.time_s
+    if values is None:
+        if numbers is None or not stamps.period_s > 0.0:
+            evidence = "neither" if numbers is None else "a counter, but no rate"
+            raise InvalidInputError(
+                f"expected samples with a clock, or with a sampling rate, got {evidence}: give --rate-hz"
+            )
         require_rate(1.0 / stamps.period_s, "sampling rate")
-    elif stamps.time_s is None:
-        evidence = "neither" if stamps.counter is None else "a counter, but no rate"
-        raise InvalidInputError(
-            f"expected samples with a clock, or with a sampling rate, got {evidence}: give --rate-hz"
-        )
-    key, starts = _rising(stamps)
-    notes, rows = list[str](), None
-    if (np.diff(key) < 0).any():
-        rows = np.argsort(key, kind="stable")
-        rank = np.argsort(rows)
-        late = int((rank < np.maximum.accumulate(rank)).sum())
+        values = numbers * stamps.period_s
+    anew = _new_starts(values, stamps)
+    if anew.any():  # each start far behind all before it, to sort them
+        steps = np.diff(values)
+        steps[anew[1:]] = LATE * _usual_step(steps)
+        values = _running_sums(steps)
+    notes, rows = list[str](), np.argsort(values, kind="stable")
+    rank = np.argsort(rows)
+    if late := int((rank < np.maximum.accumulate(rank)).sum()):
         notes.append(f"{late} samples came out of order and were sorted")
-        key = key[rows]
-    distinct = np.append(True, np.diff(key) > 0)
+    distinct = np.append(True, np.diff(values[rows]) > 0.0)
     if left_out := int((~distinct).sum()):
-        rows = (np.arange(distinct.size) if rows is None else rows)[distinct]
         notes.append(f"{left_out} samples at the time of another were left out")
-        key = key[distinct]
-    if rows is None:
-        return _build(stamps, key, starts[1:], notes)
-    return replace(_build(stamps[rows], key, np.diff(np.cumsum(starts)[rows]) > 0, notes), rows=rows)
+        rows = rows[distinct]
+    if not (late or left_out):
+        return _build(stamps, values, numbers, anew[1:], notes)
+    anew, numbers = np.diff(np.cumsum(anew)[rows]) > 0, None if numbers is None else numbers[rows]
+    return replace(_build(stamps[rows], values[rows], numbers, anew, notes), rows=rows)
 
 
 def _running_sums(steps: Any) -> Any:
@@ -176,14 +180,25 @@ def _running_sums(steps: Any) -> Any:
     return sums
 
 
-def _rising(stamps: Stamps) -> tuple[Any, BoolArray]:
-    """Times, or else counts, made to rise at new starts; new starts.
+def _usual_step(steps: FloatArray) -> float:
+    return float(np.median(steps[steps > 0])) if (steps > 0).any() else 1.0
 
-    A step far back shows a new start, unless those overtaken were followed by a jump forward to where it was.
+
+def _sample_numbers(counter: IntArray, extras: IntArray | None) -> FloatArray:
+    """Numbers of samples by the counter, which may count several for each, and other messages."""
+    numbers = counter if extras is None else counter - extras
+    usual, often = np.unique(np.diff(numbers), return_counts=True)
+    stride = int(np.gcd.reduce(np.maximum(usual[often >= max(_RARE * numbers.size, 1.0)], 0))) or 1
+    return np.asarray(numbers / stride)
+
+
+def _new_starts(values: FloatArray, stamps: Stamps) -> BoolArray:
+    """Mark the samples before which the sensor was started anew.
+
+    A step far back shows it, unless those overtaken were followed by a jump forward to where it was.
     """
-    values: Any = stamps.counter if stamps.time_s is None else stamps.time_s
     steps = np.diff(values)
-    usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else 1.0
+    usual = _usual_step(steps)
     anew = np.zeros(values.size, dtype=bool)
     back = np.flatnonzero(steps < -LATE * usual)
     anew[back + 1] = True
@@ -195,33 +210,27 @@ def _rising(stamps: Stamps) -> tuple[Any, BoolArray]:
     elif stamps.computer_s is not None:
         anew |= np.isfinite(stamps.computer_s)
     anew[0] = False
-    if anew.any():
-        steps[anew[1:]] = LATE * usual
-        values = _running_sums(steps)
-    return values, anew
+    return anew
 
 
-def _build(stamps: Stamps, key: Any, anew: BoolArray, notes: list[str]) -> Timeline:
+def _build(
+    stamps: Stamps, values: FloatArray, numbers: FloatArray | None, anew: BoolArray, notes: list[str]
+) -> Timeline:
     """Times, rising counter and gaps of samples in order, without repeats."""
-    period_s, irregular, periods = stamps.period_s, False, None
-    if stamps.counter is not None:
-        counts = np.diff(stamps.counter)
-        periods = _by_counter(counts if stamps.extras is None else counts - np.diff(stamps.extras), anew)
-    if stamps.time_s is not None:
-        seconds = np.diff(key)
-        period_s = float(np.median(seconds[~anew])) if (~anew).any() else float("nan")
-        if periods is None:
-            periods, irregular = _by_clock(seconds, anew)
-            if stamps.period_s > 0.0 and not 1.0 / _AGREES < stamps.period_s / period_s < _AGREES:
-                stated_hz, rate_hz = 1.0 / stamps.period_s, 1.0 / period_s
-                notes.append(
-                    f"stated rate {stated_hz:g} Hz: by the times it is {rate_hz:.4g} Hz, which holds"
-                )
-        else:
-            _require_agreement(seconds[~anew], counts[~anew], 1.0 / stamps.period_s)
+    seconds, irregular = np.diff(values), False
+    period_s = float(np.median(seconds[~anew])) if (~anew).any() else float("nan")
+    stated_hz = 1.0 / stamps.period_s
+    if numbers is None:
+        periods, irregular = _by_clock(seconds, anew)
+        if stated_hz > 0.0 and not 1.0 / _AGREES < stated_hz * period_s < _AGREES:
+            rate = f"{1.0 / period_s:.4g} Hz"
+            notes.append(f"stated rate {stated_hz:g} Hz: by the times it is {rate}, which holds")
     else:
-        assert periods is not None  # there is a clock or a counter
-        seconds = periods * period_s
+        assert stamps.counter is not None
+        periods = np.maximum(np.diff(numbers), 1.0)
+        if stamps.time_s is None:
+            period_s, seconds = stamps.period_s, periods * stamps.period_s
+        _require_agreement(seconds[~anew], np.diff(stamps.counter)[~anew], stated_hz)
     if irregular:
         shortest, longest = 1e3 * seconds.min(), 1e3 * seconds.max()
         notes.append(
@@ -243,7 +252,7 @@ def _build(stamps: Stamps, key: Any, anew: BoolArray, notes: list[str]) -> Timel
     if time_s is None or anew.any():
         time_s = (0.0 if time_s is None else time_s[0]) + _running_sums(seconds)
     if counter is not None:
-        counter = counter[0] + _running_sums(np.maximum(counts, 1))
+        counter = counter[0] + _running_sums(np.maximum(np.diff(counter), 1))
     return Timeline(slice(None), time_s, counter, gaps, tuple(notes))
 
 
@@ -257,13 +266,6 @@ def _require_agreement(seconds: FloatArray, counts: IntArray, stated_hz: float) 
         raise InvalidInputError(
             f"expected times at the stated rate, {stated_hz:g} Hz, got {rates[0]:.4g} Hz by their clock"
         )
-
-
-def _by_counter(counts: IntArray, anew: BoolArray) -> FloatArray:
-    """Sampling periods of each step of the counter; a sensor may count several for each sample."""
-    usual, often = np.unique(counts[~anew] if anew.any() else counts, return_counts=True)
-    stride = int(np.gcd.reduce(np.maximum(usual[often >= max(_RARE * counts.size, 1.0)], 0))) or 1
-    return np.maximum(counts / stride, 1.0)
 
 
 def _by_clock(seconds: FloatArray, anew: BoolArray) -> tuple[FloatArray, bool]:

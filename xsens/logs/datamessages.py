@@ -8,19 +8,18 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
+from speckle3d.core.arrays import BoolArray, IntArray
 from speckle3d.core.errors import InvalidInputError
 from xsens.logs.clocks import COUNTS, TICK_S, TICKS, Stamps, unwrap
 from xsens.logs.faults import at_ends
 from xsens.logs.parts import Parts
 from xsens.logs.samples import VECTORS
-from xsens.logs.worlds import Claim, quaternions_of
+from xsens.logs.worlds import Claim
 from xsens.messages.control import Configuration, MessageId, utc_time_s
 from xsens.messages.framing import Frames, Message
 from xsens.messages.mtdata import DataLayout, OutputMode, as_floats
-from xsens.messages.mtdata2 import ORIENTATIONS, STAMPS, read_items
+from xsens.messages.mtdata2 import MEASURED, ORIENTATIONS, STAMPS, read_items
 from xsens.messages.rawcounts import BLOCK_SIZE, COMPENSATION_NOTE, RawCalibration
 
 _STARTS = (MessageId.WAKE_UP, MessageId.GO_TO_MEASUREMENT_ACK, MessageId.UTC_TIME)
@@ -148,15 +147,6 @@ def mtdata2_samples(frames: Frames, indices: IntArray) -> Parts:
         None if stamp is None else unwrap(stamp[rows, 0].astype(np.int64), span)
         for stamp, span in zip(stamps, (COUNTS, TICKS), strict=True)
     )
-    force, rate = items.get("acceleration_m_s2"), items.get("rate_of_turn_rad_s")
-    increments = []
-    if force is None and (force := items.get("delta_v_m_s")) is not None:
-        notes.append("acceleration is the sensor's velocity increments over its sampling period")
-        increments.append(VECTORS[0])
-    if rate is None and (turns := items.get("delta_q_wxyz")) is not None:
-        rate = _rotation_vectors(turns)
-        notes.append("rate of turn is the sensor's orientation increments over its sampling period")
-        increments.append(VECTORS[1])
     notation = next((name for name in ORIENTATIONS if name in items), None)
     orientations = None if notation is None else items[notation]
     if orientations is not None and notation == ORIENTATIONS[1]:
@@ -168,17 +158,9 @@ def mtdata2_samples(frames: Frames, indices: IntArray) -> Parts:
             time_s=None if ticks is None else ticks * TICK_S,
             extras=extras,
         ),
-        (force, rate, items.get("magnetic_field_au")),
+        tuple(map(items.get, MEASURED)),
         orientations,
         Claim(world or "NWU", "as its messages say"),
         tuple(notes),
-        tuple(increments),
+        (items.get("delta_v_m_s"), items.get("delta_q_wxyz")),
     )
-
-
-def _rotation_vectors(wxyz: FloatArray) -> FloatArray:
-    """Rotation vectors of quaternions; NaN of those that are damage."""
-    wxyz = quaternions_of(wxyz)
-    finite = np.isfinite(wxyz)
-    turns = Rotation.from_quat(np.where(finite, wxyz, 1.0), scalar_first=True)
-    return np.where(finite[:, :1], turns.as_rotvec(), np.nan)

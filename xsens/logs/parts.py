@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 from speckle3d.core.arrays import FloatArray
 from xsens.logs.clocks import Stamps, require_rate, spread, timeline
 from xsens.logs.faults import without_faults
-from xsens.logs.samples import ImuLog
-from xsens.logs.worlds import Claim, nwu_from, quaternions_of, scalar_first, world_of
+from xsens.logs.samples import VECTORS, ImuLog
+from xsens.logs.worlds import Claim, likelier, nwu_from, quaternions_of, world_of
 
 
 @dataclass(frozen=True)
@@ -53,12 +53,15 @@ class Parts:
     ----------
     stamps : Stamps
     vectors : tuple of ndarray, shape (m, 3), or None
-        Readings of accelerometer, gyroscope and magnetometer; those named in `increments` are times the
-        sampling period.
+        Readings of accelerometer, gyroscope and magnetometer.
     orientations : ndarray, optional
         The sensor's own, in a notation of `quaternions_of`.
     claim : Claim, optional
         Its world; None for one that has nothing to do with north and up.
+    increments : tuple of ndarray, shapes (m, 3) and (m, 3) or (m, 4), or None
+        Of velocity, and of orientation as rotation vector or quaternion, over each sampling period.
+    otherwise : ndarray, optional
+        Orientations if the numbers mean something else, as `otherwise_note` says.
     """
 
     stamps: Stamps
@@ -66,7 +69,9 @@ class Parts:
     orientations: FloatArray | None = None
     claim: Claim | None = None
     notes: tuple[str, ...] = ()
-    increments: tuple[str, ...] = ()
+    increments: tuple[FloatArray | None, FloatArray | None] = (None, None)
+    otherwise: FloatArray | None = None
+    otherwise_note: str = ""
 
 
 def assemble_log(parts: Parts, hints: Hints, source: str) -> ImuLog:
@@ -78,48 +83,65 @@ def assemble_log(parts: Parts, hints: Hints, source: str) -> ImuLog:
         If they have neither a clock, nor a rate; if orientation and acceleration contradict each other; or if
         they are of several sensors.
     """
-    stamps, notes, rows = parts.stamps, list(parts.notes), parts.orientations
+    stamps, notes, rows, vectors = parts.stamps, list(parts.notes), parts.orientations, list(parts.vectors)
     if hints.rate_hz is not None:
         stamps = replace(stamps, period_s=1.0 / hints.rate_hz)
+    scaled = []
+    for i, part in enumerate(parts.increments):
+        if part is not None and vectors[i] is None:
+            vectors[i] = _rotation_vectors(part)
+            scaled.append(VECTORS[i])
+            notes.append(f"{VECTORS[i].split('_')[0]}: increments over the sampling period")
     has_counter = stamps.counter is not None
     if not has_counter and stamps.time_s is None and stamps.period_s > 0.0:
-        samples = next(len(v) for v in (stamps.starts, *parts.vectors, rows) if v is not None)
+        samples = next(len(v) for v in (stamps.starts, *vectors, rows) if v is not None)
         stamps = replace(stamps, counter=np.arange(samples))
         notes.append("samples have no counter: losses cannot be found")
     rotations, oriented = None, np.zeros(0, dtype=bool)
     if rows is not None:
         wxyz = quaternions_of(rows)
+        if parts.otherwise is not None:
+            notations = [wxyz, quaternions_of(parts.otherwise)]
+            if best := likelier(notations, vectors[0]):
+                wxyz = notations[best]
+                notes.append(f"orientation: {parts.otherwise_note}, by its own accelerometer")
         oriented = np.asarray(np.isfinite(wxyz).all(axis=1))
         claim = parts.claim if hints.world is None else Claim(hints.world, "as given", final=True)
         world = "NWU" if claim is None else claim.world
-        if rows.shape[1] == 4 and not hints.as_stated:
-            wxyz, was_last = scalar_first(wxyz, parts.vectors[0])
-            if was_last:
-                notes.append("orientation: the scalar is the last number by its own accelerometer")
         if claim is not None and not hints.as_stated and oriented.any():
-            world, world_notes = world_of(claim, wxyz, parts.vectors[0], parts.vectors[2])
+            world, world_notes = world_of(claim, wxyz, vectors[0], vectors[2])
             notes += world_notes
         rotations = nwu_from(world) * Rotation.from_quat(
             np.where(oriented[:, None], wxyz, 0.5), scalar_first=True
         )
         if not oriented.all():
             notes.append(f"{int((~oriented).sum())} samples lack the sensor's own orientation")
-    stamps, burst_notes = spread(stamps, (*parts.vectors, rows))
+    stamps, burst_notes = spread(stamps, (*vectors, rows))
     notes += burst_notes
     line = timeline(stamps)
-    force, rate, field = (None if vectors is None else vectors[line.rows] for vectors in parts.vectors)
+    oriented = oriented[line.rows] if oriented.any() else oriented[:0]
+    force, rate, field = (None if readings is None else readings[line.rows] for readings in vectors)
     log = ImuLog(
         line.time_s,
         force,
         rate,
         field,
-        rotations[line.rows] if rotations is not None and oriented.any() else None,
+        rotations[line.rows] if rotations is not None and oriented.size else None,
         line.counter if has_counter else None,
         line.gaps,
         (*notes, *line.notes),
         source,
-        oriented[line.rows] if oriented.any() else np.zeros(0, dtype=bool),
+        oriented,
     )
-    for name in parts.increments:
-        log = replace(log, **{name: getattr(log, name) * log.rate_hz})
+    log = replace(log, **{name: getattr(log, name) * log.rate_hz for name in scaled})
     return without_faults(log)
+
+
+def _rotation_vectors(numbers: FloatArray) -> FloatArray:
+    """Rotation vectors of quaternions, NaN of those that are damage; vectors as they are."""
+    if numbers.shape[1] == 3:
+        return numbers
+    wxyz = quaternions_of(numbers)
+    finite = np.isfinite(wxyz)
+    turns = Rotation.from_quat(np.where(finite, wxyz, 1.0), scalar_first=True)
+    return np.where(finite[:, :1], turns.as_rotvec(), np.nan)

@@ -67,7 +67,10 @@ _GRAVITY_M_S2 = 4.0
 _VECTORS = [[f"{quantity}_{axis}" for axis in "xyz"] for quantity in ("acc", "gyr", "mag")]
 _EULER = ["euler_roll", "euler_pitch", "euler_yaw"]
 _MATRIX = [f"mat_{row}_{column}" for row in "123" for column in "123"]
-_QUATERNION, _OPTICAL = ([f"{source}_{axis}" for axis in "wxyz"] for source in ("quat", "optical"))
+_QUATERNION, _OPTICAL, _TURNS = (
+    [f"{source}_{axis}" for axis in "wxyz"] for source in ("quat", "optical", "dq")
+)
+_VELOCITY_STEPS = [f"dv_{axis}" for axis in "xyz"]
 
 
 def parse_text(text: str | Iterable[str], hints: Hints | None = None, source: str = "text") -> ImuLog:
@@ -172,28 +175,31 @@ def _samples(table: TextTable, rate_hz: float | None) -> Parts:
             notes.append("acceleration without gravity is no accelerometer's reading and was left out")
     plain = "time" in table.columns
     odd = _unknown_columns(table, plain)
-    claim = None
+    increments = (_side_by_side(columns, _VELOCITY_STEPS), _side_by_side(columns, _TURNS))
+    claim = otherwise = None
+    otherwise_note = "the scalar is the last number"
     if (orientation := _side_by_side(columns, _OPTICAL)) is not None:
         notes.append("orientation: by cameras, in a world of their own: x and z need not be north and up")
     else:
         claim = _claim(table, plain, dot)
         notations = (_side_by_side(columns, keys) for keys in (_QUATERNION, _MATRIX, _EULER))
         orientation = next((rows for rows in notations if rows is not None), None)
-        if (
-            plain
-            and orientation is not None
-            and orientation.shape[1] == 3
-            and table.names
-            and "euler_roll" not in table.with_unit
-        ):
-            orientation = orientation * _degrees(orientation, force)
-    if all(part is None for part in (force, rate, field, orientation)):
+        if orientation is not None and orientation.shape[1] == 4:
+            otherwise = np.roll(orientation, 1, axis=1)
+        elif orientation is not None and _unit_open(table, plain, orientation):
+            otherwise, otherwise_note = np.degrees(orientation), "angles are in radians"
+            if force is None:
+                raise InvalidInputError(
+                    "expected angles with their unit, as roll_deg, got small ones without"
+                )
+    if all(part is None for part in (force, rate, field, orientation, *increments)):
         columns_text = "; ".join(odd) or describe_unknown(table.names)
         raise InvalidInputError(
             f"expected columns of acceleration, rate of turn, field or orientation, {columns_text}"
         )
     stamps = Stamps(counter, time_s, period_s)
-    return Parts(stamps, (force, rate, field), orientation, claim, (*odd, *notes))
+    vectors, all_notes = (force, rate, field), (*odd, *notes)
+    return Parts(stamps, vectors, orientation, claim, all_notes, increments, otherwise, otherwise_note)
 
 
 def _usual_step(times: FloatArray) -> float:
@@ -209,21 +215,10 @@ def _unit_of(times: FloatArray, units: dict[str, float]) -> str | None:
     return next((unit for unit, scale in units.items() if low <= value * scale <= high), None)
 
 
-def _degrees(angles: FloatArray, force: FloatArray | None) -> float:
-    """Scale to degrees of angles without a unit: gravity tells small degrees from radians."""
-    if np.nanmax(np.abs(angles), initial=0.0) > _HALF_TURN:
-        return 1.0
-    if force is None:
-        raise InvalidInputError(
-            "expected angles with their unit, as roll_deg, got none beyond half a turn in rad"
-        )
-    up = force / np.linalg.norm(force, axis=1)[:, None]
-    off = {}
-    for scale in (1.0, 180.0 / np.pi):
-        roll, pitch, _ = np.deg2rad(scale * angles).T
-        gravity = [-np.sin(pitch), np.sin(roll) * np.cos(pitch), np.cos(roll) * np.cos(pitch)]
-        off[float(np.nanmedian(1.0 - np.abs(np.einsum("nj,jn->n", up, gravity))))] = scale
-    return off[min(off)]
+def _unit_open(table: TextTable, plain: bool, angles: FloatArray) -> bool:
+    """Whether angles name no unit and may be in radians."""
+    unnamed = plain and bool(table.names) and "euler_roll" not in table.with_unit
+    return unnamed and angles.shape[1] == 3 and np.nanmax(np.abs(angles), initial=0.0) < _HALF_TURN
 
 
 def _utc_s(columns: dict[str, FloatArray]) -> FloatArray | None:

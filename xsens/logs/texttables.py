@@ -39,51 +39,60 @@ _DIGIT = re.compile("[0-9]")
 # -- names of columns
 
 _DEG = 0.017453292519943295
-_FIELD_UNITS = ("au", "a_u", "ut", "µt", "nt", "mt", "t", "gauss", "g", "mgauss", "local_flux")
 TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}
-_COLUMNS = (
-    ("acc", "acc(?:el(?:eration|erometers?)?)?|a", "[xyz]"),
-    ("free", "(?:free|lin(?:ear)?|user)_?(?:acc(?:el(?:eration)?)?)?", "[xyzenu]"),
-    ("gyr", "gyro?(?:scopes?)?|angular_(?:velocity|rate)|as|[gw]", "[xyz]"),
-    ("mag", "mag(?:n|neto|netometers?|netic)?(?:_field)?|[mh]", "[xyz]"),
-    ("quat", "quat(?:ernion)?(?:_?q)?|q|orientation", "[wxyz0-3]|scalar"),
-    ("euler", "(?:euler)?", "roll|pitch|yaw|(?<=euler_)[xyz]"),
-    ("euler", "angle", "[xyz]"),
-    ("mat", "mat", "[1-3]_[1-3]"),
-    ("optical", "vicon_orientation", "[wxyz]"),
+_FORCES = {"m_s2": 1.0, "m_s_2": 1.0, "m_s_s": 1.0, "g": g, "mg": 1e-3 * g}
+_RATES = {
+    f"{unit}{power}": scale
+    for units, scale in (("rad_s", 1.0), ("mrad_s", 1e-3), ("deg_s dps °_s", _DEG), ("mdps", 1e-3 * _DEG))
+    for unit in units.split()
+    for power in ("", "_1")
+}
+_FIELDS = dict.fromkeys(
+    ("au", "a_u", "ut", "µt", "nt", "mt", "t", "gauss", "g", "mgauss", "mg", "local_flux"), 1.0
+)
+_ANGLES = {"deg": 1.0, "°": 1.0, "rad": 1.0 / _DEG}
+_NUMBERED = {"0": "w", "1": "x", "2": "y", "3": "z", "scalar": "w"}
+_ROLLING = {"x": "roll", "y": "pitch", "z": "yaw"}
+
+_COLUMNS: tuple[tuple[str, str, str, Mapping[str, float], Mapping[str, str]], ...] = (
+    ("acc", "acc(?:el(?:eration|erometers?)?)?|a", "[xyz]", _FORCES, {}),
+    ("acc", "accelerometer_?acceleration", "[xyz]", {"g": -g}, {}),  # as iOS has it: gravity, not the force
+    ("free", "(?:free|lin(?:ear)?|user)_?(?:acc(?:el(?:eration)?)?)?", "[xyzenu]", _FORCES, {}),
+    ("dv", "dv|delta_?v|vel(?:ocity)?_?inc(?:rement)?", "[xyz1-3]", {}, _NUMBERED),
+    ("gyr", "gyro?(?:scopes?)?(?:_?rotation)?|angular_(?:velocity|rate)|as|[gw]", "[xyz]", _RATES, {}),
+    ("dq", "(?:dq|delta_?q|ori(?:entation)?_?inc(?:rement)?)(?:_?q)?", "[wxyz0-3]", {}, _NUMBERED),
+    ("mag", "mag(?:n|neto|netometers?|netic)?(?:_field)?|[mh]", "[xyz]", _FIELDS, {}),
+    ("quat", "quat(?:ernion)?(?:_?q)?|q|orientation", "[wxyz0-3]|scalar", {}, _NUMBERED),
+    ("euler", "(?:euler)?", "roll|pitch|yaw|(?<=euler_)[xyz]", _ANGLES, _ROLLING),
+    ("euler", "angle", "[xyz]", _ANGLES, _ROLLING),
+    ("mat", "mat", "[1-3]_[1-3]", {}, {}),
+    ("optical", "vicon_orientation", "[wxyz]", {}, {}),
     (
         "time",
         "(?:(?:sample|system|sensor|elapsed|date|local|chip)_?)?time(?:_?stamp)?|ts?|epoch|(?:s_)?elapsed",
         "",
+        TIMES,
+        {},
     ),
-    ("counter", "(?:packet|sample)?_?(?:counter|number|index)|(?:frame|sample)_?(?:number|no)?|seq", ""),
-    ("ticks", "sampletimefine", ""),
-    ("utc", "utc", "year|month|day|hour|minute|s|nano"),
-)
-"""Quantity, its names with other characters than letters and digits as underscores, and those of its axes."""
-
-_PATTERNS = [
     (
-        quantity,
-        re.compile(
-            rf"(?:(?:imu|field|sensor|shimmer(?:_[0-9a-f]{{4}})?)_)*(?:{names})(?:_rs_s|_ln|_wr|_unix|_startup)?_?({axes})(?:_cal)?(?:_(.+))?$"
-        ),
-    )
-    for quantity, names, axes in _COLUMNS
-]
-_FORCE_UNITS = {"m_s2": 1.0, "m_s_2": 1.0, "m_s_s": 1.0, "g": g, "mg": 1e-3 * g}
-_RATE_UNITS = (
-    {"rad_s": 1.0, "mrad_s": 1e-3} | dict.fromkeys(("deg_s", "dps", "°_s"), _DEG) | {"mdps": 1e-3 * _DEG}
+        "counter",
+        "(?:packet|sample)?_?(?:counter|number|index)|(?:frame|sample)_?(?:number|no)?|seq",
+        "",
+        {},
+        {},
+    ),
+    ("ticks", "sampletimefine", "", {}, {}),
+    ("utc", "utc", "year|month|day|hour|minute|s|nano", {}, {}),
 )
-_UNITS = {
-    "acc": _FORCE_UNITS,
-    "free": _FORCE_UNITS,
-    "gyr": {f"{unit}{power}": scale for unit, scale in _RATE_UNITS.items() for power in ("", "_1")},
-    "mag": dict.fromkeys(_FIELD_UNITS, 1.0),
-    "euler": {"deg": 1.0, "°": 1.0, "rad": 1.0 / _DEG},
-    "time": TIMES,
-}
-"""Units by quantity; the field stays in the unit it is in, and angles are in degrees."""
+"""Quantity; its names with other characters than letters and digits as underscores, and those of its axes;
+factors from its units to SI, angles to degrees, while fields stay in theirs; axes by their other names."""
+
+_PREFIX = "(?:(?:imu|field|sensor|data|shimmer(?:_[0-9a-f]{4})?)_)*"
+_SUFFIX = "(?:_rs_s|_ln|_wr|_unix|_startup)?"
+_PATTERNS = [
+    (quantity, re.compile(rf"{_PREFIX}(?:{names}){_SUFFIX}_?({axes})(?:_cal)?(?:_(.+))?$"), units, letters)
+    for quantity, names, axes, units, letters in _COLUMNS
+]
 
 _SPELLINGS = {
     short: re.compile(rf"(?<![^_])(?:{spelling})(?![^_])")
@@ -97,12 +106,6 @@ _SPELLINGS = {
     )
 }
 """Units by how they may be spelt out."""
-
-_AXES = {
-    "quat": {"0": "w", "1": "x", "2": "y", "3": "z", "scalar": "w"},
-    "euler": {"x": "roll", "y": "pitch", "z": "yaw"},
-}
-"""Names of one axis."""
 
 STAMPS = ("time", "counter", "ticks")
 
@@ -121,19 +124,18 @@ def column_of(name: str) -> tuple[str, float | None] | None:
 
     With it comes what turns its numbers to SI units, None if the name states no unit.
     """
-    words = re.sub(r"[^a-z0-9°µ]+", "_", name.replace("²", "2")).strip("_")
+    words = stated = re.sub(r"[^a-z0-9°µ]+", "_", name.replace("²", "2")).strip("_")
     for short, spelling in _SPELLINGS.items():
         words = spelling.sub(short, words)
-    if words in TIMES:  # as millis
-        return "time", TIMES[words]
-    for quantity, pattern in _PATTERNS:
+    if words in TIMES:  # as millis; s alone may be anything
+        return ("time", TIMES[words]) if words != stated else None
+    for quantity, pattern, units, letters in _PATTERNS:
         if match := pattern.match(words):
             axis, unit = match.groups()
-            scale = _UNITS.get(quantity, {}).get(unit)
+            scale = units.get(unit)
             if unit and scale is None:
                 return None
-            axis = _AXES.get(quantity, {}).get(axis, axis)
-            return (f"{quantity}_{axis}" if axis else quantity), scale
+            return f"{quantity}_{letters.get(axis, axis)}".strip("_"), scale
     return None
 
 

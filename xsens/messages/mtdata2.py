@@ -15,6 +15,7 @@ from xsens.messages.framing import Frames, rows_at
 from xsens.messages.mtdata import REAL, Field, Values, as_floats
 
 STAMPS = ("packet_counter", "sample_time_fine")
+MEASURED = ("acceleration_m_s2", "rate_of_turn_rad_s", "magnetic_field_au")
 ORIENTATIONS = ("quaternion_wxyz", "rotation_matrix_by_column", "euler_deg")
 
 KINDS = {
@@ -24,10 +25,10 @@ KINDS = {
     0x2020: Field(ORIENTATIONS[1], 9),
     0x2030: Field(ORIENTATIONS[2], 3),
     0x4010: Field("delta_v_m_s", 3),
-    0x4020: Field("acceleration_m_s2", 3),
-    0x8020: Field("rate_of_turn_rad_s", 3),
+    0x4020: Field(MEASURED[0], 3),
+    0x8020: Field(MEASURED[1], 3),
     0x8030: Field("delta_q_wxyz", 4),
-    0xC020: Field("magnetic_field_au", 3),
+    0xC020: Field(MEASURED[2], 3),
 }
 """Identifiers of the vendor's list that are read, their last four bits zero for real numbers."""
 

@@ -48,25 +48,13 @@ def read(path: Path, rate_hz: float | None = None, world: str | None = None) -> 
 
 def note_gaps(log: ImuLog) -> None:
     """Report on stderr what a log lacks, and what was assumed in its place."""
-    notes([*log.notes, *other_unit(log)])
+    from xsens.logs.contradictions import contradictions
+
+    notes([*log.notes, *filter(None, [contradictions(log).get("gravity")])])
     if log.gaps:
         longest = max(gap.duration_s for gap in log.gaps)
         text = f"{log.lost} samples lost in {len(log.gaps)} gaps" if log.lost else f"{len(log.gaps)} pauses"
         note(f"{text}, the longest of {longest:.3f} s; nothing filled in")
-
-
-def other_unit(log: ImuLog) -> list[str]:
-    """Say that a log's accelerometer is not in m/s^2, if its norm shows that."""
-    from xsens.fusion.readings import require_metres
-    from xsens.logs.samples import finite_rows
-
-    force = log.accelerometer_m_s2
-    try:
-        if force is not None and finite_rows(force).any():
-            require_metres(force[finite_rows(force)], "accelerometer")
-    except InvalidInputError as error:
-        return [str(error)]
-    return []
 
 
 def orientation_of(
@@ -128,7 +116,7 @@ def info(log_file: Path, rate_hz: MaybeNumber = None, world: World = None) -> Re
         else:
             norm = np.nanmedian(np.linalg.norm(values, axis=1))
             rows.append((f"{noun}, median norm", f"{norm:.4f}", unit))
-    notes = [*log.notes, *filter(None, contradictions(log).values()), *other_unit(log)]
+    notes = [*log.notes, *filter(None, contradictions(log).values())]
     return rows_of([*rows, *(("note", text, "") for text in notes)])
 
 
