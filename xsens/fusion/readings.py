@@ -139,7 +139,7 @@ def usable_samples(log: ImuLog) -> tuple[IntArray, Samples, list[str]]:
         )
     against = contradictions(log)
     agrees = against.get("accelerometer") == ""
-    fatal = ("gravity", *(() if agrees else ("accelerometer", "own orientation")))
+    fatal = ("gravity", "gyroscope", *(() if agrees else ("accelerometer", "own orientation")))
     if problem := next(filter(None, map(against.get, fatal)), ""):
         raise InvalidInputError(f"{source}: {problem}")
     notes += filter(None, against.values())
