@@ -139,7 +139,8 @@ def _still_axis(name: str, turns: FloatArray, change: FloatArray, arms: FloatArr
 def _against_gyroscope(name: str, turns: FloatArray, change: FloatArray) -> str:
     """Sentence on a direction that turns otherwise than the gyroscope; empty if it agrees."""
     whole = turns.sum(axis=0)
-    for axis, turn in (("", whole), *zip((" x", " y", " z"), turns, strict=True)):
+    axes = () if name == "magnetometer" else (" x", " y", " z")  # iron on the sensor spoils single axes
+    for axis, turn in (("", whole), *zip(axes, turns, strict=False)):
         share = 1.0 + (turn * (change - whole)).sum() / max((turn**2).sum(), 1e-12)
         if _rms(turn) > _TURNING_RAD_S and not _HONEST_SHARES[0] < share < _HONEST_SHARES[1]:
             doubt = "in deg/s" if 0.0 < share < 0.05 else "as it is told, in rate, axes and signs"
