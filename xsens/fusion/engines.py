@@ -8,8 +8,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from speckle3d.core.arrays import FloatArray
+from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.kernels.orientation import inclination as kernel
 from speckle3d.kernels.orientation.smoothing import orient_samples, smooth_steps
 from xsens.fusion.heading import UNKNOWN, HeadingFilter, averaged_bins, lasts_of_bins, steps_per_bin
@@ -93,12 +94,11 @@ class Filter:
         self.last, self._north = steps[-1:], north[-1:]
         if not len(steps):
             steps, north = np.zeros(1, kernel.STEP), np.array([UNKNOWN])
-        sd = steps["sd"][step_of_sample, :3] * _CLAIMED_SHARES
+        sd = steps["sd"][:, :3] * _CLAIMED_SHARES
         if self._settings.use_magnetometer:
-            sd[:, 2] = north[step_of_sample, 1]
-        turn, _, distrust, stray, iron = north[step_of_sample].T
-        bias, resting = steps["bias"][step_of_sample], steps["resting"][step_of_sample]
-        return Estimate(turn_about_up(turn, xyzw), sd, bias, distrust > 0.0, resting, stray, iron)
+            sd[:, 2] = north[:, 1]
+        xyzw = turn_about_up(north[step_of_sample, 0], xyzw)
+        return _at_samples(samples, xyzw, sd, steps["bias"], steps, north, step_of_sample)
 
 
 def smooth(samples: Samples, settings: FusionSettings) -> Estimate:
@@ -123,6 +123,24 @@ def smooth(samples: Samples, settings: FusionSettings) -> Estimate:
     xyzw, rates = np.empty((len(samples), 4)), np.ascontiguousarray(samples.rate_rad_s)
     orient_samples(samples.step_s, rates, rows, nodes, biases, xyzw)
     of_step = np.repeat(np.arange(n), np.diff(rows["last"], prepend=0))
-    _, _, distrust, stray, iron = north[of_step].T
-    resting = rows["resting"][of_step]
-    return Estimate(xyzw, sd[of_step], biases[1:][of_step], distrust > 0.0, resting, stray, iron)
+    return _at_samples(samples, xyzw, sd, biases[1:], rows, north, of_step)
+
+
+def _at_samples(
+    samples: Samples,
+    xyzw: FloatArray,
+    sd_rad: FloatArray,
+    bias_rad_s: FloatArray,
+    steps: Any,
+    north: FloatArray,
+    of_sample: IntArray,
+) -> Estimate:
+    """Estimate of each sample by the step that it belongs to.
+
+    When in its interval a gyroscope's reading is taken is not known: half of it is claimed as well.
+    """
+    rates = Rotation.from_quat(xyzw).apply(samples.rate_rad_s - bias_rad_s[of_sample])
+    late_rad = 0.5 * float(np.median(samples.step_s)) * rates
+    _, _, distrust, stray, iron = north[of_sample].T
+    sd_rad, resting = np.hypot(sd_rad[of_sample], late_rad), steps["resting"][of_sample]
+    return Estimate(xyzw, sd_rad, bias_rad_s[of_sample], distrust > 0.0, resting, stray, iron)

@@ -140,16 +140,9 @@ class OnlineFilter:
         if len(last := self._filter.last):
             if last["started"][0] and (problem := not_in_metres(self._filter.start_force_m_s2)):
                 raise InvalidInputError(f"accelerometer_m_s2: {problem}")
-            self._state = OnlineState(
-                Rotation.from_quat(estimate.xyzw[-1]),
-                estimate.sd_rad[-1],
-                estimate.bias_rad_s[-1],
-                bool(estimate.distrust[-1]),
-                bool(estimate.resting[-1]),
-                bool(last["started"][0]),
-                float(estimate.field_stray[-1]),
-                float(estimate.field_iron[-1]),
-            )
+            last_row = {name: v[-1] if v.ndim > 1 else v[-1].item() for name, v in vars(estimate).items()}
+            turn = Rotation.from_quat(last_row.pop("xyzw"))
+            self._state = OnlineState(turn, started=bool(last["started"][0]), **last_row)
 
     @property
     def state(self) -> OnlineState | None:

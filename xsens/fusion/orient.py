@@ -130,22 +130,14 @@ def orient(
     if breaks.size:
         notes.append(f"{breaks.size} pauses over {PAUSE_S:g} s: orientation found anew after each")
     estimate = _estimate(samples, breaks, settings, method)
-    bias = float(np.abs(estimate.bias_rad_s).max())
+    bias = float(np.abs(estimate.gyro_bias_rad_s).max())
     if bias > _FORESEEN * settings.bias_sd_rad_s:
         notes.append(f"a gyroscope bias of {np.rad2deg(bias):.1f} deg/s: found again, foreseen so large")
         estimate = _estimate(samples, breaks, replace(settings, bias_sd_rad_s=bias), method)
-    return Orientation(
-        TimedRotations(log.time_s[rows], Rotation.from_quat(estimate.xyzw)),
-        estimate.sd_rad,
-        estimate.bias_rad_s,
-        estimate.distrust,
-        estimate.resting,
-        method,
-        tuple(notes),
-        settings.use_magnetometer,
-        estimate.field_stray,
-        estimate.field_iron,
-    )
+    columns = vars(estimate).copy()
+    rotations = TimedRotations(log.time_s[rows], Rotation.from_quat(columns.pop("xyzw")))
+    magnetic = settings.use_magnetometer
+    return Orientation(rotations, **columns, method=method, notes=tuple(notes), magnetic=magnetic)
 
 
 def _estimate(samples: Samples, breaks: IntArray, settings: FusionSettings, method: Method) -> Estimate:

@@ -62,19 +62,14 @@ class Estimate:
     ----------
     xyzw : ndarray, shape (m, 4)
         World from sensor, scalar last.
-    sd_rad : ndarray, shape (m, 3)
-        About the world's axes.
-    bias_rad_s : ndarray, shape (m, 3)
-    distrust, resting : ndarray of bool, shape (m,)
-        Whether the magnetic field was not trusted, and the sensor lay still.
-    field_stray, field_iron : ndarray, shape (m,)
-        As `xsens.fusion.heading.NORTH` says; NaN where no field tells the heading.
+    standard_deviation_rad, gyro_bias_rad_s, disturbed, resting, field_stray, field_iron
+        As in `xsens.fusion.orient.Orientation`.
     """
 
     xyzw: FloatArray
-    sd_rad: FloatArray
-    bias_rad_s: FloatArray
-    distrust: BoolArray
+    standard_deviation_rad: FloatArray
+    gyro_bias_rad_s: FloatArray
+    disturbed: BoolArray
     resting: BoolArray
     field_stray: FloatArray
     field_iron: FloatArray

@@ -72,9 +72,11 @@ def by_vqf(stretch: Samples, claims: Estimate, offline: bool, magnetic: bool) ->
     return replace(
         claims,
         xyzw=xyzw,
-        sd_rad=np.minimum(np.hypot(claims.sd_rad, _apart(xyzw, claims.xyzw)), np.pi),
-        bias_rad_s=estimate["bias"][at],
-        distrust=disturbance,
+        standard_deviation_rad=np.minimum(
+            np.hypot(claims.standard_deviation_rad, _apart(xyzw, claims.xyzw)), np.pi
+        ),
+        gyro_bias_rad_s=estimate["bias"][at],
+        disturbed=disturbance,
         resting=estimate["restDetected"][at],
     )
 
