@@ -77,24 +77,18 @@ def without_faults(log: ImuLog) -> ImuLog:
     InvalidInputError
         If its rows are of several sensors in turn.
     """
-    oriented = slice(None) if log.oriented.all() else log.oriented
     readings = {name: getattr(log, name) for name in VECTORS} | {_ORIENTATION: log.own_direction}
     readings = {name: rows for name, rows in readings.items() if rows is not None}
     _require_one_sensor(readings)
     changes: dict[str, Any] = {}
     notes: list[str] = []
-    dead, force, rate = np.zeros(len(log), dtype=bool), readings.get(VECTORS[0]), readings.get(VECTORS[1])
+    nothing = np.full((len(log), 3), np.nan)
+    force, rate = (readings.get(name, nothing) for name in VECTORS[:2])
     for name, rows in readings.items():
-        part: Any = oriented if name == _ORIENTATION else slice(None)
-        inertial = (None if vectors is None else vectors[part] for vectors in (force, rate))
-        bad = _bad(name, rows[part], dead[part], *inertial)
-        if name == VECTORS[0]:
-            dead = bad["readings of zero"] | ~finite_rows(rows)
-        counts = ", ".join(f"{int(mask.sum())} {why}" for why, mask in bad.items() if mask.any())
-        wrong = np.zeros(len(log), dtype=bool)
-        wrong[part] = np.logical_or.reduce(list(bad.values()))
-        if counts:
+        bad = _bad(name, rows, force, rate)
+        if counts := ", ".join(f"{int(mask.sum())} {why}" for why, mask in bad.items() if mask.any()):
             notes.append(f"{name.split('_')[0]}: {counts}: taken as missing")
+        wrong = np.logical_or.reduce(list(bad.values()))
         if name == _ORIENTATION:
             changes["oriented"] = log.oriented & ~wrong
         elif counts or not finite_rows(rows).any():
@@ -123,14 +117,14 @@ def _digit(readings: FloatArray) -> float:
     return float(np.min(steps, where=steps > 0.0, initial=np.inf))
 
 
-def _bad(
-    name: str, rows: FloatArray, dead: BoolArray, force: FloatArray | None, rate: FloatArray | None
-) -> dict[str, BoolArray]:
-    """Rows that are no measurement of one sensor, by reason; `dead` where the accelerometer reads nothing."""
+def _bad(name: str, rows: FloatArray, force: FloatArray, rate: FloatArray) -> dict[str, BoolArray]:
+    """Rows that are no measurement of one sensor, by reason."""
     limits, size = LIMITS[name], _norm(rows)
     finite = ~np.isnan(size)
     size[~finite] = 0.0
     zero, unit = finite & (size < 1e-12), 1.0
+    if name == VECTORS[1]:  # at rest zero is a reading
+        zero &= np.isnan(force[:, 0]) | ~force.any(axis=1)
     if name == VECTORS[2] and (finite & ~zero).any():
         unit = float(np.median(size[finite & ~zero]))
     beyond = size > limits.largest * unit
@@ -138,31 +132,22 @@ def _bad(
         beyond = finite & (np.abs(rows).max(axis=1) > limits.largest * unit)
     if beyond.sum() > _FEW * finite.sum():  # another unit, which whoever uses the log refuses
         beyond = size >= _ABSURD
-    if beyond.any() or not finite.all():
-        rows = np.where((finite & ~beyond)[:, None], rows, np.nan)
-    ends, spikes = at_ends(rows), _spikes(rows, limits.spike * unit)
-    if name == VECTORS[1]:  # at rest zero is a reading
-        zero &= dead
-    repeats = _repeats(name, rows, limits.change * unit, size, force, rate) & finite & ~zero
-    overflows = _overflows(np.where((repeats | zero)[:, None], np.nan, rows))
+    valid, repeats = finite & ~beyond & ~zero, np.zeros(len(rows), dtype=bool)
+    if valid.any():
+        repeats[valid] = _repeats(name, limits.change * unit, rows[valid], force[valid], rate[valid])
+    rows = np.where((valid & ~repeats)[:, None], rows, np.nan)
+    ends, overflows = at_ends(rows), _overflows(rows)
     return {
         "readings of zero": zero,
         "out of range": beyond,
         "repeated": repeats,
-        "at the end of the range": ends & ~repeats & ~zero,
+        "at the end of the range": ends,
         "beyond the range, wrapped round": overflows & ~ends,
-        "single spikes": spikes & ~overflows & ~zero,
+        "single spikes": _spikes(rows, limits.spike * unit) & ~overflows,
     }
 
 
-def _repeats(
-    name: str,
-    rows: FloatArray,
-    change: float,
-    size: FloatArray,
-    force: FloatArray | None,
-    rate: FloatArray | None,
-) -> BoolArray:
+def _repeats(name: str, change: float, rows: FloatArray, force: FloatArray, rate: FloatArray) -> BoolArray:
     """Rows that repeat the one before for longer than two samples of the sensor's rate, and then change.
 
     One in ten of a sensor's samples may last longer: its rate is another than that of the log.
@@ -180,13 +165,12 @@ def _repeats(
     noisy = np.minimum(before, after) > _NOISY * _digit(rows)
     moves = noisy | (after > change) | (np.isnan(after) & (start > 0))
     if name == VECTORS[1]:  # a resting one may read its bias, or zero
-        still = np.ones(len(start), dtype=bool)
-        for axis in () if force is None else force.T:
-            still &= ~(np.fmax.reduceat(axis, start) - np.fmin.reduceat(axis, start) > _STEADY_M_S2)
+        spread = np.fmax.reduceat(force, start) - np.fmin.reduceat(force, start)
+        still = ~(spread > _STEADY_M_S2).any(axis=1)
         drops = np.isnan(before) | np.isnan(after) | (before > _DROP_RAD_S)
-        moves = (moves & ~(still & drops & (size[start] < _SLOW_RAD_S))) | (np.isnan(after) & ~still)
+        moves = (moves & ~(still & drops & (_norm(rows[start]) < _SLOW_RAD_S))) | (np.isnan(after) & ~still)
     else:  # what is repeated to the log's end was left while the sensor turned
-        turn = 0.0 if rate is None else np.add.reduceat(np.nan_to_num(_norm(rate)), start)
+        turn = np.add.reduceat(np.nan_to_num(_norm(rate)), start)
         moves &= ~np.isnan(after) | (turn > _TURNING_RAD_S * length)
     bad, first = long & moves, np.full(len(start), usual)
     if bad.any():  # what readings jump to again and again is none, but a number that stands for none
