@@ -54,7 +54,7 @@ def track(
     doubts += examine_echoes(matches)
     require_placed(matches.flags)
 
-    tissue = tissue_curves(curves, matches.texture, matches.flags == 0)
+    tissue = tissue_curves(curves, matches.texture)
     problem = MotionProblem(
         tissue.curves, matcher.patches, matcher.centre_mm, len(sweep), settings.planes, settings.trajectory
     )

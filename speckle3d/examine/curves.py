@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.optimize import least_squares
 
-from speckle3d.core.arrays import BoolArray, FloatArray
+from speckle3d.core.arrays import FloatArray
 from speckle3d.core.curves import DecorrelationCurves, SpeckleSize, curve_widths
 from speckle3d.core.doubts import Doubt
 from speckle3d.core.errors import MismatchError, Speckle3DError
@@ -89,14 +89,14 @@ def require_usable(doubts: Iterable[Doubt | None], error: type[Speckle3DError]) 
     return actual
 
 
-def examine_curves(texture: Texture, motion: Motion, usable: BoolArray) -> tuple[Doubt | None, ...]:
+def examine_curves(texture: Texture, motion: Motion) -> tuple[Doubt | None, ...]:
     """Hold the curves against a sweep's own speckle and steps."""
     rows, patches = rows_without_tilt(motion), motion.problem.patches
     gain = np.ones(patches.row_depth_mm.size) if rows is None else np.nan_to_num(rows.gain)
     return (
-        *doubt_size(texture.speckle_size(usable), motion.problem.curves, patches, gain),
+        *doubt_size(texture.speckle_size(), motion.problem.curves, patches, gain),
         doubt_bend(rows),
-        doubt_sign(texture, usable),
+        doubt_sign(texture),
     )
 
 
@@ -174,13 +174,13 @@ def doubt_size(
     return tuple(doubts)
 
 
-def doubt_sign(texture: Texture, usable: BoolArray | None = None) -> Doubt | None:
+def doubt_sign(texture: Texture) -> Doubt | None:
     """Doubt the sign of Q where the echoes' frequency seems to rise with depth.
 
     Tissue takes more of high frequencies, so it falls; with the other sign it is mirrored at the demodulation
     frequency. Noise, too, draws it to the band's middle, so it is doubted only where it goes away from it.
     """
-    signal, spectra = texture.signal, texture.spectra(usable)
+    signal, spectra = texture.signal, texture.spectra()
     if (
         spectra is None
         or spectra.depth_mm.size < LEAST_ROWS

@@ -205,7 +205,7 @@ def examine_images(
     )
     return (
         *require_usable(images, InsufficientDataError),
-        *require_usable(examine_curves(texture, motion, usable), MismatchError),
+        *require_usable(examine_curves(texture, motion), MismatchError),
         *require_usable(path, InsufficientDataError),
     )
 

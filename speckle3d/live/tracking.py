@@ -28,8 +28,7 @@ from speckle3d.core.relative import RelativePoses
 from speckle3d.core.sweep import BModeSettings, Sweep
 from speckle3d.core.threads import on_one_thread
 from speckle3d.matching.frames import FrameByFrame, ImageSink
-from speckle3d.matching.matcher import FrameMatcher
-from speckle3d.matching.overlay import Overlay
+from speckle3d.matching.matcher import FrameMatcher, Overlay
 from speckle3d.matching.quality import FrameFeatures, FrameFlag, flag_frames
 from speckle3d.matching.schedule import PairSchedule
 from speckle3d.matching.table import CorrelationTable
@@ -192,7 +191,7 @@ class LiveTracker:
         if self.images:
             self.images(number, ready.echo.intensity)
         if number % EVERY == 0 and number < EVERY * FRAMES:
-            self._overlay.keep(frame, ready.echo)
+            self._overlay.add(ready.echo)
             self._matcher.leave_out(self._overlay)
             if isinstance(self._example.signal, BModeSettings):
                 self._texture.keep(number, frame, ready)

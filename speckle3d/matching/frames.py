@@ -11,8 +11,7 @@ from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from speckle3d.core.sweep import Sweep, read_frame
 from speckle3d.core.threads import ahead
 from speckle3d.kernels.inplane import Frame
-from speckle3d.matching.matcher import FrameMatcher, ReadyFrame, compose, inverse
-from speckle3d.matching.overlay import Overlay
+from speckle3d.matching.matcher import FrameMatcher, Overlay, ReadyFrame, compose, inverse
 from speckle3d.matching.quality import FrameFeatures, FrameFlag, flag_frames
 from speckle3d.matching.schedule import KnownSchedule, PairSchedule
 from speckle3d.matching.table import CorrelationTable
@@ -37,7 +36,7 @@ class MatchedSweep:
     features : sequence of FrameFeatures
         Of every frame.
     texture : Texture
-        Of some frames.
+        Of some frames, those without a flag if there are any.
     flags : ndarray of int, shape (n,)
         `FrameFlag` of every frame, by what is in it and what it shares with others.
     echoless : ndarray, shape (p,)
@@ -77,8 +76,8 @@ def match_sweep(
     pairing = FrameByFrame(matcher, schedule)
     texture, texture_frames = Texture(matcher), spread_frames(len(sweep), FRAMES)
     overlay = Overlay()
-    for samples in (read_frame(sweep.frames, number) for number in texture_frames):
-        overlay.keep(samples, matcher.echo(samples))
+    for number in texture_frames:
+        overlay.add(matcher.echo(read_frame(sweep.frames, number)))
     matcher.leave_out(overlay)
 
     def make(number: int) -> ReadyFrame:
@@ -98,6 +97,7 @@ def match_sweep(
             progress(number + 1, len(sweep))
     table, flags = CorrelationTable.joined(tables), flag_frames(features, matcher.quality)
     flags[table.unmatched(len(sweep), schedule.least_correlation)] |= FrameFlag.UNMATCHED
+    texture.leave_out(flags != 0)
     echoless = matcher.patches.inside - np.mean([frame.usable for frame in features], axis=0)
     return MatchedSweep(table, features, texture, flags, echoless)
 

@@ -8,7 +8,7 @@ I/Q, may have been sampled more coarsely than that, and then the rate rises.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,7 +20,7 @@ from speckle3d.core.arrays import BoolArray, Complex64Array, Float32Array, Float
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.grid import ImageGrid
 from speckle3d.core.sweep import BModeSettings, RFSettings
-from speckle3d.kernels.box_means import box_means, squared_magnitude
+from speckle3d.kernels.box_means import amplify, box_means, squared_magnitude
 
 _RATE_OVER_BAND = 100 / 27
 """Rate of the intensity's samples over the width of the pass-band, edges included, whatever the echoes were
@@ -55,8 +55,7 @@ class Echo(NamedTuple):
     analytic: Complex64Array | None
 
 
-@dataclass(frozen=True)
-class _Resampling:
+class _Resampling(NamedTuple):
     """Fourier bins of the band, and where they go in the inverse transform of another length."""
 
     length: int
@@ -81,35 +80,38 @@ class IntensityExtractor:
         self.settings = settings or IntensitySettings()
         self.signal = signal
         self.grid = grid
-        self._frame_shape = (grid.vectors, grid.samples)
-        self._plan: _Resampling | None = None
+        self._shape = grid.vectors, grid.samples
         if isinstance(signal, RFSettings):
             self._plan = _plan_resampling(signal, grid.samples, self.settings.edge_fraction)
             step = self._plan.length / self._plan.out_length
             samples = int((grid.samples - 1) / step) + 1
             self.grid = replace(grid, samples=samples, sample_spacing_mm=grid.sample_spacing_mm * step)
 
-    def analytic(self, frame: npt.NDArray[Any]) -> Complex64Array:
-        """Band-passed analytic signal about the band's centre, resampled in depth.
+    def echo(self, frame: npt.NDArray[Any]) -> Echo:
+        """Intensity, arbitrary units, and analytic signal of a frame, each of shape (vector, grid.samples).
 
         Parameters
         ----------
         frame : ndarray, shape (vector, sample)
-            RF samples, real, or I/Q, complex.
-
-        Returns
-        -------
-        ndarray of complex64, shape (vector, grid.samples)
+            RF samples, real; I/Q, complex; or grey levels of B-mode.
 
         Raises
         ------
         InvalidInputError
-            If the frame has another shape, or the sweep holds B-mode images.
+            If the frame has another shape.
         """
+        if frame.shape != self._shape:
+            raise InvalidInputError(f"expected a frame of shape {self._shape}, got {frame.shape}")
+        if isinstance(self.signal, BModeSettings):
+            return Echo(_decompress(frame, self.signal), None)
+        analytic = self._analytic(frame)
+        intensity = np.empty(analytic.shape, np.float32)
+        squared_magnitude(analytic, intensity)
+        return Echo(intensity, analytic)
+
+    def _analytic(self, frame: npt.NDArray[Any]) -> Complex64Array:
+        """Band-passed analytic signal about the band's centre, resampled in depth."""
         plan, are_complex = self._plan, np.iscomplexobj(frame)
-        if plan is None:
-            raise InvalidInputError("expected RF frames, got B-mode images: there is no phase to recover")
-        self._require_shape(frame)
         padded = np.zeros((len(frame), plan.length), "c8" if are_complex else "f4")
         padded[:, : frame.shape[1]] = frame
         transform: Any = fft.fft if are_complex else fft.rfft
@@ -118,49 +120,41 @@ class IntensityExtractor:
         band[:, plan.destination] = spectrum.take(plan.bins, axis=1) * plan.weights
         return np.ascontiguousarray(fft.ifft(band, axis=1, overwrite_x=True)[:, : self.grid.samples])
 
-    def echo(self, frame: npt.NDArray[Any]) -> Echo:
-        """Intensity, shape (vector, grid.samples), arbitrary units, from RF or B-mode grey levels."""
-        if isinstance(self.signal, BModeSettings):
-            self._require_shape(frame)
-            return Echo(_decompress(frame, self.signal), None)
-        analytic = self.analytic(frame)
-        intensity = np.empty(analytic.shape, np.float32)
-        squared_magnitude(analytic, intensity)
-        return Echo(intensity, analytic)
-
-    def intensity(self, frame: npt.NDArray[Any]) -> Float32Array:
-        """Intensity alone."""
-        return self.echo(frame).intensity
-
-    def gain(self, intensity: Float32Array, mask: BoolArray | None = None) -> Float32Array:
-        """One over the local mean of intensity, of its shape; ones if nothing is to be equalised.
+    def equalised(self, echo: Echo, counted: BoolArray) -> tuple[Float32Array, Float32Array]:
+        """Intensity and, where there is phase, parts of the echo over the local mean; see `Frame`.
 
         Brightness that varies within a patch correlates between frames whatever the probe did: with the local
-        mean divided out, echogenicity does not read as speckle that stays.
+        mean divided out, echogenicity does not read as speckle that stays. Nor does what is left out: it
+        counts in no mean and departs from none, so that a shadow's edge is no pattern.
 
         Parameters
         ----------
-        mask : ndarray of bool, optional
-            Samples that count in the mean, of the same shape; by default all.
+        counted : ndarray of bool, shape (vector, grid.samples)
+            Samples that are not left out.
         """
+        gain = self._gain(echo.intensity, counted)
+        gain[~counted] = 0.0
+        if echo.analytic is None:
+            image, parts = echo.intensity * gain, np.empty((2, 0, 0), np.float32)
+        else:
+            image, parts = np.empty_like(gain), np.empty((2, *gain.shape), np.float32)
+            amplify(echo.analytic, gain, image, parts)
+        image[~counted] = 1.0
+        return image, parts
+
+    def _gain(self, intensity: Float32Array, counted: BoolArray) -> Float32Array:
+        """One over the local mean; ones if nothing is to be equalised."""
         if self.settings.equalise_mm == 0:
             return np.ones_like(intensity)
         sides = (self.grid.vector_pitch_mm, self.grid.sample_spacing_mm)
-        window = [2 * int(self.settings.equalise_mm / 2 / side) + 1 for side in sides]
-        mean = np.empty_like(intensity)
-        box_means(intensity if mask is None else intensity * mask, window[0], window[1], mean)
-        if mask is not None:
-            share = np.empty_like(mean)
-            box_means(mask.astype(np.float32), window[0], window[1], share)
-            # Less than half a sample is rounding: nothing counts near.
-            counted, unknown = share > 0.5 / np.prod(window), np.full_like(mean, np.inf)
-            mean = np.divide(mean, share, out=unknown, where=counted)
-        np.maximum(mean, np.finfo(np.float32).tiny, out=mean)
-        return np.reciprocal(mean, out=mean)
-
-    def _require_shape(self, frame: npt.NDArray[Any]) -> None:
-        if frame.shape != self._frame_shape:
-            raise InvalidInputError(f"expected a frame of shape {self._frame_shape}, got {frame.shape}")
+        wide, high = (2 * int(self.settings.equalise_mm / 2 / side) + 1 for side in sides)
+        mean, share = np.empty_like(intensity), np.ones_like(intensity)
+        box_means(intensity * counted, wide, high, mean)
+        if not counted.all():
+            box_means(counted.astype(np.float32), wide, high, share)
+        # Less than half a sample is rounding: nothing counts near.
+        share[share <= 0.5 / (wide * high)] = 0.0
+        return np.divide(share, np.maximum(mean, np.finfo(np.float32).tiny), out=share)
 
 
 def two_way_wavenumber(signal: RFSettings) -> float:

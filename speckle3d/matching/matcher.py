@@ -19,10 +19,8 @@ from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray
 from speckle3d.core.curves import CurveKey, DecorrelationCurves
 from speckle3d.core.sweep import BModeSettings, RFSettings, Sweep
 from speckle3d.core.threads import in_parallel
-from speckle3d.kernels.box_means import amplify
 from speckle3d.kernels.inplane import Frame, Geometry, Matches, match_pair
 from speckle3d.matching.intensity import Echo, IntensityExtractor, IntensitySettings, two_way_wavenumber
-from speckle3d.matching.overlay import Overlay
 from speckle3d.matching.patches import PatchSettings, lay_patches
 from speckle3d.matching.quality import FrameFeatures, QualitySettings, inspect_frame
 from speckle3d.matching.table import CorrelationTable
@@ -31,6 +29,10 @@ _POOLED_BELOW_MM = 0.05
 """Sample spacing below which two samples are pooled for the coarse search: intensity comes with two to four
 in a speckle, and the peak is still found to the sample from which the matching goes on."""
 
+
+_STANDING = 0.5
+"""Share of a sample's power that is in the mean of the frames' echoes, from which it stands still. Of n
+independent frames of speckle (1 - 0.5)^(n - 1) of the samples have it by chance."""
 
 _OVERLAID, _OVER_SPECKLE = 0.1, 10.0
 """Share of a patch's power in samples that stand still, from which it is left out, also over that of the
@@ -86,6 +88,44 @@ class ReadyFrame(NamedTuple):
     frame: Frame
 
 
+class Overlay:
+    """What stands still in frames far apart while the probe moves: text, a ruler, ringing without contact.
+
+    Its patches tell nothing of the motion. In the others' local mean it would be a pattern that stays, as if
+    the probe had moved less.
+
+    Attributes
+    ----------
+    power : ndarray, shape (vector, grid.samples)
+        Sum of the frames' intensities; zero before the first that is finite.
+    """
+
+    def __init__(self) -> None:
+        self._count = 0
+        self.power: Any = np.float32(0.0)
+        self._total: Any = np.complex64(0.0)
+        self._darkest: Any = np.float32(np.inf)
+        self._brightest: Any = np.float32(0.0)
+
+    def add(self, echo: Echo) -> None:
+        """Look at one more frame."""
+        if not np.isfinite(echo.intensity.sum()):
+            return
+        self._count += 1
+        self.power = self.power + echo.intensity
+        self._darkest = np.minimum(self._darkest, echo.intensity)
+        self._brightest = np.maximum(self._brightest, echo.intensity)
+        if echo.analytic is not None:
+            self._total = self._total + echo.analytic
+
+    @property
+    def standing(self) -> BoolArray:
+        """Which samples stand still, by the echo's mean or their level, shape (vector, grid.samples)."""
+        in_mean = np.abs(self._total) ** 2 > _STANDING * self._count * self.power
+        unchanged = (self._darkest == self._brightest) & (self._darkest > np.min(self._darkest))
+        return np.asarray(in_mean | unchanged)
+
+
 class FrameMatcher:
     """Prepares the frames of one sweep and matches pairs of them.
 
@@ -129,8 +169,7 @@ class FrameMatcher:
         self.centre_mm = sweep.grid.centre_mm
         self.patches = self.laid = lay_patches(self.grid, s.patches)
         self._least_overlap = s.inplane.least_overlap
-        self._mask = self.laid.region
-        self._standing: BoolArray | None = None
+        self._counted = self.laid.region
         spacing, sides = self.laid.spacing_mm, np.array([self.grid.vectors, self.grid.samples])
         self._pool = np.array([1, 2 if spacing[1] < _POOLED_BELOW_MM else 1])
         self._reach = np.minimum(
@@ -161,55 +200,34 @@ class FrameMatcher:
 
     def leave_out(self, overlay: Overlay) -> None:
         """Leave out the patches on which something stands still, and that from the others' local mean."""
-        if not overlay.count:
+        if not overlay.power.any():
             return
         standing, patches = overlay.standing, self.patches
-        still = patches.tiles(standing * overlay.power).sum(axis=(1, 2))
-        power = patches.tiles(overlay.power).sum(axis=(1, 2))
+        still, power = (
+            patches.tiles(power).sum(axis=(1, 2)) for power in (standing * overlay.power, overlay.power)
+        )
         share = still / np.maximum(power, np.finfo(np.float32).tiny)
         self.overlaid = share > max(_OVERLAID, _OVER_SPECKLE * float(np.median(share)))
-        (wide, high), over = patches.size, np.zeros_like(standing)
-        for vector, sample in patches.first[self.overlaid]:
-            over[vector : vector + wide, sample : sample + high] = True
-        over &= standing
-        self._standing = over if over.any() else None
-        self._mask = self.laid.region
-        if self._standing is not None:
-            self._mask = ~over if self._mask is None else self._mask & ~over
+        (wide, high), self._counted = patches.size, self.laid.region.copy()
+        for v, s in patches.first[self.overlaid]:
+            self._counted[v : v + wide, s : s + high] &= ~standing[v : v + wide, s : s + high]
 
     def ready(self, samples: npt.NDArray[Any]) -> ReadyFrame:
         """Make a frame, as read, ready to be matched; on any thread."""
-        echo, is_bmode = self.echo(samples), isinstance(self.signal, BModeSettings)
-        features = inspect_frame(samples, echo.intensity, self.patches, is_bmode, self.quality)
-        echoing = 1.0 - self.patches.tiles(self._silent(echo.intensity)).mean(axis=(1, 2))
+        echo, patches = self.echo(samples), self.patches
+        silent = self._silent(echo.intensity)
+        features = inspect_frame(
+            samples, echo.intensity, patches, isinstance(self.signal, BModeSettings), self.quality
+        )
+        echoing = 1.0 - patches.tiles(silent).mean(axis=(1, 2))
         usable = features.usable & ~self.overlaid & (echoing >= self._least_overlap)
-        return ReadyFrame(echo, replace(features, usable=usable), self.prepare(echo, usable))
+        frame = self.prepare(echo, usable, self._counted & ~silent)
+        return ReadyFrame(echo, replace(features, usable=usable), frame)
 
-    def echo(self, frame: npt.NDArray[Any]) -> Echo:
+    def echo(self, samples: npt.NDArray[Any]) -> Echo:
         """Echo of a frame as read."""
-        echo = self.extractor.echo(frame)
+        echo = self.extractor.echo(samples)
         return echo if self.of_echo else Echo(echo.intensity, None)
-
-    def equalised(self, echo: Echo) -> tuple[Float32Array, Float32Array]:
-        """Intensity and, where there is phase, echo over their local mean; see `Frame`.
-
-        What is silent or stands still counts in no mean and departs from none: a shadow's edge would be a
-        pattern that stays.
-        """
-        left_out, mask = self._silent(echo.intensity), self._mask
-        if left_out.any():
-            mask = ~left_out if mask is None else mask & ~left_out
-        if self._standing is not None:
-            left_out |= self._standing
-        gain = self.extractor.gain(echo.intensity, mask)
-        gain[left_out] = 0.0
-        if echo.analytic is None:
-            image, parts = echo.intensity * gain, np.empty((2, 0, 0), np.float32)
-        else:
-            image, parts = np.empty_like(gain), np.empty((2, *gain.shape), np.float32)
-            amplify(echo.analytic, gain, image, parts)
-        image[left_out] = 1.0
-        return image, parts
 
     def _silent(self, intensity: Float32Array) -> BoolArray:
         """Samples in rows of patches whose vector holds no echo there: a shadow, no contact."""
@@ -219,23 +237,22 @@ class FrameMatcher:
             silent[:, top : top + high] = (power < _SILENT * np.sort(power)[3 * power.size // 4])[:, None]
         return silent
 
-    def prepare(self, echo: Echo, usable: BoolArray | None = None) -> Frame:
+    def prepare(self, echo: Echo, usable: BoolArray, counted: BoolArray) -> Frame:
         """Equalise an echo and transform it for the coarse search.
 
         Parameters
         ----------
-        usable : ndarray of bool, shape (p,), optional
-            Patches that may be matched; by default all in the region.
+        usable : ndarray of bool, shape (p,)
+            Patches that may be matched.
+        counted : ndarray of bool, shape (vector, grid.samples)
+            Samples that may.
         """
-        image, parts = self.equalised(echo)
-        matched_patches = self.patches.inside if usable is None else self.patches.inside & usable
-        # Only what lies in the region and moves is searched for.
-        moving = image if self._mask is None else np.where(self._mask, image, image[self._mask].mean())
-        if self._pool[1] == 2:
-            even = moving.shape[1] // 2 * 2
-            moving = moving[:, 0:even:2] + moving[:, 1:even:2]
-        spectrum = fft.rfft2(moving - moving.mean(), self._lengths)
-        return Frame(matched_patches, image, parts, spectrum)
+        image, parts = self.extractor.equalised(echo, counted)
+        pool = int(self._pool[1])
+        end = image.shape[1] // pool * pool
+        pooled = np.add.reduce([image[:, first:end:pool] for first in range(pool)])
+        spectrum = fft.rfft2(pooled - pooled.mean(), self._lengths)
+        return Frame(usable, image, parts, spectrum)
 
     def search(self, fixed: Frame, moving: Frame) -> FloatArray:
         """In-plane motion (x, y, roll) to the nearest sample, by the correlation of whole frames."""

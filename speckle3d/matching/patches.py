@@ -53,10 +53,10 @@ class PatchGrid:
         Vector pitch, of a fan at its middle depth, and sample spacing.
     inside : ndarray of bool, shape (p,)
         Patches in the region that counts.
+    region : ndarray of bool, shape (vector, sample)
+        Samples of the image in it.
     step_rad : float
         Angle between neighbouring vectors.
-    region : ndarray of bool, shape (vector, sample), optional
-        Samples of the image that count, where not all do.
     """
 
     first: IntArray
@@ -67,8 +67,8 @@ class PatchGrid:
     pitch_mm: FloatArray
     spacing_mm: FloatArray
     inside: BoolArray
+    region: BoolArray
     step_rad: float = 0.0
-    region: BoolArray | None = None
 
     def __len__(self) -> int:
         return int(self.first.shape[0])
@@ -138,15 +138,16 @@ def lay_patches(grid: ImageGrid, settings: PatchSettings | None = None) -> Patch
     first = np.stack([v.ravel(), d.ravel()], axis=1).astype(np.int64)
     vector, sample = (first + (size - 1) / 2).T
     depth, angle = grid.first_sample_depth_mm + sample * spacing[1], grid.angle_rad(vector)
-    pitch, step, inside = np.full(len(first), spacing[0]), 0.0, np.ones(len(first), dtype=bool)
+    pitch, step = np.full(len(first), spacing[0]), 0.0
     if grid.fan is not None:
         step = grid.fan.step_rad
         pitch = (grid.fan.radius_mm + depth) * step
-    patches = PatchGrid(first, size, grid.mm(vector, sample), depth, angle, pitch, spacing, inside, step)
-    if s.region:
-        # Most of a patch must lie in the region.
-        mask = Region(s.region).mask(grid)
-        patches = replace(patches, region=mask, inside=patches.tiles(mask).mean(axis=(1, 2)) >= 0.5)
+    everywhere = np.ones((grid.vectors, grid.samples), dtype=bool)
+    region = Region(s.region).mask(grid) if s.region else everywhere
+    centre_mm, inside = grid.mm(vector, sample), np.ones(len(first), dtype=bool)
+    patches = PatchGrid(first, size, centre_mm, depth, angle, pitch, spacing, inside, region, step)
+    # Most of a patch must lie in the region.
+    patches = replace(patches, inside=patches.tiles(region).mean(axis=(1, 2)) >= 0.5)
     rows_inside = np.asarray(patches.rows_of(patches.inside).any(axis=1))
     if (count := rows_inside.sum()) < 2:
         raise InvalidInputError(f"region: expected two rows of patches in it, got {count}: {s.region}")

@@ -92,25 +92,24 @@ class Texture:
         size, power = (np.where(usable, values, np.nan) for values in (size, power))
         self._looks[number] = _Look(size, power, level, sample_power, _unit_echoes(local_tiles))
 
+    def leave_out(self, bad: BoolArray) -> None:
+        """Forget the frames of a sweep, shape (n,), that are bad, unless all are."""
+        self._looks = {k: look for k, look in self._looks.items() if not bad[k]} or self._looks
+
     @property
     def frames(self) -> IntArray:
         """Numbers of the frames that were looked at, increasing."""
         return np.array(sorted(self._looks), dtype=np.int64)
 
-    def speckle_size(self, usable: BoolArray | None = None) -> SpeckleSize:
+    def speckle_size(self) -> SpeckleSize:
         """Lateral and axial size of speckle in each row of patches.
-
-        Parameters
-        ----------
-        usable : ndarray of bool, shape (n,), optional
-            Frames that count, if any of those that were looked at do.
 
         Returns
         -------
         SpeckleSize
             Of shape (r,); NaN where too few patches hold fully developed speckle.
         """
-        rows = np.moveaxis(self._rows("size", usable), 0, -1)
+        rows = np.moveaxis(self._rows("size"), 0, -1)
         measured_rows = np.isfinite(rows).sum(axis=(2, 3)) >= LEAST_PATCHES
         size = np.full(measured_rows.shape, np.nan)
         size[measured_rows] = np.nanmedian(rows[measured_rows], axis=(1, 2))
@@ -124,7 +123,7 @@ class Texture:
         low, middle, high = np.concatenate(levels, axis=1)
         return float(np.median(middle - low) / max(float(np.median(high - middle)), 1e-9))
 
-    def spectra(self, usable: BoolArray | None = None) -> EchoSpectra | None:
+    def spectra(self) -> EchoSpectra | None:
         """Power spectrum within the band that is matched, at each row of patches; None without phase.
 
         RF and I/Q of one sweep have the same: both are band-passed and resampled alike before they are
@@ -132,7 +131,7 @@ class Texture:
         """
         if not (self._of_echo and isinstance(self.signal, RFSettings)):
             return None
-        rows = self._rows("power", usable)
+        rows = self._rows("power")
         rows_seen = np.isfinite(rows).any(axis=(0, 1, 3))
         if not rows_seen.any():
             return None
@@ -182,11 +181,9 @@ class Texture:
         common = echoes @ echoes.transpose(0, 2, 1)
         return np.asarray(np.median(common[:, *at.reshape(-1, 2).T], axis=1), dtype=float)
 
-    def _rows(self, name: str, usable: BoolArray | None) -> FloatArray:
-        """Values of the usable frames, or of all if none is, by rows and columns, shape (n, k, r, c)."""
-        frames = self.frames
-        sound = frames if usable is None or not usable[frames].any() else frames[usable[frames]]
-        return self._patches.rows_of(np.stack([getattr(self._looks[k], name) for k in sound.tolist()]))
+    def _rows(self, name: str) -> FloatArray:
+        """Values of all frames by rows and columns, shape (n, k, r, c)."""
+        return self._patches.rows_of(np.stack([getattr(self._looks[k], name) for k in self.frames.tolist()]))
 
 
 def measured_texture(sweep: Sweep, matcher: FrameMatcher) -> Texture:

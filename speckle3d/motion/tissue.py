@@ -18,7 +18,7 @@ import numpy as np
 from scipy.ndimage import uniform_filter1d
 from scipy.stats import theilslopes
 
-from speckle3d.core.arrays import BoolArray, FloatArray
+from speckle3d.core.arrays import FloatArray
 from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.matching.quality import FrameFeatures
 from speckle3d.matching.table import CorrelationTable
@@ -70,15 +70,9 @@ class TissueCurves:
     structure: float
 
 
-def tissue_curves(curves: DecorrelationCurves, texture: Texture, usable: BoolArray) -> TissueCurves:
-    """Stretch curves of a phantom for a sweep's attenuation and structure.
-
-    Parameters
-    ----------
-    usable : ndarray of bool, shape (n,)
-        Frames whose spectra count.
-    """
-    attenuation = estimate_attenuation(curves, texture.spectra(usable))
+def tissue_curves(curves: DecorrelationCurves, texture: Texture) -> TissueCurves:
+    """Stretch curves of a phantom for a sweep's attenuation and structure."""
+    attenuation = estimate_attenuation(curves, texture.spectra())
     structure = 0.0 if curves.of_tissue else structure_openness(texture)
     if structure:
         curves = replace(stretched(curves, np.array(structure)), of_tissue=True)

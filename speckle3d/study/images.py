@@ -98,7 +98,9 @@ class GreyImages:
             # One level for the whole sweep. For looking, the 99.9th percentile, so that one specular echo
             # does not darken it; for measuring an echo's place, the brightest, so that none is cut off.
             frames = [len(sweep) // 2] if clipped else np.linspace(0, len(sweep) - 1, _GLANCES).astype(int)
-            images = [_decibel(self._extractor.intensity(read_frame(sweep.frames, int(i)))) for i in frames]
+            images = [
+                _decibel(self._extractor.echo(read_frame(sweep.frames, int(i))).intensity) for i in frames
+            ]
             self._brightest = max(float(np.percentile(image, 99.9 if clipped else 100)) for image in images)
 
     @property
@@ -113,7 +115,7 @@ class GreyImages:
     def _levels_of(self, frame: npt.NDArray[Any]) -> npt.NDArray[Any]:
         if self._levels == "stored":
             return frame
-        intensity = self._extractor.intensity(frame)
+        intensity = self._extractor.echo(frame).intensity
         if self._levels == "linear":
             return np.asarray(np.sqrt(intensity), dtype=np.float32)
         level = 1 + (_decibel(intensity) - self._brightest) / self._range_db

@@ -38,7 +38,7 @@ def test_motion_in_the_plane_of_a_fan(grid, motion):
     frames = np.stack([frame(grid, field, margin, m) for m in (np.zeros(3), motion)])
     sweep = Sweep(frames, grid, BModeSettings(60.0), np.arange(2.0))
     matcher = FrameMatcher(sweep)
-    first, second = (matcher.prepare(matcher.echo(f)) for f in frames)
+    first, second = (matcher.ready(f).frame for f in frames)
     match = matcher.match({0: first}, 1, second, [matcher.search(first, second)])
     # The same field is seen again: within a fifth of a sample, and no elevational motion to read.
     np.testing.assert_allclose(match.inplane[0, :2], motion[:2], atol=0.016)

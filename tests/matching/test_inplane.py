@@ -57,7 +57,7 @@ def pair(seed, motion=(0.0, 0.0, 0.0), rho=1.0, spectrum=speckle.gaussian, strai
 
 
 def prepare(echo, matcher=MATCHER, of_echo=False):
-    frame = matcher.prepare(Echo(speckle.intensity(echo), None))
+    frame = matcher.prepare(Echo(speckle.intensity(echo), None), PATCHES.inside, PATCHES.region)
     parts = np.stack([echo.real, echo.imag]).astype(np.float32)
     return frame._replace(echo=parts) if of_echo else frame
 

@@ -10,7 +10,7 @@ from scipy import fft
 
 from speckle3d.core.grid import ImageGrid
 from speckle3d.core.sweep import BModeSettings, RFSettings
-from speckle3d.matching.intensity import IntensityExtractor
+from speckle3d.matching.intensity import Echo, IntensityExtractor
 
 RF = RFSettings(66.67e6, 1540.0, 7e6, (5e6, 10e6))
 GRID = ImageGrid(6, 1800, 0.3, RF.sample_spacing_mm)
@@ -55,7 +55,7 @@ def test_resampled_intensity_is_the_plain_one_at_its_samples(signal, samples):
     at = step(package, signal) * np.arange(package.grid.samples)
     assert samples - 1 - step(package, signal) < at[-1] <= samples - 1
     expected = plain_intensity(rf, signal, at)
-    intensity = package.intensity(rf)
+    intensity = package.echo(rf).intensity
     assert intensity.shape == (6, package.grid.samples) == expected.shape
     # The filter's tail, cut where the package pads and the plain one does not, is 1e-4 of the amplitude.
     np.testing.assert_allclose(intensity, expected, rtol=2e-3, atol=1e-3 * expected.mean())
@@ -83,7 +83,7 @@ def test_i_and_q_give_what_their_rf_gives(middle_hz, every):
     )
     of_rf, of_iq = extractor(signal, samples), extractor(baseband, samples // every)
     iq = demodulate(rf, signal, middle_hz, every).astype(np.complex64)
-    expected, intensity = of_rf.intensity(rf.astype(np.float32)), of_iq.intensity(iq)
+    expected, intensity = (e.echo(f).intensity for e, f in ((of_rf, rf.astype(np.float32)), (of_iq, iq)))
     # 4 um at 40 mm: 1e-4 of the rate, of which the echoes' speckle of 0.1 mm sees 1e-3.
     assert abs(of_iq.grid.sample_spacing_mm / of_rf.grid.sample_spacing_mm - 1) < 1e-4
     count = min(expected.shape[1], intensity.shape[1])
@@ -99,7 +99,7 @@ def test_i_and_q_give_what_their_rf_gives(middle_hz, every):
 def test_log_compression_is_undone(decibel, dynamic_range, full):
     bmode = IntensityExtractor(BModeSettings(dynamic_range, full), ImageGrid(2, 3, 0.1, 0.1))
     grey = full * (1 + decibel / dynamic_range)
-    intensity = bmode.intensity(np.full((2, 3), grey))
+    intensity = bmode.echo(np.full((2, 3), grey)).intensity
     np.testing.assert_allclose(intensity, 10 ** (decibel / 10), rtol=1e-4)  # float32 of a 60 dB range
 
 
@@ -130,7 +130,7 @@ def test_equalising_leaves_the_correlation_of_speckle_and_takes_away_that_of_bri
     two_views, ramp, equaliser
 ):
     ramps = [view * ramp for view in two_views]
-    levels = [view * equaliser.gain(view) for view in ramps]
+    levels = [equaliser.equalised(Echo(view, None), view >= 0.0)[0] for view in ramps]
     plain, steep, level = (np.corrcoef(a.ravel(), b.ravel())[0, 1] for a, b in (two_views, ramps, levels))
     assert abs(level - plain) < 0.04
     assert steep > plain + 0.1

@@ -24,7 +24,7 @@ def match(matcher, fixed, moving, start=None):
 def test_neighbouring_frames_are_matched(realdata):
     sweep = load_sweep(realdata / "rf" / "MouseLiverRF.mha", MOUSE)
     matcher = FrameMatcher(sweep)
-    frames = [matcher.prepare(matcher.echo(sweep.frames[i])) for i in range(len(sweep))]
+    frames = [matcher.ready(sweep.frames[i]).frame for i in range(len(sweep))]
     for fixed, moving in pairwise(frames):
         motion, correlation = match(matcher, fixed, moving)
         finite = np.isfinite(correlation)

@@ -27,7 +27,7 @@ def features_of(frames, signal, grid):
     extractor = IntensityExtractor(signal, grid)
     patches, is_bmode = lay_patches(extractor.grid), isinstance(signal, BModeSettings)
     with np.errstate(all="ignore"):
-        images = [extractor.intensity(frame) for frame in frames]
+        images = [extractor.echo(frame).intensity for frame in frames]
     return [inspect_frame(*pair, patches, is_bmode) for pair in zip(frames, images, strict=True)]
 
 
@@ -93,7 +93,7 @@ def good(request):
 def grey(frame, signal, grid):
     """The frame as a log-compressed image of 60 dB, white 22 dB above the phantom's mean intensity."""
     extractor = IntensityExtractor(signal, grid)
-    decibel = 10 * np.log10(extractor.intensity(frame) + 1e-9)
+    decibel = 10 * np.log10(extractor.echo(frame).intensity + 1e-9)
     return np.clip(np.rint(255 * (1 + (decibel - 75) / 60)), 0, 255).astype(np.uint8), extractor.grid
 
 

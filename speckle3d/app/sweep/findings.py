@@ -10,11 +10,10 @@ from speckle3d.config import Config
 from speckle3d.core.arrays import IntArray
 from speckle3d.core.doubts import Doubt
 from speckle3d.core.reconstruction import Reconstruction
-from speckle3d.core.sweep import BModeSettings, Sweep, read_frame
+from speckle3d.core.sweep import Sweep, read_frame
 from speckle3d.examine.sensors import repair_readings
-from speckle3d.matching.intensity import IntensityExtractor
-from speckle3d.matching.patches import lay_patches
-from speckle3d.matching.quality import FrameFeatures, FrameFlag, flag_frames, inspect_frame
+from speckle3d.matching.matcher import FrameMatcher
+from speckle3d.matching.quality import FrameFeatures, FrameFlag, flag_frames
 
 REASONS = {
     FrameFlag.FROZEN: "bit for bit the frame before, which the recorder repeated",
@@ -58,15 +57,12 @@ class FrameFindings:
         self.flags: IntArray | None = None if trust is None else trust.flags
         self.doubts = repair_readings(sweep)[1] if doubts is None else tuple(doubts)
         if trust is None:
-            self._extractor = IntensityExtractor(sweep.signal, sweep.grid, config.intensity)
-            self._patches = lay_patches(self._extractor.grid, config.patches)
+            self._matcher = FrameMatcher(sweep, config)
 
     def judge_next(self) -> None:
         """Look at one more frame; after the last all have their flags."""
         samples = read_frame(self._sweep.frames, len(self._features))
-        intensity = self._extractor.intensity(samples)
-        is_bmode = isinstance(self._sweep.signal, BModeSettings)
-        self._features.append(inspect_frame(samples, intensity, self._patches, is_bmode, self._quality))
+        self._features.append(self._matcher.ready(samples).features)
         if len(self._features) == len(self._sweep):
             self.flags = flag_frames(self._features, self._quality)
 

@@ -116,7 +116,7 @@ class SweepPairs:
         return correlation, centre * motion * centre.inv()
 
     def _make_ready(self, frame: int) -> Frame:
-        return self._matcher.prepare(self._matcher.echo(read_frame(self._sweep.frames, frame)))
+        return self._matcher.ready(read_frame(self._sweep.frames, frame)).frame
 
     def _row(self, first: int, second: int) -> int | None:
         if self._pairs is None:

@@ -19,7 +19,7 @@ def rows(path, runs):
     """One row; the coefficients are the same to 1e-4 where all lags lie in the image."""
     sweep, config = load_sweep(path), Config()
     matcher = FrameMatcher(sweep, config)
-    fixed, moving = (matcher.prepare(matcher.echo(sweep.frames[i])).image for i in (0, 1))
+    fixed, moving = (matcher.ready(sweep.frames[i]).frame.image for i in (0, 1))
     patches = matcher.patches
     rho, lag = np.empty((len(patches), 5)), np.zeros((len(patches), 2), dtype=np.int64)
 
