@@ -7,7 +7,6 @@ RF -> intensity -> in-plane motion -> patch correlation -> |distance| and sigma 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 
@@ -16,7 +15,7 @@ from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.progress import Progress
 from speckle3d.core.reconstruction import FramePairs
-from speckle3d.core.sweep import BModeSettings, RFSettings, Sweep
+from speckle3d.core.sweep import Sweep
 from speckle3d.examine.curves import examine_key
 from speckle3d.examine.disagreements import disagreements
 from speckle3d.examine.images import examine_echoes, examine_images, examine_processing
@@ -26,10 +25,10 @@ from speckle3d.matching.matcher import FrameMatcher
 from speckle3d.matching.quality import placed_flags, require_placed
 from speckle3d.matching.schedule import PairSchedule
 from speckle3d.motion.direction import settle_direction
-from speckle3d.motion.estimate import Motion, estimate_motion, frame_pairs
+from speckle3d.motion.estimate import estimate_motion, frame_pairs
 from speckle3d.motion.planes import MotionProblem
 from speckle3d.motion.subset import consistent_poses
-from speckle3d.motion.tissue import averaging_loss, tissue_curves
+from speckle3d.motion.tissue import averaging_loss, compression_error, tissue_curves
 from speckle3d.tracked import Tracked
 
 PairSink = Callable[[FramePairs], None]
@@ -61,23 +60,21 @@ def track(
     motion = estimate_motion(problem, matches.table, matches.sound)
     flags = placed_flags(matches.flags, motion.unplaced)
 
-    sensors = examine_sensors(sweep, motion.poses, settings.sensors.examine)
-    direction, source = settle_direction(
-        sensors.credible, motion.poses, settings.sensors, sensors.tells_direction
-    )
+    credible, sensor_doubts = examine_sensors(sweep, motion.poses, settings.sensors.examine)
+    direction, source = settle_direction(credible, motion.poses, settings.sensors, sensor_doubts)
     motion = motion.mirrored() if direction < 0 else motion
-    subset = consistent_poses(motion, sensors.credible, settings.sensors)
+    subset = consistent_poses(motion, credible, settings.sensors)
 
     mismatch = motion.problem.curves.mismatch(settings.curves.same_probe, tissue.attenuation.log_length_sigma)
     averaging = averaging_loss(matches.table.where(matches.sound), matches.features)
-    compression = _compression_error(sweep, matcher.signal, settings, motion)
+    compression = compression_error(matcher.signal) if curves.origin == "data sheet" else 0.0
     error = float(np.linalg.norm([mismatch, averaging, compression]))
     shared, covariance = motion.claims(float(np.hypot(error, tissue.structure)))
 
     doubts += tissue.attenuation.doubts + examine_processing(tissue.structure, averaging)
     # What structure leaves open is told by itself.
     doubts += examine_images(matches, motion, motion.claims(error)[1], tissue.unattenuated, flags == 0)
-    doubts += sensors.doubts + disagreements(sensors.credible, motion.poses, covariance)
+    doubts += sensor_doubts + disagreements(credible, motion.poses, covariance)
     if sink:
         sink(frame_pairs(motion, subset.used, shared.length_sigma))
     return Tracked(
@@ -97,25 +94,3 @@ def track(
         grid=sweep.grid,
         frame_time_s=sweep.frame_time_s,
     )
-
-
-def _compression_error(
-    sweep: Sweep, signal: RFSettings | BModeSettings, config: Config, motion: Motion
-) -> float:
-    """Relative standard deviation of distances by a dynamic range, that of `signal`, if it is estimated.
-
-    One that is wider by its deviation is tried: what it does to fully developed speckle's correlation, a
-    tenth of what comes out, can be calculated, what it does to structure and to black and white cannot.
-    Curves measured with images compressed alike have its error in them.
-    """
-    curves = motion.problem.curves
-    if not isinstance(signal, BModeSettings) or curves.origin != "data sheet":
-        return 0.0
-    if not signal.dynamic_range_sigma_db:
-        return 0.0
-    range_db = signal.dynamic_range_db + signal.dynamic_range_sigma_db
-    wider = replace(signal, dynamic_range_db=range_db, dynamic_range_sigma_db=0.0)
-    matcher = FrameMatcher(replace(sweep, signal=wider), config, curves)
-    matches = match_sweep(sweep, matcher, PairSchedule(motion.problem.trajectory))
-    wide_motion = estimate_motion(motion.problem, matches.table, matches.sound)
-    return abs(float(np.log(np.ptp(wide_motion.path[:, 0]) / np.ptp(motion.path[:, 0]))))

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from speckle3d.core.arrays import BoolArray, FloatArray
+from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.compression import USUAL_PIXEL_MM, estimate_dynamic_range
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.extras import extra_module
@@ -70,6 +70,11 @@ def read_frame(frames: Frames, index: int) -> npt.NDArray[Any]:
         return frames[index]
     with _READING:
         return np.array(frames[index])
+
+
+def spread_frames(count: int, most: int) -> IntArray:
+    """Every frame of a short sweep, evenly spread ones of a long one, both ends included."""
+    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(np.int64))
 
 
 @dataclass(frozen=True)

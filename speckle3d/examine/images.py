@@ -336,8 +336,7 @@ def doubt_path(
     usable : ndarray of bool, shape (n,)
     """
     low, high = ALIKE
-    rows = np.flatnonzero((table.median > low) & (table.median < high))
-    rows = rows[usable[table.first[rows]] & usable[table.second[rows]]]
+    rows = np.flatnonzero((table.median > low) & (table.median < high) & table.joins(usable))
     rows = rows[np.argsort(-table.median[rows], kind="stable")]
     if rows.size < LEAST_PAIRS or len(patch_centre_mm) < FOLD_PATCHES:
         return None

@@ -7,11 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
-from typing import Any, NamedTuple
+from functools import partial
+from typing import Any
 
 import numpy as np
 from scipy.ndimage import median_filter
 from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.stats import median_abs_deviation
 
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.doubts import Doubt
@@ -19,8 +21,6 @@ from speckle3d.core.errors import MismatchError
 from speckle3d.core.geometry import nearest_rotation
 from speckle3d.core.leastsquares import robust_sigma
 from speckle3d.core.sweep import OrientationSensor, Sweep, Tracker
-from speckle3d.examine.conventions import doubts_of_gravity, doubts_of_gyroscope
-from speckle3d.motion.direction import LEAST_FRAMES
 
 LONGEST_STILL_S = 0.5
 """Beyond which unchanged readings are told: loggers repeat one until the next."""
@@ -42,28 +42,23 @@ _SLIP = float(np.deg2rad(300.0)), 250.0
 """Rates, rad/s and mm/s, of no scan, from one reading to the next."""
 _STILL = 1e-9
 """Readings closer than this are the same: noise moves the last digits of any sensor that is read."""
+TURN_S = 0.3
+"""A hand's wobble turns round within this time; over longer ones a gyroscope's bias counts."""
+WALK_DEG, SCALE_ERROR = 0.03, 0.05
+"""Random walk of a gyroscope over `TURN_S`, and the share of a turn by which readings honestly differ."""
+LEAST_GAIN = 4.0
+"""Logarithm of the likelihood by which a convention must explain the gyroscope better: good simulated sensors
+gain up to 0.1, faulty ones from 5."""
+MOST_BIAS_DEG_S = 3.0
+"""Biases of gyroscopes in orientation sensors are below 1 degree/s once they have stood still."""
+TILTED_DEG = 10.0
+"""Angle between gravity and the world's z that contradicts a sensor."""
 
 
-class SensorVerdict(NamedTuple):
-    """What may be used of a sweep's sensors.
-
-    Attributes
-    ----------
-    credible : Sweep
-        Without the sensors that contradict themselves.
-    tells_direction : bool
-        Whether a gyroscope or the images' roll confirm how the orientation sensor turns, without which it
-        tells no sign of the motion.
-    doubts : tuple of Doubt
-    """
-
-    credible: Sweep
-    tells_direction: bool
-    doubts: tuple[Doubt, ...]
-
-
-def examine_sensors(sweep: Sweep, image: RigidTransform, examine: bool = True) -> SensorVerdict:
-    """Examine the sensors of a sweep, or trust them all.
+def examine_sensors(
+    sweep: Sweep, image: RigidTransform, examine: bool = True
+) -> tuple[Sweep, tuple[Doubt, ...]]:
+    """The sweep without what its sensors contradict themselves in, and the doubts; or trust them all.
 
     Parameters
     ----------
@@ -71,23 +66,17 @@ def examine_sensors(sweep: Sweep, image: RigidTransform, examine: bool = True) -
         Image-based poses, of either sign of the elevational motion: they tell whether the probe moved.
     """
     if not examine:
-        return SensorVerdict(sweep, True, ())
-    repaired, doubts = repair_readings(sweep)
-    left = credible_sensors(repaired, doubts)
-    for sensor in (left.tracker, left.orientation):
+        return sweep, ()
+    sweep, doubts = repair_readings(sweep)
+    sweep = credible_sensors(sweep, doubts)
+    for sensor in (sweep.tracker, sweep.orientation):
         if sensor is not None:
-            odd = (*_doubt_still(sensor, sweep, image), *_doubt_jitter(sensor))
+            place, turn = jitter(rigid(sensor.readings.world_from_sensor), np.zeros(3))
+            odd = (*_doubt_still(sensor, sweep, image), *_doubt_jitter(sensor.label, place, turn))
             if not odd and isinstance(sensor, OrientationSensor):
-                _, turn_jitter = jitter(rigid(sensor.readings.world_from_sensor), np.zeros(3))
-                odd = (*doubts_of_gyroscope(sensor, turn_jitter), *doubts_of_gravity(sensor))
+                odd = (*doubts_of_gyroscope(sensor, turn), *doubts_of_gravity(sensor))
             doubts += odd
-    credible = credible_sensors(left, doubts)
-    sensor, suspects = credible.orientation, {doubt.about for doubt in doubts}
-    tells_direction = sensor is not None and (
-        (sensor.gyroscope_rad_s is not None and sensor.label not in suspects)
-        or _roll_agrees(sensor, sweep, image)
-    )
-    return SensorVerdict(credible, tells_direction, doubts)
+    return credible_sensors(sweep, doubts), doubts
 
 
 def repair_readings(sweep: Sweep) -> tuple[Sweep, tuple[Doubt, ...]]:
@@ -127,13 +116,12 @@ def require_credible(doubts: Iterable[Doubt], sensor: OrientationSensor | Tracke
             raise MismatchError(f"{where}: {doubt}; sensors.examine = false uses it as it is")
 
 
-def _doubt_jitter(sensor: OrientationSensor | Tracker) -> Iterator[Doubt]:
-    place, turn = jitter(rigid(sensor.readings.world_from_sensor), np.zeros(3))
+def _doubt_jitter(label: str, place_mm: float, turn_rad: float) -> Iterator[Doubt]:
     # A step varies twice as much as a reading.
-    size = np.sqrt(2.0) * place, np.sqrt(2.0) * np.rad2deg(turn)
+    size = np.sqrt(2.0) * place_mm, np.sqrt(2.0) * np.rad2deg(turn_rad)
     if max(size) > DOUBTFUL_JITTER:
         evidence = f"expected a steady path, got a jitter of {size[0]:.2g} mm and {size[1]:.2g} degrees"
-        yield Doubt(sensor.label, "noise or scrambled values", evidence, max(size) > ABSURD_JITTER)
+        yield Doubt(label, "noise or scrambled values", evidence, max(size) > ABSURD_JITTER)
 
 
 def _doubt_jumps(sensor: OrientationSensor | Tracker, frame_time_s: FloatArray) -> Iterator[Doubt]:
@@ -169,18 +157,90 @@ def _doubt_still(sensor: OrientationSensor | Tracker, sweep: Sweep, image: Rigid
         yield Doubt(sensor.label, "frozen", evidence, same_s > MOST_STILL * whole_s, where)
 
 
-ROLL_SHARE = 0.6
-"""Share of the variance of the images' roll that a sensor must have in common with it to confirm it."""
+def conventions(turned: Rotation) -> Iterator[tuple[str, Rotation]]:
+    """Readings as they would be if a convention had been mistaken, and its name."""
+    xyzw = turned.as_quat()
+    yield "quaternions stored xyzw for wxyz", Rotation.from_quat(xyzw[:, [3, 0, 1, 2]])
+    yield "quaternions wxyz taken for xyzw", Rotation.from_quat(xyzw[:, [1, 2, 3, 0]])
+    yield "quaternions inverted", turned.inv()
+    for axis, unit in zip("xyz", np.eye(3), strict=True):
+        flip = np.diag(1.0 - 2.0 * unit)
+        yield f"handedness: {axis} mirrored", Rotation.from_matrix(flip @ turned.as_matrix() @ flip)
 
 
-def _roll_agrees(sensor: OrientationSensor, sweep: Sweep, image: RigidTransform) -> bool:
-    """Whether roll, which images know well, is the sensor's."""
-    frames = np.flatnonzero(sensor.covers(sweep.frame_time_s))
-    if sensor.sensor_from_image is None or frames.size < LEAST_FRAMES:
-        return False
-    rotations = sensor.world_from_image(sweep.frame_time_s[frames]), image[frames].rotation
-    sensor_roll, image_roll = ((turns[0].inv() * turns).as_rotvec()[:, 2] for turns in rotations)
-    return bool(np.var(sensor_roll - image_roll) < (1.0 - ROLL_SHARE) * np.var(image_roll))
+_spread = partial(median_abs_deviation, scale="normal")
+"""Robust standard deviation by column."""
+
+
+def doubts_of_gyroscope(sensor: OrientationSensor, jitter_rad: float) -> Iterator[Doubt]:
+    """At most one: the convention in which readings turn as the gyroscope, or that they do not.
+
+    A turn has the jitter of two readings.
+    """
+    rate, time_s, readings = sensor.gyroscope_rad_s, sensor.readings.time_s, sensor.readings.world_from_sensor
+    if rate is None or len(time_s) < 2:
+        return
+    pause = np.diff(time_s)
+    lag = max(1, round(TURN_S / float(np.median(pause))))
+    if len(time_s) <= 2 * lag:
+        return
+    angle = np.cumsum((rate[1:] + rate[:-1]) / 2 * pause[:, None], axis=0)
+    angle = np.concatenate([np.zeros((1, 3)), angle])
+    turns = np.rad2deg(angle[lag:] - angle[:-lag])
+    noise = WALK_DEG + np.sqrt(2.0) * np.rad2deg(jitter_rad) + SCALE_ERROR * float(_spread(turns).max())
+
+    def difference(turned: Rotation, sign: float = 1.0) -> FloatArray:
+        """Turns by the gyroscope, or the opposite ones, less those by readings, degrees."""
+        return sign * turns - (turned[:-lag].inv() * turned[lag:]).as_rotvec(degrees=True)
+
+    def misfit(left: FloatArray) -> float:
+        """Negative log likelihood but for a bias; overlapping turns count once."""
+        return float(len(turns) / lag * np.log(_spread(left) ** 2 + noise**2).sum())
+
+    left = difference(readings)
+    upright = [
+        (misfit(left) - misfit(difference(other)), name)
+        for name, other in conventions(readings)
+        if not _gravity_from_vertical(sensor, other) > TILTED_DEG
+    ]
+    gain, name = max(upright, default=(0.0, ""))
+    still = misfit(left) - misfit(turns)
+    bias = float(np.linalg.norm(np.median(left, axis=0))) / (lag * float(np.median(pause)))
+    contradicted = float(_spread(left).max()) > noise
+    # The gyroscope's sign may be the mistaken one.
+    if contradicted and gain > max(LEAST_GAIN, misfit(left) - misfit(difference(readings, -1.0))):
+        evidence = f"expected turns as its gyroscope's, so they fit better by {gain:.0f} in log likelihood"
+        yield Doubt(sensor.label, name, evidence, True)
+    # Readings that jitter beside a slow hand still turn as the gyroscope does, better than not at all.
+    elif contradicted and still > LEAST_GAIN:
+        evidence = f"expected turns as its gyroscope's, no turn fits better by {still:.0f} in log likelihood"
+        yield Doubt(sensor.label, "gyroscope on other axes, or quaternions of another kind", evidence, False)
+    elif bias > MOST_BIAS_DEG_S:
+        evidence = f"expected turns as its gyroscope's, got {bias:.1f} degrees/s more"
+        yield Doubt(sensor.label, "heading drift, or a gyroscope's bias", evidence, False)
+
+
+def doubts_of_gravity(sensor: OrientationSensor) -> Iterator[Doubt]:
+    """At most one: gravity is not along the world's z; refuted if a convention brings it there."""
+    readings = sensor.readings.world_from_sensor
+    degrees = _gravity_from_vertical(sensor, readings)
+    if not degrees > TILTED_DEG:
+        return
+    mended = [
+        name for name, other in conventions(readings) if _gravity_from_vertical(sensor, other) < TILTED_DEG
+    ]
+    suspect = (mended or ["a world whose z is not vertical, or an accelerometer on other axes"])[0]
+    evidence = f"expected gravity along the world's z, got it {degrees:.0f} degrees off"
+    yield Doubt(sensor.label, suspect, evidence, bool(mended))
+
+
+def _gravity_from_vertical(sensor: OrientationSensor, readings: Rotation) -> float:
+    """Angle between gravity, as readings turn it, and the world's z, degrees; NaN if not measured."""
+    if sensor.accelerometer_m_s2 is None:
+        return float("nan")
+    up = np.median(readings.apply(sensor.accelerometer_m_s2), axis=0)
+    size = float(np.linalg.norm(up))
+    return float(np.degrees(np.arccos(min(1.0, abs(float(up[2])) / size)))) if size > 0 else float("nan")
 
 
 def rigid(samples: RigidTransform | Rotation) -> RigidTransform:

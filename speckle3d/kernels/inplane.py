@@ -139,60 +139,6 @@ def _read(z: FloatArray, logarithmic: bool, lateral: float, axial: float) -> flo
 
 
 @njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
-def _robust_fit(
-    design: FloatArray, data: FloatArray, weight: FloatArray, solution: FloatArray, covariance: FloatArray
-) -> bool:
-    """Least squares with Huber weights; false, and nothing changed, if the places do not determine it."""
-    total, scale = weight, 0.0
-    for _ in range(_ROUNDS):
-        weighted = design * total.reshape(-1, 1)
-        normal = weighted.T @ design
-        if not np.linalg.det(normal) > _COLLINEAR * normal[0, 0] * normal[1, 1] * normal[2, 2]:
-            return False
-        copy_into(covariance, np.linalg.inv(normal))
-        copy_into(solution, covariance @ (weighted.T @ data))
-        size = np.abs(data - design @ solution) * np.sqrt(weight)
-        scale = MAD_TO_SIGMA * np.median(size) + 1e-12
-        total = weight * (_HUBER / np.maximum(size / scale, _HUBER))
-    covariance *= scale * scale
-    return True
-
-
-@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
-def _fit_fan(
-    design: FloatArray,
-    turn: FloatArray,
-    shift: FloatArray,
-    weight: FloatArray,
-    field: FloatArray,
-    covariance: FloatArray,
-) -> None:
-    """Improve a field fitted to shifts across and along vectors that are not parallel, as if they were.
-
-    Each of the two has its own robust standard deviation: along vectors it is far smaller.
-    """
-    sine, cosine = turn[:, :1].copy(), turn[:, 1:].copy()
-    rows = (np.hstack((cosine * design, -sine * design)), np.hstack((sine * design, cosine * design)))
-    total = (weight.copy(), weight.copy())
-    for _ in range(_ROUNDS):
-        normal, right = np.zeros((6, 6)), np.zeros(6)
-        for i in range(2):
-            weighted = rows[i] * total[i].reshape(-1, 1)
-            normal += weighted.T @ rows[i]
-            right += weighted.T @ shift[i]
-        inverse = np.linalg.inv(normal)
-        solution = inverse @ right
-        for i in range(2):
-            size = np.abs(shift[i] - rows[i] @ solution) * np.sqrt(weight)
-            scale = MAD_TO_SIGMA * np.median(size) + 1e-12
-            copy_into(total[i], weight * (_HUBER / np.maximum(size / scale, _HUBER)) / scale**2)
-    for i in range(2):
-        own = slice(3 * i, 3 * i + 3)
-        copy_into(field[i], solution[own])
-        copy_into(covariance[i], inverse[own, own])
-
-
-@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
 def _places(geometry: Geometry, field: FloatArray) -> FloatArray:
     """Shift of each patch across and along its vectors, in vectors and samples."""
     shift, sine, cosine = geometry.design @ field.T, geometry.turn[:, 0], geometry.turn[:, 1]
@@ -220,17 +166,35 @@ def _fit(
 ) -> bool:
     """Fit an affine field, shape (2, 3), to the patches' shifts across and along their vectors, shape (2, p).
 
-    False if they are too few.
+    Least squares with Huber weights; either shift has its own robust standard deviation: along vectors it is
+    far smaller. False, and nothing changed, if the places do not determine it.
     """
     rows = np.flatnonzero(weight > 0.0)
-    if rows.size < _LEAST_PATCHES:
+    design, turn, own = geometry.design[rows], geometry.turn[rows], weight[rows]
+    normal = (design * own.reshape(-1, 1)).T @ design
+    determined = np.linalg.det(normal) > _COLLINEAR * normal[0, 0] * normal[1, 1] * normal[2, 2]
+    if rows.size < _LEAST_PATCHES or not determined:
         return False
-    design, fitted = geometry.design, True
-    for axis in range(2):
-        fitted &= _robust_fit(design[rows], shift[axis][rows], weight[rows], field[axis], covariance[axis])
-    if fitted and geometry.step_rad > 0.0:
-        _fit_fan(design[rows], geometry.turn[rows], shift[:, rows], weight[rows], field, covariance)
-    return fitted
+    sine, cosine = turn[:, :1].copy(), turn[:, 1:].copy()
+    terms = (np.hstack((cosine * design, -sine * design)), np.hstack((sine * design, cosine * design)))
+    data, total, scale = (shift[0][rows], shift[1][rows]), (own.copy(), own.copy()), np.ones(2)
+    for _ in range(_ROUNDS):
+        joint, right = np.zeros((6, 6)), np.zeros(6)
+        for i in range(2):
+            weighted = terms[i] * (total[i] / scale[i] ** 2).reshape(-1, 1)
+            joint += weighted.T @ terms[i]
+            right += weighted.T @ data[i]
+        inverse = np.linalg.inv(joint)
+        solution, before = inverse @ right, scale.copy()
+        for i in range(2):
+            size = np.abs(data[i] - terms[i] @ solution) * np.sqrt(own)
+            scale[i] = MAD_TO_SIGMA * np.median(size) + 1e-12
+            copy_into(total[i], own * (_HUBER / np.maximum(size / scale[i], _HUBER)))
+    for i in range(2):
+        part = slice(3 * i, 3 * i + 3)
+        copy_into(field[i], solution[part])
+        copy_into(covariance[i], inverse[part, part] * (scale[i] / before[i]) ** 2)
+    return True
 
 
 @njit(cache=True, nogil=True, fastmath=False, error_model="numpy")

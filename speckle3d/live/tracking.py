@@ -271,8 +271,7 @@ class LiveTracker:
             return
         every = CorrelationTable.joined(tables[begin + 1 :])
         table = every.where(every.first >= begin, -begin).among(~self._matcher.overlaid)
-        bad = (flags[begin:] & ~FrameFlag.UNMATCHED) != 0
-        sound = ~bad[table.first] & ~bad[table.second]
+        sound = table.joins((flags[begin:] & ~FrameFlag.UNMATCHED) == 0)
         if not sound.any():
             return
         problem = replace(self._problem, frames=count - begin)

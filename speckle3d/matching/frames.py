@@ -8,14 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
-from speckle3d.core.sweep import Sweep, read_frame
+from speckle3d.core.sweep import Sweep, read_frame, spread_frames
 from speckle3d.core.threads import ahead
 from speckle3d.kernels.inplane import Frame
 from speckle3d.matching.matcher import FrameMatcher, Overlay, ReadyFrame, compose, inverse
 from speckle3d.matching.quality import FrameFeatures, FrameFlag, flag_frames
 from speckle3d.matching.schedule import KnownSchedule, PairSchedule
 from speckle3d.matching.table import CorrelationTable
-from speckle3d.matching.texture import FRAMES, Texture, spread_frames
+from speckle3d.matching.texture import FRAMES, Texture
 
 SEARCHES = 3
 """References against which the in-plane motion of a frame is searched, if it resembles none before: the last
@@ -53,8 +53,7 @@ class MatchedSweep:
     @property
     def sound(self) -> BoolArray:
         """Pairs both of whose frames hold speckle, shape (e,)."""
-        bad = (self.flags & ~FrameFlag.UNMATCHED) != 0
-        return np.asarray(~bad[self.table.first] & ~bad[self.table.second])
+        return self.table.joins((self.flags & ~FrameFlag.UNMATCHED) == 0)
 
 
 def match_sweep(
@@ -74,7 +73,7 @@ def match_sweep(
         Called with every intensity image.
     """
     pairing = FrameByFrame(matcher, schedule)
-    texture, texture_frames = Texture(matcher), spread_frames(len(sweep), FRAMES)
+    texture, texture_frames = Texture(matcher), spread_frames(len(sweep), FRAMES).tolist()
     overlay = Overlay()
     for number in texture_frames:
         overlay.add(matcher.echo(read_frame(sweep.frames, number)))

@@ -184,13 +184,12 @@ def _transform_lengths(samples: int, ratio: float) -> tuple[int, int]:
 
     The first fast pair is taken that has that ratio to `_RATIO_TOLERANCE`.
     """
-    out_length = fft.next_fast_len(int(np.ceil(samples / ratio)))
-    least = out_length
-    while out_length <= 2 * least:
-        length = fft.next_fast_len(round(out_length * ratio * (1 - _RATIO_TOLERANCE)))
-        if length % 2 == 0 and abs(length / (out_length * ratio) - 1) <= _RATIO_TOLERANCE:
+    least = fft.next_fast_len(int(np.ceil(samples / ratio)))
+    for out_length in range(least, 2 * least + 1):
+        length = 2 * round(out_length * ratio / 2)
+        fast = all(n == fft.next_fast_len(n) for n in (length, out_length))
+        if fast and abs(length / (out_length * ratio) - 1) <= _RATIO_TOLERANCE:
             return length, out_length
-        out_length = fft.next_fast_len(out_length + 1)
     return 2 * round(least * ratio / 2), least
 
 

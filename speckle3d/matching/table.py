@@ -57,6 +57,10 @@ class CorrelationTable:
         table = CorrelationTable(*(column[rows] for column in self._columns))
         return replace(table, first=table.first + shift, second=table.second + shift)
 
+    def joins(self, frames: BoolArray) -> BoolArray:
+        """Which pairs have both frames among some, shape (e,)."""
+        return np.asarray(frames[self.first] & frames[self.second])
+
     @classmethod
     def joined(cls, tables: Sequence[CorrelationTable]) -> CorrelationTable:
         """All pairs of several tables, one at least, in their order."""

@@ -16,7 +16,7 @@ from scipy.signal import welch
 
 from speckle3d.core.arrays import BoolArray, Complex64Array, Float32Array, FloatArray, IntArray
 from speckle3d.core.curves import EchoSpectra, SpeckleSize
-from speckle3d.core.sweep import RFSettings, Sweep, read_frame
+from speckle3d.core.sweep import RFSettings, Sweep, read_frame, spread_frames
 from speckle3d.matching.matcher import FrameMatcher, ReadyFrame
 
 FRAMES = 16
@@ -189,7 +189,7 @@ class Texture:
 def measured_texture(sweep: Sweep, matcher: FrameMatcher) -> Texture:
     """Read some frames of a sweep, and measure their texture."""
     texture = Texture(matcher)
-    for number in spread_frames(len(sweep), FRAMES):
+    for number in spread_frames(len(sweep), FRAMES).tolist():
         samples = read_frame(sweep.frames, number)
         texture.keep(number, samples, matcher.ready(samples))
     return texture
@@ -202,11 +202,6 @@ def mean_spectra(spectra: Sequence[EchoSpectra]) -> EchoSpectra | None:
     first = spectra[0]
     power = np.mean([spectrum.at(first.depth_mm, first.frequency_hz) for spectrum in spectra], axis=0)
     return EchoSpectra(first.depth_mm, first.frequency_hz, power)
-
-
-def spread_frames(frames: int, count: int) -> list[int]:
-    """Choose at most so many of a sweep's frames, evenly spread."""
-    return [int(k) for k in np.unique(np.linspace(0, frames - 1, count).round())]
 
 
 def _powers(echo: Complex64Array) -> FloatArray:

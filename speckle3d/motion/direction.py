@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import FloatArray
+from speckle3d.core.doubts import Doubt
 from speckle3d.core.sweep import OrientationSensor, Sweep, Tracker, image_orientation
 
 LEAST_DEVIATIONS = 2.5
@@ -16,6 +19,8 @@ SAME_CORRELATION = 0.95
 """Correlation at which turns are one motion's, however few of them there are."""
 LEAST_FRAMES = 20
 """Frames with readings from which turns are compared."""
+ROLL_SHARE = 0.6
+"""Share of the variance of the images' roll that a sensor must have in common with it to confirm it."""
 
 
 class SensorSettings(BaseModel):
@@ -61,19 +66,20 @@ def sensed_orientation(sweep: Sweep, settings: SensorSettings) -> Rotation | Non
 
 
 def settle_direction(
-    sweep: Sweep, image: RigidTransform, settings: SensorSettings, tells_direction: bool = True
+    sweep: Sweep, image: RigidTransform, settings: SensorSettings, doubts: Iterable[Doubt] = ()
 ) -> tuple[int, str]:
     """Sign of the elevational motion, which images alone cannot tell, and its source.
 
     Parameters
     ----------
-    tells_direction : bool
-        Whether roll or a gyroscope confirm the orientation sensor's turns; it is not asked otherwise.
+    doubts : iterable of Doubt
+        About the sensors. An orientation sensor is asked if the images' roll confirms its turns or, unless
+        there is a doubt about it, its gyroscope.
     """
     if settings.direction:
         return settings.direction, "setting"
-    time_s = sweep.frame_time_s
-    for sensor in (sweep.tracker, sweep.orientation if tells_direction else None):
+    time_s, suspects = sweep.frame_time_s, {doubt.about for doubt in doubts}
+    for sensor in (sweep.tracker, sweep.orientation):
         if sensor is None or sensor.sensor_from_image is None:
             continue
         frames = np.flatnonzero(sensor.covers(time_s))
@@ -82,7 +88,12 @@ def settle_direction(
             return _same_way(sensor_poses, image[frames], sweep.grid.centre_mm), sensor.label
         if isinstance(sensor, OrientationSensor) and frames.size >= LEAST_FRAMES:
             rotations = sensor.world_from_image(time_s[frames]), image[frames].rotation
-            sign = same_turns(*((turn[0].inv() * turn).as_rotvec()[:, :2] for turn in rotations))
+            turns, image_turns = ((turn[0].inv() * turn).as_rotvec() for turn in rotations)
+            roll, image_roll = turns[:, 2], image_turns[:, 2]
+            by_roll = np.var(roll - image_roll) < (1.0 - ROLL_SHARE) * np.var(image_roll)
+            by_gyroscope = sensor.gyroscope_rad_s is not None and sensor.label not in suspects
+            is_confirmed = by_roll or by_gyroscope or not settings.examine
+            sign = same_turns(turns[:, :2], image_turns[:, :2]) if is_confirmed else None
             if sign is not None:
                 return sign, sensor.label
     if sweep.truth is not None:

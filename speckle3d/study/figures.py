@@ -11,7 +11,6 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from speckle3d.core.arrays import IntArray
 from speckle3d.core.printable import printable
 from speckle3d.io.hdf5 import atomic_path, make_folder
 from speckle3d.scoring.references import SweepCurves
@@ -49,11 +48,6 @@ def label_of(mode: str) -> str:
 def colour_of(mode: str) -> str:
     """Colour of a mode, the same in all figures; dark grey of a volume and of modes that older files hold."""
     return _COLOURS.get(mode, "#404040")
-
-
-def spread_frames(count: int, most: int) -> IntArray:
-    """Frames to draw: every one of a short sweep, evenly spread ones of a long one, both ends included."""
-    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(np.int64))
 
 
 def figure_drift(curves: SweepCurves, title: str = "") -> Figure:

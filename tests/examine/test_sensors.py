@@ -8,9 +8,8 @@ from scipy.spatial.transform import Rotation
 from speckle3d.config import Config
 from speckle3d.core.errors import MismatchError
 from speckle3d.corrections import correct
-from speckle3d.examine.conventions import doubts_of_gyroscope
 from speckle3d.examine.disagreements import differing_lengths, disagreements
-from speckle3d.examine.sensors import examine_sensors, jitter, repair_readings, rigid
+from speckle3d.examine.sensors import doubts_of_gyroscope, examine_sensors, jitter, repair_readings, rigid
 from speckle3d.motion.direction import settle_direction
 
 AGAINST_THEMSELVES = {
@@ -49,34 +48,32 @@ REFUTES = (
 
 
 def doubts_of(sweep, tracking):
-    examination = examine_sensors(sweep, tracking.image)
-    return examination, disagreements(examination.credible, tracking.image, tracking.covariance)
+    credible, doubts = examine_sensors(sweep, tracking.image)
+    return credible, doubts, disagreements(credible, tracking.image, tracking.covariance)
 
 
 def test_good_sensors_are_not_doubted(sweep, tracking):
     assert tracking.doubts == ()
-    examination, conflicts = doubts_of(sweep, tracking)
-    assert examination.doubts == conflicts == ()
-    assert examination.tells_direction
-    assert examination.credible.tracker is sweep.tracker
-    assert examination.credible.orientation is sweep.orientation
+    credible, doubts, conflicts = doubts_of(sweep, tracking)
+    assert doubts == conflicts == ()
+    assert credible.tracker is sweep.tracker
+    assert credible.orientation is sweep.orientation
 
 
 @pytest.mark.parametrize("name", AGAINST_THEMSELVES)
 def test_a_sensor_that_contradicts_itself_is_named(name, sweep, tracking):
-    examination, _ = doubts_of(spoil(sweep, name), tracking)
+    _, doubts, _ = doubts_of(spoil(sweep, name), tracking)
     about = "tracker" if name.startswith("tracker") else "orientation sensor"
-    assert {doubt.about for doubt in examination.doubts} == {about}
-    assert any(AGAINST_THEMSELVES[name] in doubt.suspect for doubt in examination.doubts)
+    assert {doubt.about for doubt in doubts} == {about}
+    assert any(AGAINST_THEMSELVES[name] in doubt.suspect for doubt in doubts)
     if name in REFUTES:
-        assert any(doubt.refuted for doubt in examination.doubts)
+        assert any(doubt.refuted for doubt in doubts)
 
 
 @pytest.mark.parametrize("name", BESIDE_THE_IMAGES)
 def test_images_and_a_sensor_that_differ_are_told_side_by_side_and_nobody_is_left_out(name, sweep, tracking):
-    bad = spoil(sweep, name)
-    examination, conflicts = doubts_of(bad, tracking)
-    assert examination.credible.tracker is not None
+    credible, _, conflicts = doubts_of(spoil(sweep, name), tracking)
+    assert credible.tracker is not None
     assert conflicts
     assert not any(doubt.refuted for doubt in conflicts)
     assert all(
@@ -99,16 +96,13 @@ def test_no_sign_is_taken_from_turns_that_nothing_confirms(name, sweep, tracking
     # Without what it measures beside its orientation, only the images are left to say so.
     bare = replace(bad, orientation=replace(bad.orientation, gyroscope_rad_s=None, accelerometer_m_s2=None))
     for spoilt_sweep in (bad, bare):
-        examination = examine_sensors(spoilt_sweep, tracking.image)
-        sign = settle_direction(
-            examination.credible, tracking.image, Config().sensors, examination.tells_direction
-        )
-        assert sign == (1, "assumed")
+        credible, doubts = examine_sensors(spoilt_sweep, tracking.image)
+        assert settle_direction(credible, tracking.image, Config().sensors, doubts) == (1, "assumed")
 
 
 def test_a_sensor_that_contradicts_itself_gives_no_mode_unless_told_to(sweep, tracking):
     bad = spoil(sweep, "tracker frozen")
-    doubts = examine_sensors(bad, tracking.image).doubts
+    _, doubts = examine_sensors(bad, tracking.image)
     with pytest.raises(MismatchError, match=r"pose.*tracker.*frozen"):
         correct(replace(tracking, doubts=doubts), bad, ["pose"])
     config = Config(sensors={"examine": False})
@@ -135,8 +129,8 @@ def test_spikes_are_left_out_and_counted(sweep, tracking):
 
 def test_a_gyroscope_on_other_axes_does_not_refute_the_readings(sweep, tracking):
     opposite = replace(sweep.orientation, gyroscope_rad_s=-sweep.orientation.gyroscope_rad_s)
-    examination = examine_sensors(replace(sweep, tracker=None, orientation=opposite), tracking.image)
-    assert [(doubt.refuted, "gyroscope" in doubt.suspect) for doubt in examination.doubts] == [(False, True)]
+    _, doubts = examine_sensors(replace(sweep, tracker=None, orientation=opposite), tracking.image)
+    assert [(doubt.refuted, "gyroscope" in doubt.suspect) for doubt in doubts] == [(False, True)]
 
 
 @pytest.mark.parametrize("jitter_deg", [0.15, 0.6])

@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 from scipy.ndimage import uniform_filter1d
 
 from speckle3d.core.arrays import Float32Array
+from speckle3d.core.sweep import spread_frames
 from speckle3d.study.figures import (
     UNSEEN,
     colour_of,
@@ -23,7 +24,6 @@ from speckle3d.study.figures import (
     name_figure,
     new_figure,
     save_figure,
-    spread_frames,
 )
 from speckle3d.study.images import GreyImages
 from speckle3d.study.posed import SweepModes
