@@ -16,7 +16,7 @@ from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, naming
 from speckle3d.core.geometry import require_finite
 from speckle3d.core.region import polygon_mask
-from speckle3d.core.sweep import Frames, read_frame
+from speckle3d.core.sweep import Frames
 
 _GLANCES = 48
 """Frames compared to see what stands still in all of them."""
@@ -168,7 +168,8 @@ def detect_in_frames(
     count, numbers, reasons = frames.shape[0], list[int](), dict[int, str]()
     detections, previous = list[tuple[FloatArray, FloatArray]](), np.zeros(0)
     for index in range(count):
-        image = read_frame(frames, index)
+        # A copy: frames may share their memory.
+        image = np.array(frames[index])
         with naming(f"frame {index}"):
             try:
                 if np.array_equal(image, previous):

@@ -39,7 +39,7 @@ class ImageFrames:
                 f"frames: expected images of shape (n, row, column) of {', '.join(_KINDS)}, or uint8 "
                 f"(n, row, column, 3), got {shape} of {kind}"
             )
-        self.any_thread = isinstance(images, np.ndarray) or getattr(images, "any_thread", False)
+        self.any_thread = any_thread(images)
         self._images, self.dtype = images, kind.newbyteorder("=")
         self.shape = (shape[0], shape[2], shape[1])
 
@@ -55,3 +55,8 @@ class ImageFrames:
         if image.ndim == 3:
             image = np.rint(image[..., :3] @ _LUMINANCE).astype(np.uint8)
         return np.ascontiguousarray(image.T, self.dtype)
+
+
+def any_thread(images: object) -> bool:
+    """Whether images may be read by several threads at once: arrays, and what says ``any_thread = True``."""
+    return isinstance(images, np.ndarray) or getattr(images, "any_thread", False)

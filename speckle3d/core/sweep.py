@@ -17,7 +17,7 @@ from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.extras import extra_module
 from speckle3d.core.geometry import require_increasing
 from speckle3d.core.grid import ImageGrid, require_positive
-from speckle3d.core.images import ImageFrames
+from speckle3d.core.images import ImageFrames, any_thread
 from speckle3d.core.scan_conversion import ScanConversion
 from speckle3d.core.shown import shown
 from speckle3d.core.streams import Samples, TimedPoses, TimedRotations, TimedSamples
@@ -57,19 +57,7 @@ def stored_dtype(frames: Frames) -> np.dtype[Any]:
     return np.dtype(np.int16) if pairs else own
 
 
-_READING = threading.Lock()
-
-
-def read_frame(frames: Frames, index: int) -> npt.NDArray[Any]:
-    """Read one frame while other threads may read others.
-
-    Frames that say ``any_thread = True`` are read as they are. Others, which may reuse their memory or hold a
-    place in a file, are read one at a time, and each is copied.
-    """
-    if isinstance(frames, np.ndarray) or getattr(frames, "any_thread", False):
-        return frames[index]
-    with _READING:
-        return np.array(frames[index])
+_READING = threading.RLock()
 
 
 def spread_frames(count: int, most: int) -> IntArray:
@@ -79,7 +67,11 @@ def spread_frames(count: int, most: int) -> IntArray:
 
 @dataclass(frozen=True)
 class _FramesPart:
-    """Some frames of others, from `first` on, still read one at a time."""
+    """Some frames of others, from `first` on, still read one at a time, on any thread.
+
+    Those that do not say ``any_thread = True`` may reuse their memory or hold a place in a file: each is read
+    while no other is, and copied.
+    """
 
     frames: Frames
     first: int
@@ -89,7 +81,11 @@ class _FramesPart:
     any_thread: ClassVar[bool] = True
 
     def __getitem__(self, index: int) -> npt.NDArray[Any]:
-        return read_frame(self.frames, self.first + range(self.shape[0])[index])
+        number = self.first + range(self.shape[0])[index]
+        if any_thread(self.frames):
+            return self.frames[number]
+        with _READING:
+            return np.array(self.frames[number])
 
 
 @dataclass(frozen=True)
@@ -241,6 +237,7 @@ class Sweep:
     Parameters
     ----------
     frames : Frames, shape (n, grid.vectors, grid.samples)
+        May be read on any thread.
     grid : ImageGrid
     signal : RFSettings or BModeSettings
         What the samples are.
@@ -288,6 +285,8 @@ class Sweep:
                 f"{self.name}: expected frames of shape {shape} by times and grid, and as many true poses "
                 f"if any, got {self.frames.shape}"
             )
+        if not any_thread(self.frames):
+            object.__setattr__(self, "frames", self._part_of_frames(0, len(self)))
         are_complex = np.dtype(self.frames.dtype).kind == "c"
         if are_complex != (isinstance(self.signal, RFSettings) and self.signal.are_complex):
             raise InvalidInputError(
@@ -415,13 +414,17 @@ class Sweep:
             raise InvalidInputError(
                 f"{self.name}: expected a part among frames 0 to {len(self) - 1}, got {first} to {stop - 1}"
             )
-        shape = stop - first, *self.frames.shape[1:]
         return replace(
             self,
-            frames=_FramesPart(self.frames, first, shape, self.frames.dtype, stored_dtype(self.frames)),
+            frames=self._part_of_frames(first, stop),
             frame_time_s=self.frame_time_s[first:stop],
             truth=None if self.truth is None else self.truth[first:stop],
         )
+
+    def _part_of_frames(self, first: int, stop: int) -> _FramesPart:
+        frames = self.frames
+        shape = stop - first, *frames.shape[1:]
+        return _FramesPart(frames, first, shape, np.dtype(frames.dtype), stored_dtype(frames))
 
     @property
     def orientation_source(self) -> OrientationSensor | Tracker | None:

@@ -13,6 +13,7 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError, MismatchError
 from speckle3d.core.grid import ImageGrid
+from speckle3d.core.images import any_thread
 
 
 class IndexedImages(Protocol):
@@ -114,11 +115,6 @@ class ChosenImages:
 
 def _read(images: Images, index: int) -> npt.NDArray[Any]:
     return images(index) if callable(images) else images[index]
-
-
-def any_thread(images: Images) -> bool:
-    """Whether images may be read by several threads at once."""
-    return isinstance(images, np.ndarray) or getattr(images, "any_thread", False)
 
 
 def require_poses(world_from_image: RigidTransform) -> None:

@@ -194,7 +194,7 @@ class LiveTracker:
             self._overlay.add(ready.echo)
             self._matcher.leave_out(self._overlay)
             if isinstance(self._example.signal, BModeSettings):
-                self._texture.keep(number, frame, ready)
+                self._texture.keep(number, ready)
         table = self._matching.advance(number, ready.frame)
         with self._lock:
             self._keep(ready.features, table)

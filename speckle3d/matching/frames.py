@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
-from speckle3d.core.sweep import Sweep, read_frame, spread_frames
+from speckle3d.core.sweep import Sweep, spread_frames
 from speckle3d.core.threads import ahead
 from speckle3d.kernels.inplane import Frame
-from speckle3d.matching.matcher import FrameMatcher, Overlay, ReadyFrame, compose, inverse
+from speckle3d.matching.matcher import FrameMatcher, Overlay, compose, inverse
 from speckle3d.matching.quality import FrameFeatures, FrameFlag, flag_frames
 from speckle3d.matching.schedule import KnownSchedule, PairSchedule
 from speckle3d.matching.table import CorrelationTable
@@ -76,18 +76,14 @@ def match_sweep(
     texture, texture_frames = Texture(matcher), spread_frames(len(sweep), FRAMES).tolist()
     overlay = Overlay()
     for number in texture_frames:
-        overlay.add(matcher.echo(read_frame(sweep.frames, number)))
+        overlay.add(matcher.echo(sweep.frames[number]))
     matcher.leave_out(overlay)
 
-    def make(number: int) -> ReadyFrame:
-        samples = read_frame(sweep.frames, number)
-        ready = matcher.ready(samples)
-        if number in texture_frames:
-            texture.keep(number, samples, ready)
-        return ready
-
     features, tables = [], []
-    for number, ready in enumerate(ahead(make, range(len(sweep)))):
+    frames = ahead(lambda number: matcher.ready(sweep.frames[number]), range(len(sweep)))
+    for number, ready in enumerate(frames):
+        if number in texture_frames:
+            texture.keep(number, ready)
         if images:
             images(number, ready.echo.intensity)
         features.append(ready.features)

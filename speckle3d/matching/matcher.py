@@ -81,8 +81,9 @@ class ImageSettings(BaseModel):
 
 
 class ReadyFrame(NamedTuple):
-    """What is made of a frame on the way to matching it."""
+    """A frame as read, and what is made of it on the way to matching it."""
 
+    samples: npt.NDArray[Any]
     echo: Echo
     features: FrameFeatures
     frame: Frame
@@ -222,7 +223,7 @@ class FrameMatcher:
         echoing = 1.0 - patches.tiles(silent).mean(axis=(1, 2))
         usable = features.usable & ~self.overlaid & (echoing >= self._least_overlap)
         frame = self.prepare(echo, usable, self._counted & ~silent)
-        return ReadyFrame(echo, replace(features, usable=usable), frame)
+        return ReadyFrame(samples, echo, replace(features, usable=usable), frame)
 
     def echo(self, samples: npt.NDArray[Any]) -> Echo:
         """Echo of a frame as read."""

@@ -105,11 +105,7 @@ class PatchGrid:
                 f"{high:.1f} mm, got {rows[0]:.1f} to {rows[-1]:.1f} mm, {inside.sum()} of {rows.size} rows "
                 "between them"
             )
-        return self.with_rows(inside)
-
-    def with_rows(self, rows: BoolArray) -> PatchGrid:
-        """Keep some of the rows, shape (r,)."""
-        patches = np.isin(self.depth_mm, self.row_depth_mm[rows])
+        patches = np.isin(self.depth_mm, rows[inside])
         names = ("first", "centre_mm", "depth_mm", "angle_rad", "pitch_mm", "inside")
         return replace(self, **{name: getattr(self, name)[patches] for name in names})
 
@@ -135,20 +131,21 @@ def lay_patches(grid: ImageGrid, settings: PatchSettings | None = None) -> Patch
         )
     left = (grid.vectors - columns * size[0]) // 2
     v, d = np.meshgrid(left + size[0] * np.arange(columns), top + size[1] * np.arange(rows), indexing="ij")
+    everywhere = np.ones((grid.vectors, grid.samples), dtype=bool)
+    region = Region(s.region).mask(grid) if s.region else everywhere
     first = np.stack([v.ravel(), d.ravel()], axis=1).astype(np.int64)
+    # Most of a patch must lie in the region.
+    inside = np.array([region[v : v + size[0], d : d + size[1]].mean() >= 0.5 for v, d in first])
+    rows_inside = inside.reshape(columns, rows).any(axis=0)
+    if (count := rows_inside.sum()) < 2:
+        raise InvalidInputError(f"region: expected two rows of patches in it, got {count}: {s.region}")
+    laid = np.tile(rows_inside, columns)
+    first, inside = first[laid], inside[laid]
     vector, sample = (first + (size - 1) / 2).T
     depth, angle = grid.first_sample_depth_mm + sample * spacing[1], grid.angle_rad(vector)
     pitch, step = np.full(len(first), spacing[0]), 0.0
     if grid.fan is not None:
         step = grid.fan.step_rad
         pitch = (grid.fan.radius_mm + depth) * step
-    everywhere = np.ones((grid.vectors, grid.samples), dtype=bool)
-    region = Region(s.region).mask(grid) if s.region else everywhere
-    centre_mm, inside = grid.mm(vector, sample), np.ones(len(first), dtype=bool)
-    patches = PatchGrid(first, size, centre_mm, depth, angle, pitch, spacing, inside, region, step)
-    # Most of a patch must lie in the region.
-    patches = replace(patches, inside=patches.tiles(region).mean(axis=(1, 2)) >= 0.5)
-    rows_inside = np.asarray(patches.rows_of(patches.inside).any(axis=1))
-    if (count := rows_inside.sum()) < 2:
-        raise InvalidInputError(f"region: expected two rows of patches in it, got {count}: {s.region}")
-    return patches.with_rows(rows_inside)
+    centre_mm = grid.mm(vector, sample)
+    return PatchGrid(first, size, centre_mm, depth, angle, pitch, spacing, inside, region, step)

@@ -7,16 +7,15 @@ on what is scanned as long as it scatters as a phantom does; patches whose contr
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from scipy import fft
 from scipy.signal import welch
 
 from speckle3d.core.arrays import BoolArray, Complex64Array, Float32Array, FloatArray, IntArray
 from speckle3d.core.curves import EchoSpectra, SpeckleSize
-from speckle3d.core.sweep import RFSettings, Sweep, read_frame, spread_frames
+from speckle3d.core.sweep import RFSettings, Sweep, spread_frames
 from speckle3d.matching.matcher import FrameMatcher, ReadyFrame
 
 FRAMES = 16
@@ -70,8 +69,8 @@ class Texture:
         self._edge_fraction, self._of_echo = matcher.key.edge_fraction, matcher.of_echo
         self._looks: dict[int, _Look] = {}
 
-    def keep(self, number: int, samples: npt.NDArray[Any], ready: ReadyFrame) -> None:
-        """Measure the usable patches of one frame, on any thread."""
+    def keep(self, number: int, ready: ReadyFrame) -> None:
+        """Measure the usable patches of one frame, later than those before."""
         echo, usable, patches = ready.echo, ready.features.usable, self._patches
         images = echo.intensity, ready.frame.echo if ready.frame.echo.size else ready.frame.image
         intensity, local_tiles = map(patches.tiles, images)
@@ -79,8 +78,8 @@ class Texture:
         power, level, sample_power = np.zeros((0, len(patches))), np.zeros((3, 0)), np.zeros(0)
         if isinstance(self.signal, RFSettings):
             # A vector of each column of patches; frames that are not finite are flagged.
-            vectors = np.nan_to_num(samples[np.unique(patches.first[:, 0])], posinf=0.0, neginf=0.0)
-            segment = min(SEGMENT, samples.shape[1])
+            vectors = np.nan_to_num(ready.samples[np.unique(patches.first[:, 0])], posinf=0.0, neginf=0.0)
+            segment = min(SEGMENT, vectors.shape[1])
             spectra = welch(vectors, nperseg=segment, return_onesided=False, detrend=False)[1]
             sample_power = spectra.mean(axis=0)
         if tiles is not None:
@@ -99,7 +98,7 @@ class Texture:
     @property
     def frames(self) -> IntArray:
         """Numbers of the frames that were looked at, increasing."""
-        return np.array(sorted(self._looks), dtype=np.int64)
+        return np.array(list(self._looks), dtype=np.int64)
 
     def speckle_size(self) -> SpeckleSize:
         """Lateral and axial size of speckle in each row of patches.
@@ -139,18 +138,16 @@ class Texture:
         rate_hz = 1e3 * self.signal.speed_of_sound_m_s / (2.0 * self._patches.spacing_mm[1])
         low, high = self.signal.bandwidth_hz
         # The band's centre was shifted to zero.
-        frequency = fft.fftfreq(power.shape[1], 1.0 / rate_hz) + (low + high) / 2.0
+        frequency = fft.fftshift(fft.fftfreq(power.shape[1], 1.0 / rate_hz)) + (low + high) / 2.0
         edge = self._edge_fraction * (high - low)
-        rising = np.argsort(frequency)
-        band = rising[(frequency[rising] > low - edge) & (frequency[rising] < high + edge)]
+        band = (frequency > low - edge) & (frequency < high + edge)
         return EchoSpectra(self._patches.row_depth_mm[rows_seen], frequency[band], power[:, band])
 
     def sample_spectrum(self) -> tuple[FloatArray, FloatArray] | None:
         """Frequencies, Hz, increasing, and the power of the samples as read; None of grey levels."""
         if not isinstance(self.signal, RFSettings):
             return None
-        # In the order of the frames, which threads do not keep: sums are the same to the last bit.
-        power = np.mean([self._looks[k].sampled for k in self.frames.tolist()], axis=0)
+        power = np.mean([look.sampled for look in self._looks.values()], axis=0)
         frequency = self.signal.bin_frequency_hz(power.size)
         rising = np.argsort(frequency)
         return frequency[rising], power[rising]
@@ -183,15 +180,14 @@ class Texture:
 
     def _rows(self, name: str) -> FloatArray:
         """Values of all frames by rows and columns, shape (n, k, r, c)."""
-        return self._patches.rows_of(np.stack([getattr(self._looks[k], name) for k in self.frames.tolist()]))
+        return self._patches.rows_of(np.stack([getattr(look, name) for look in self._looks.values()]))
 
 
 def measured_texture(sweep: Sweep, matcher: FrameMatcher) -> Texture:
     """Read some frames of a sweep, and measure their texture."""
     texture = Texture(matcher)
     for number in spread_frames(len(sweep), FRAMES).tolist():
-        samples = read_frame(sweep.frames, number)
-        texture.keep(number, samples, matcher.ready(samples))
+        texture.keep(number, matcher.ready(sweep.frames[number]))
     return texture
 
 
@@ -205,10 +201,10 @@ def mean_spectra(spectra: Sequence[EchoSpectra]) -> EchoSpectra | None:
 
 
 def _powers(echo: Complex64Array) -> FloatArray:
-    """Power spectrum of each patch, shape (p, v, s), of unit sum, shape (f, p)."""
+    """Power spectrum of each patch, shape (p, v, s), of unit sum, shape (f, p), frequencies rising."""
     spectrum = fft.fft(echo * np.hanning(echo.shape[-1]).astype(np.float32), axis=-1)
     power = (spectrum.real**2 + spectrum.imag**2).sum(axis=1, dtype=float).T
-    return np.asarray(power / np.maximum(power.sum(axis=0), 1e-30))
+    return fft.fftshift(power / np.maximum(power.sum(axis=0), 1e-30), axes=0)
 
 
 def _sizes(intensity: Float32Array, spacing_mm: FloatArray) -> FloatArray:

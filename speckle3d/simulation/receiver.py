@@ -10,7 +10,7 @@ import numpy.typing as npt
 from scipy import signal as filters
 
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.core.sweep import BModeSettings, Frames, RFSettings, Sweep, read_frame
+from speckle3d.core.sweep import BModeSettings, Frames, RFSettings, Sweep
 from speckle3d.simulation.scan import SPECKLE_RMS_COUNTS
 
 _GUARD = 0.1
@@ -67,7 +67,7 @@ class ReceivedFrames:
 
     def __getitem__(self, index: int) -> npt.NDArray[Any]:
         """One frame, shape (vector, sample)."""
-        echoes = filters.hilbert(read_frame(self.frames, index), axis=1)
+        echoes = filters.hilbert(self.frames[index], axis=1)
         baseband = echoes * np.exp(-2j * np.pi * self.cycles_per_sample * np.arange(echoes.shape[1]))
         counts = filters.resample_poly(baseband, 1, self.decimation, axis=1, window=_WINDOW)
         if self.dynamic_range_db is None:

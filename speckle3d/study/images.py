@@ -14,7 +14,7 @@ from speckle3d.core.errors import InvalidInputError, MismatchError
 from speckle3d.core.grid import ImageGrid
 from speckle3d.core.reconstruction import Reconstruction
 from speckle3d.core.scan_conversion import ScanConversion
-from speckle3d.core.sweep import BModeSettings, Sweep, read_frame
+from speckle3d.core.sweep import BModeSettings, Sweep
 from speckle3d.imaging.voxels.settings import Levels
 from speckle3d.io.calibrations import apply_calibrations
 from speckle3d.io.load import load_sweep, recording_sha256
@@ -98,9 +98,7 @@ class GreyImages:
             # One level for the whole sweep. For looking, the 99.9th percentile, so that one specular echo
             # does not darken it; for measuring an echo's place, the brightest, so that none is cut off.
             frames = [len(sweep) // 2] if clipped else np.linspace(0, len(sweep) - 1, _GLANCES).astype(int)
-            images = [
-                _decibel(self._extractor.echo(read_frame(sweep.frames, int(i))).intensity) for i in frames
-            ]
+            images = [_decibel(self._extractor.echo(sweep.frames[int(i)]).intensity) for i in frames]
             self._brightest = max(float(np.percentile(image, 99.9 if clipped else 100)) for image in images)
 
     @property
@@ -109,7 +107,7 @@ class GreyImages:
         return len(self._sweep), self.grid.vectors, self.grid.samples
 
     def __getitem__(self, index: int) -> npt.NDArray[Any]:
-        levels = self._levels_of(read_frame(self._sweep.frames, index))
+        levels = self._levels_of(self._sweep.frames[index])
         return levels if self._convert is None else np.nan_to_num(self._convert(levels), nan=self._outside)
 
     def _levels_of(self, frame: npt.NDArray[Any]) -> npt.NDArray[Any]:

@@ -10,7 +10,7 @@ from speckle3d.config import Config
 from speckle3d.core.arrays import IntArray
 from speckle3d.core.doubts import Doubt
 from speckle3d.core.reconstruction import Reconstruction
-from speckle3d.core.sweep import Sweep, read_frame
+from speckle3d.core.sweep import Sweep
 from speckle3d.examine.sensors import repair_readings
 from speckle3d.matching.matcher import FrameMatcher
 from speckle3d.matching.quality import FrameFeatures, FrameFlag, flag_frames
@@ -61,7 +61,7 @@ class FrameFindings:
 
     def judge_next(self) -> None:
         """Look at one more frame; after the last all have their flags."""
-        samples = read_frame(self._sweep.frames, len(self._features))
+        samples = self._sweep.frames[len(self._features)]
         self._features.append(self._matcher.ready(samples).features)
         if len(self._features) == len(self._sweep):
             self.flags = flag_frames(self._features, self._quality)

@@ -12,7 +12,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from speckle3d.config import Config
 from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.reconstruction import FramePairs
-from speckle3d.core.sweep import Sweep, read_frame
+from speckle3d.core.sweep import Sweep
 from speckle3d.kernels.inplane import Frame
 from speckle3d.matching.matcher import FrameMatcher
 
@@ -116,7 +116,7 @@ class SweepPairs:
         return correlation, centre * motion * centre.inv()
 
     def _make_ready(self, frame: int) -> Frame:
-        return self._matcher.ready(read_frame(self._sweep.frames, frame)).frame
+        return self._matcher.ready(self._sweep.frames[frame]).frame
 
     def _row(self, first: int, second: int) -> int | None:
         if self._pairs is None:

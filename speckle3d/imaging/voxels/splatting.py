@@ -28,8 +28,9 @@ import numpy.typing as npt
 
 from speckle3d.core.arrays import BoolArray, ByteArray, Float32Array, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError, MismatchError
+from speckle3d.core.images import any_thread
 from speckle3d.core.threads import cores, in_parallel
-from speckle3d.imaging.images import PosedImages, any_thread
+from speckle3d.imaging.images import PosedImages
 from speckle3d.imaging.voxels.grid import VoxelGrid
 from speckle3d.imaging.voxels.settings import Rule, Splat
 from speckle3d.kernels.samples import PLUS_BITS, POSITION_BITS, SHARE_BITS, Samples
