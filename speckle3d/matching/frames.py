@@ -76,7 +76,7 @@ def match_sweep(
     texture, texture_frames = Texture(matcher), spread_frames(len(sweep), FRAMES).tolist()
     overlay = Overlay()
     for number in texture_frames:
-        overlay.add(matcher.echo(sweep.frames[number]))
+        overlay.add(matcher.extractor.echo(sweep.frames[number]))
     matcher.leave_out(overlay)
 
     features, tables = [], []

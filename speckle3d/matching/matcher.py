@@ -215,7 +215,7 @@ class FrameMatcher:
 
     def ready(self, samples: npt.NDArray[Any]) -> ReadyFrame:
         """Make a frame, as read, ready to be matched; on any thread."""
-        echo, patches = self.echo(samples), self.patches
+        echo, patches = self.extractor.echo(samples), self.patches
         silent = self._silent(echo.intensity)
         features = inspect_frame(
             samples, echo.intensity, patches, isinstance(self.signal, BModeSettings), self.quality
@@ -224,11 +224,6 @@ class FrameMatcher:
         usable = features.usable & ~self.overlaid & (echoing >= self._least_overlap)
         frame = self.prepare(echo, usable, self._counted & ~silent)
         return ReadyFrame(samples, echo, replace(features, usable=usable), frame)
-
-    def echo(self, samples: npt.NDArray[Any]) -> Echo:
-        """Echo of a frame as read."""
-        echo = self.extractor.echo(samples)
-        return echo if self.of_echo else Echo(echo.intensity, None)
 
     def _silent(self, intensity: Float32Array) -> BoolArray:
         """Samples in rows of patches whose vector holds no echo there: a shadow, no contact."""
@@ -248,6 +243,7 @@ class FrameMatcher:
         counted : ndarray of bool, shape (vector, grid.samples)
             Samples that may.
         """
+        echo = echo if self.of_echo else echo._replace(analytic=None)
         image, parts = self.extractor.equalised(echo, counted)
         pool = int(self._pool[1])
         end = image.shape[1] // pool * pool

@@ -74,16 +74,13 @@ class Texture:
         echo, usable, patches = ready.echo, ready.features.usable, self._patches
         images = echo.intensity, ready.frame.echo if ready.frame.echo.size else ready.frame.image
         intensity, local_tiles = map(patches.tiles, images)
-        tiles = None if echo.analytic is None else patches.tiles(echo.analytic)
         power, level, sample_power = np.zeros((0, len(patches))), np.zeros((3, 0)), np.zeros(0)
-        if isinstance(self.signal, RFSettings):
+        if echo.analytic is not None:
             # A vector of each column of patches; frames that are not finite are flagged.
             vectors = np.nan_to_num(ready.samples[np.unique(patches.first[:, 0])], posinf=0.0, neginf=0.0)
             segment = min(SEGMENT, vectors.shape[1])
             spectra = welch(vectors, nperseg=segment, return_onesided=False, detrend=False)[1]
-            sample_power = spectra.mean(axis=0)
-        if tiles is not None:
-            power = _powers(tiles)
+            sample_power, power = spectra.mean(axis=0), _powers(patches.tiles(echo.analytic))
         elif usable.any():
             thinned = intensity[usable, :, ::4].reshape(int(usable.sum()), -1)
             level = np.log(np.percentile(thinned, [10, 50, 90], axis=1))
