@@ -13,9 +13,8 @@ from scipy.spatial.transform import Rotation
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.streams import TimedRotations
 from speckle3d.core.sweep import INERTIAL, OrientationSensor
-from speckle3d.io.clarius import READER
 from speckle3d.io.clarius.imu import MEANING
-from speckle3d.io.clarius.reader import sensor_of
+from speckle3d.io.clarius.reader import READER, sensor_of
 from speckle3d.io.load import load_sweep
 from speckle3d.io.readers import find_reader
 from speckle3d.io.sweep_writer import attach_orientation

@@ -80,11 +80,6 @@ class FileFrames:
         """Some of the frames, as `numpy.take` along the axis of frames."""
         return FileFrames(self.path, *self._arguments, [self.numbers[i] for i in rows.tolist()])
 
-    def close(self) -> None:
-        """Close the file; the next frame opens it again."""
-        with self._lock:
-            self._read = None
-
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self.path, *self._arguments, self.numbers)
 

@@ -59,10 +59,6 @@ _CHUNK_CACHE_BYTES = 32 * 2**20
 _KINDS = {"f": "fiu", "i": "iu", "b": "biu"}
 """Kinds in a file that may become a kind of result."""
 
-_LEAST_BYTES, _BYTES_OF_ONE = 2**24, 2**15
-"""Size of data sets that may be unwritten, and what a byte stands for at most, as Zstandard packs zeros: 128
-KiB in four bytes."""
-
 
 @contextmanager
 def atomic_path(path: PathLike) -> Iterator[Path]:
@@ -270,8 +266,6 @@ def read_array(
         raise InvalidInputError(f"{where}: expected numbers of type {result}, got {node.dtype}")
     if shape is not None:
         require_shape(node, shape, where)
-    if node.nbytes > _LEAST_BYTES + _BYTES_OF_ONE * node.id.get_storage_size():
-        raise FileError(f"{where}: ends early: {node.shape} numbers, most of which were never written")
     with reading(where):
         return np.asarray(node[()], dtype=result)
 

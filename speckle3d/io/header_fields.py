@@ -11,6 +11,7 @@ References
 from __future__ import annotations
 
 import re
+from codecs import BOM_UTF8
 from collections.abc import Iterator
 from typing import Any, BinaryIO
 
@@ -21,8 +22,6 @@ from speckle3d.core.errors import InvalidInputError
 from speckle3d.io.text import numbers
 
 _FRAME_FIELD = re.compile(r"Seq_Frame0*(\d{1,7})_(\w+)")
-MOST_FRAMES_A_FIELD = 100
-"""Frames, as a header counts them, for each frame that it has fields of."""
 _MM_PER = {
     "": 1.0, "?": 1.0, "none": 1.0, "unknown": 1.0, "mm": 1.0, "millimeter": 1.0, "cm": 10.0,
     "centimeter": 10.0, "m": 1e3, "meter": 1e3, "um": 1e-3, "µm": 1e-3, "micrometer": 1e-3, "micron": 1e-3,
@@ -52,7 +51,7 @@ NRRD_NAMES = {
 
 def is_image(start: bytes) -> bool:
     """Whether a file's first bytes are those of a MetaImage or NRRD header."""
-    first = start.split(b"\n", 1)[0].partition(b"=")[0].strip()
+    first = start.removeprefix(BOM_UTF8).split(b"\n", 1)[0].partition(b"=")[0].strip()
     return start.startswith(b"NRRD000") or first in (b"ObjectType", b"NDims", b"Comment", b"ObjectSubType")
 
 
@@ -64,11 +63,14 @@ def nrrd_fields(stream: BinaryIO) -> dict[str, Any]:
         if is_whole := not line.strip():
             break
         name, sign, value = line.partition(":")
+        if not sign:  # names of files below "data file: LIST"
+            continue
         if not value.startswith("="):
             # Fields of the format itself, unlike those of its users, may be in letters of any size.
             name = re.sub("^(data|byte|line)(?=file|skip)", r"\1 ", name.strip().lower())
         lines[name] = f"{NRRD_NAMES.get(name, name)}{sign}{value}"
-    fields: dict[str, Any] = nrrd.read_header([magic, *lines.values()])
+    fields: dict[str, Any] = {"sizes": (), "type": "", "encoding": ""}
+    fields |= nrrd.read_header([magic, *lines.values()])
     if not (is_whole or "data file" in fields):
         raise InvalidInputError("expected an NRRD header up to an empty line, got a truncated one")
     return fields
@@ -94,7 +96,7 @@ def meta_fields(stream: BinaryIO) -> dict[str, Any]:
     file, header_bytes = first("ElementDataFile"), int(first("HeaderSize") or "0")
     is_text = "BinaryData" in fields and not is_set("BinaryData")
     words: dict[str, Any] = {
-        "sizes": [*map(int, first("DimSize").split())],
+        "sizes": numbers(first("DimSize"), None, "DimSize"),
         "kinds": first("Kinds").split(),
         "type": first("ElementType"),
         "endian": "big" if is_set("BinaryDataByteOrderMSB", "ElementByteOrderMSB") else "little",
@@ -116,21 +118,15 @@ def meta_fields(stream: BinaryIO) -> dict[str, Any]:
     return fields | words
 
 
-def frame_fields(lines: dict[str, Any]) -> tuple[dict[str, str], tuple[dict[str, str], ...]]:
-    """Texts of the file, and of each frame; none of a frame that the header leaves out."""
-    frames: dict[int, dict[str, str]] = {}
-    fields = {}
+def frame_fields(lines: dict[str, Any]) -> tuple[dict[str, str], dict[int, dict[str, str]]]:
+    """Texts of the file, and of frames by their numbers."""
+    fields, frames = dict[str, str](), dict[int, dict[str, str]]()
     for name, value in lines.items():
-        if not isinstance(value, str):
-            continue
         if match := _FRAME_FIELD.fullmatch(name):
             frames.setdefault(int(match[1]), {})[match[2]] = value
-        else:
+        elif isinstance(value, str):
             fields[name] = value
-    last = max(frames, default=-1)
-    if last > MOST_FRAMES_A_FIELD * len(frames):
-        raise InvalidInputError(f"expected fields of most frames, got those of {len(frames)} up to {last}")
-    return fields, tuple(frames.get(i, {}) for i in range(last + 1))
+    return fields, frames
 
 
 def number_type(word: str, is_big: bool) -> np.dtype[Any]:
@@ -169,6 +165,6 @@ def _singular(unit: str) -> str:
 def _lines(stream: BinaryIO) -> Iterator[str]:
     for line in stream:
         try:
-            yield line.decode("utf-8").rstrip("\r\n")
+            yield line.decode("utf-8-sig").rstrip("\r\n")
         except UnicodeDecodeError:
             yield line.decode("latin-1").rstrip("\r\n")

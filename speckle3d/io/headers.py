@@ -9,7 +9,7 @@ from __future__ import annotations
 import bz2
 import math
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -59,8 +59,8 @@ class SequenceHeader:
         Kind of the file, ``"MetaImage"`` or ``"NrrdImage"``.
     fields : dict
         Texts of the whole file.
-    frames : tuple of dict
-        Fields of each frame, without the ``Seq_FrameNNNN_`` before their names; empty for a plain image.
+    frames : dict of int to dict
+        Fields of frames by their number, without the ``Seq_FrameNNNN_`` before their names.
     size : tuple of int
         Lengths of the image's axes, fastest first, and the number of frames if there is an axis for them.
     spacing_mm : tuple of float, or None
@@ -73,10 +73,8 @@ class SequenceHeader:
         Whether all three axes are of space, as they say and frames' fields do not contradict.
     channels : int
         Numbers a pixel.
-    axis_index_s : ndarray, shape (n,), optional
-        Times of the frames by the index of their axis.
-    axis_step_s : float, optional
-        Time between frames by their axis.
+    axis_times_s : ndarray, shape (n,), optional
+        Times of the frames by their axis, NaN beyond its index.
     axes_mm : ndarray, shape (axis, coordinate), optional
         Step along each axis, in a space whose axes lead left, posterior and superior; NaN of an axis that
         has none.
@@ -95,15 +93,14 @@ class SequenceHeader:
     path: str
     container: str
     fields: dict[str, str]
-    frames: tuple[dict[str, str], ...]
+    frames: dict[int, dict[str, str]]
     size: tuple[int, ...]
     spacing_mm: tuple[float, ...] | None
     file_size: tuple[int, ...]
     frame_axis: int | None
     is_volume: bool
     channels: int
-    axis_index_s: FloatArray | None
-    axis_step_s: float | None
+    axis_times_s: FloatArray | None
     axes_mm: FloatArray | None
     origin_mm: FloatArray | None
     dtype: np.dtype[Any]
@@ -122,14 +119,10 @@ class SequenceHeader:
         """How many numbers all pixels have."""
         return math.prod(self.size) * self.channels
 
-    def axis_times_s(self, count: int) -> FloatArray | None:
-        """Times of `count` frames by their axis, NaN beyond its index; None if it is not an axis of time."""
-        if self.axis_step_s is not None:
-            return self.axis_step_s * np.arange(count, dtype=np.float64)
-        if self.axis_index_s is None:
-            return None
-        times: FloatArray = np.append(self.axis_index_s, np.full(count, np.nan))[:count]
-        return times
+    def column(self, name: str) -> Iterator[tuple[int, str]]:
+        """Number and text of each frame that has a field of this name."""
+        rows = self.frames.items()
+        return ((i, frame[name]) for i, frame in rows if i < self.frame_count and name in frame)
 
     def require_bytes(self) -> None:
         """Raise if the file is too short for its images, before anything of their number is allocated.
@@ -235,7 +228,7 @@ def _header(path: Path, words: dict[str, Any], is_nrrd: bool, start: int) -> Seq
     sides = [i for i, kind in enumerate(kinds) if kind in _SPACE]
     frame_axis = next((i for i, kind in enumerate(kinds) if kind in _TIME), None)
     colours = {*range(len(sizes))} - {*sides, frame_axis}
-    if frame_axis is None and len(sides) == 3:
+    if frame_axis is None and len(sides) > 2:
         frame_axis = sides.pop()
     if len(sides) == 3:  # images of 3D Slicer are a pixel thick
         thin = next((i for i in reversed(sides) if sizes[i] == 1), None)
@@ -251,20 +244,20 @@ def _header(path: Path, words: dict[str, Any], is_nrrd: bool, start: int) -> Seq
     if spacing is not None and (not all(0 < step < math.inf for step in spacing) or spacing == (1.0, 1.0)):
         spacing = None  # PLUS and ITK write 1 where nobody told them
     fields, frames = frame_fields(words)
-    if len(frames) == (*size, 0)[2] + 1 and not frames[0]:
-        frames = frames[1:]  # of a writer that counts from 1
+    if 0 not in frames and (*size, 1)[2] in frames:  # of a writer that counts from 1
+        frames = {number - 1: frame for number, frame in frames.items()}
     type_word = words["type"] if 0 not in sizes else "uchar"  # a tracker's may name no type
     encoding = _ENCODINGS.get(words["encoding"].lower()[:2])
     if encoding is None:
         raise InvalidInputError(f"encoding: expected raw, gzip, bzip2 or text, got {words['encoding']!r}")
     file, byte_skip = words.get("data file", ""), words.get("byte skip", 0)
     data, start = (_data_file(path, file), 0) if file else (path, start)
-    index, step = (None, None) if frame_axis is None else _axis_clock(words, frame_axis)
+    times = None if frame_axis is None else _axis_times(words, frame_axis, sizes[frame_axis])
     return SequenceHeader(
         str(path), "NrrdImage" if is_nrrd else "MetaImage", fields, frames, size, spacing, sizes, frame_axis,
         is_spatial and len(frames) < size[2],
-        math.prod(sizes[i] for i in colours if i is not None) * words.get("channels", 1), index, step, axes,
-        origin, number_type(type_word, words.get("endian", "").lower() == "big"), data,
+        math.prod(sizes[i] for i in colours if i is not None) * words.get("channels", 1), times, axes, origin,
+        number_type(type_word, words.get("endian", "").lower() == "big"), data,
         -1 if byte_skip < 0 else start + byte_skip, encoding, words.get("line skip", 0),
     )  # fmt: skip
 
@@ -290,13 +283,15 @@ def _placement(words: Mapping[str, Any], count: int) -> tuple[FloatArray | None,
     return axes, origin
 
 
-def _axis_clock(words: Mapping[str, Any], axis: int) -> tuple[FloatArray | None, float | None]:
-    """Times of frames by the index of their axis, as 3D Slicer writes it, or the step between them."""
+def _axis_times(words: Mapping[str, Any], axis: int, count: int) -> FloatArray | None:
+    """Times of frames by the index of their axis, as 3D Slicer writes it, or by the step between them."""
     unit_s = s_per("".join(words.get("units", ())[axis : axis + 1]))
     index, steps = words.get(f"axis {axis} index values", "").split(), words.get("spacings")
     if words.get(f"axis {axis} index type", "numeric") == "numeric" and index:
-        return np.array(index, dtype=float) * (unit_s or 1.0), None
-    return None, float(steps[axis]) * unit_s if unit_s and steps is not None and steps[axis] > 0 else None
+        times = np.array(index, dtype=float) * (unit_s or 1.0)
+        return np.append(times, np.full(count, np.nan))[:count]
+    step_s = 0.0 if steps is None else (unit_s or 0.0) * float(steps[axis])
+    return np.asarray(step_s * np.arange(count)) if step_s > 0 else None
 
 
 def _data_file(path: Path, name: str) -> Path:

@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,8 @@ from speckle3d.core.streams import TimedPoses, TimedRotations
 from speckle3d.core.sweep import OrientationSensor, Tracker
 from speckle3d.io.carrier import CARRIER, carrier_share
 from speckle3d.io.frames import FileFrames, ReadFrame
-from speckle3d.io.header_fields import MOST_FRAMES_A_FIELD, is_image
+from speckle3d.io.hdf5 import reading
+from speckle3d.io.header_fields import is_image
 from speckle3d.io.headers import SequenceHeader, read_header
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.plus.device_set import DeviceSet, read_device_set
@@ -29,6 +30,7 @@ from speckle3d.io.plus.transforms import (
     ORIENTATION,
     Names,
     Poses,
+    ends,
     fixed_transform,
     names_of,
     pixel_axes,
@@ -38,23 +40,11 @@ from speckle3d.io.plus.transforms import (
 from speckle3d.io.plus.write import own_values
 from speckle3d.io.pose_paths import timed_poses
 from speckle3d.io.readers import Reader
-from speckle3d.io.recordings import Facts, Recording, Value, differs
+from speckle3d.io.recordings import CONTRADICTION, Facts, Recording, Value, differs
+from speckle3d.io.text import numbers
 
-_DEVICE = "the device set"
+_DEVICE, _PIXELS = "the device set", ("column_pitch_mm", "row_spacing_mm")
 _FREQUENCIES = ("demodulation_frequency_hz", "centre_frequency_hz", "sampling_rate_hz")
-
-
-@dataclass(frozen=True)
-class SequenceFile:
-    """Opens the images of a sequence."""
-
-    header: SequenceHeader
-    layout: Layout
-
-    def __call__(self) -> ReadFrame:
-        """Map or unpack them."""
-        images = self.header.images()
-        return lambda i: self.layout.frame(images[i])
 
 
 def read_poses(path: PathLike, settings: ImportSettings | None = None) -> Tracker:
@@ -65,11 +55,8 @@ def read_poses(path: PathLike, settings: ImportSettings | None = None) -> Tracke
     InvalidInputError
         If the header names no such transform, or no sample of it is valid.
     """
-    sequence = _Sequence.of(path, settings or ImportSettings())
-    fields, frames = len(sequence.header.frames), sequence.header.frame_count
-    if 0 < MOST_FRAMES_A_FIELD * fields < frames:
-        raise InvalidInputError(f"{path}: expected fields of most frames, got those of {fields} of {frames}")
-    readings, notes = sequence.readings
+    with reading(path):  # of more frames than memory has places for
+        readings, notes = _Sequence.of(path, settings or ImportSettings()).readings
     if readings is None:
         raise InvalidInputError(
             f"{path}: expected tracked poses (fields like ProbeToTrackerTransform), got {lacking_poses(path)}"
@@ -164,7 +151,7 @@ class _Sequence:
         header, path = self.header, self.header.path
         if 0 in header.size or max(header.size[:2]) == 1:
             use = ": the recording of a tracker, for --poses" if names_of(header) else ""
-            size = _length_text(header.size[:2])
+            size = _length_text(header.size)
             raise InvalidInputError(f"{path}: expected pixels of images, got images of size {size}{use}")
         if header.is_volume and not self.settings.frame_rate_hz:
             raise InvalidInputError(
@@ -182,16 +169,41 @@ class _Sequence:
             settings,
             _file_frames(header, self.frame_layout),
             self.values,
-            time_s=self._times(header.frame_count),
+            time_s=self._times(),
             faults=self._image_faults(),
             tracker=self._tracker(),
             orientation=self._orientation(),
             chain=self._chain(),
-            probe=settings.probe or own.get("probe") or self.device.text("TransducerName"),
+            probe=own.get("probe") or self.device.text("TransducerName"),
             full_scale=own.get("full_scale", 255.0),
+            substitutes=dict.fromkeys(_PIXELS, "tracker_transform") if self.image_pose else {},
             assumptions=("parallel lines",) if self.layout.is_rf and not own else (),
             remarks=tuple(self._remarks()),
         )
+
+    @cached_property
+    def image_pose(self) -> str:
+        """Name of the file's own transform of the image in the world of the tool's poses; empty if none."""
+        poses, image = self.poses, self.device.names.image
+        name = "" if poses is None else f"{image}To{ends(poses.chain[-1])[1]}"
+        return name if poses is not None and poses.tool != image and name in names_of(self.header) else ""
+
+    def _image_pose_remarks(self) -> Iterator[str]:
+        """Tell where the file's own transform of the image contradicts the chain that is used."""
+        name, poses, place = self.image_pose, self.poses, self.image_to_probe
+        direct = tracked_poses(self.header, name, "none", self.device.names) if name else None
+        if poses is None or direct is None or direct.pixels is None:
+            return
+        if place is None:
+            yield f"no place of the image on {poses.tool}: --transform {name} takes the file's own"
+            return
+        corners = np.array([[0.0, 0.0, 0.0, 1.0], [*self.header.size[:2], 0.0, 1.0]]).T
+        used, other = poses.matrices @ place.value @ corners, direct.matrices @ direct.pixels @ corners
+        is_valid = [not (a or b) for a, b in zip(poses.faults, direct.faults, strict=True)]
+        off_mm = np.linalg.norm(used - other, axis=1)[is_valid].max(initial=0.0)
+        if off_mm > CONTRADICTION * np.linalg.norm(np.diff(used)[0]):
+            words = f"{self._chain()}, which is used: --transform {name} takes the other"
+            yield f"{name} places images up to {off_mm:.3g} mm away from {words}"
 
     @cached_property
     def readings(self) -> tuple[TimedPoses | None, list[str]]:
@@ -199,32 +211,32 @@ class _Sequence:
         return self._timed_poses(self.poses)
 
     def _timed_poses(self, poses: Poses | None) -> tuple[TimedPoses | None, list[str]]:
-        times = None if poses is None else self._times(len(poses.faults), self.settings.frame_rate_hz)
+        rate_hz, count = self.settings.frame_rate_hz, self.header.frame_count
+        times = self._times() if rate_hz is None else np.arange(count) / rate_hz
         if poses is None or times is None:
             return None, []
         return timed_poses(times, poses.matrices, poses.faults)
 
-    def _times(self, count: int, rate_hz: float | None = None) -> FloatArray | None:
-        """Time of each frame: of a rate, or by its stamp or its axis, NaN where it has none.
+    def _times(self) -> FloatArray | None:
+        """Time of each frame by its stamp or its axis, NaN where it has none.
 
         Stamps all the same are none.
         """
-        if rate_hz is not None:
-            return np.arange(count) / rate_hz
+        count = self.header.frame_count
         stamps = np.full(count, np.nan)
-        for i, frame in enumerate(self.header.frames[:count]):
-            with suppress(ValueError):
-                stamps[i] = float(frame.get("Timestamp", "nan"))
-        if np.unique(stamps[np.isfinite(stamps)]).size >= min(2, count):
-            return stamps
-        return self.header.axis_times_s(count)
+        for i, text in self.header.column("Timestamp"):
+            with suppress(InvalidInputError):
+                (stamps[i],) = numbers(text, 1, "Timestamp")
+        is_clock = np.unique(stamps[np.isfinite(stamps)]).size >= min(2, count)
+        return stamps if is_clock else self.header.axis_times_s
 
     def _image_faults(self) -> list[str]:
         """Why each image is of no use; older files of PLUS tell it in Status alone."""
-        count = self.header.frame_count
-        statuses = [{frame.get("ImageStatus"), frame.get("Status")} for frame in self.header.frames[:count]]
-        faults = ["" if status <= {None, "OK"} else "not valid by their status" for status in statuses]
-        return faults + [""] * (count - len(faults))
+        faults = [""] * self.header.frame_count
+        for name in ("ImageStatus", "Status"):
+            for i, status in self.header.column(name):
+                faults[i] = faults[i] if status == "OK" else "not valid by their status"
+        return faults
 
     @cached_property
     def spacing_mm(self) -> tuple[float, ...] | None:
@@ -253,9 +265,7 @@ class _Sequence:
         across, down = (replace(pixel, value=size) for size in pixel.value or (None, None))
         values, (vectors, samples) = dict[str, Value](), layout.shape(header.size)
 
-        def scan(numbers: float | tuple[float, ...] | None) -> Value:
-            return Value(numbers, "ScanConversion of the device set", _DEVICE)
-
+        scan = partial(Value, source="ScanConversion of the device set", said_by=_DEVICE)
         width_mm = device.scan("TransducerWidthMm")
         if device.is_curved and (layout.is_rf or layout.has_lines_in_rows):
             near, far = device.scan("RadiusStartMm", "RadiusStopMm") or (None, 0.0)
@@ -325,6 +335,7 @@ class _Sequence:
         if self.frame_layout.conjugate:
             yield "Q has the other sign in the file, as its phase tells: turned"
         yield from self.readings[1]
+        yield from self._image_pose_remarks()
         if self.poses is None and names_of(header) and self.settings.tracker_transform is None:
             yield f"no tracker: the header's transforms are {lacking_poses(header.path)}"
         if len(header.frames) not in (0, header.frame_count):
@@ -348,7 +359,13 @@ def _file_frames(header: SequenceHeader, layout: Layout) -> FileFrames:
     elif layout.is_rf and dtype != np.int16:
         dtype = np.dtype(np.float32)
     shape = (header.frame_count, *layout.shape(header.size))
-    return FileFrames(header.path, SequenceFile(header, layout), shape, dtype, narrow)
+    return FileFrames(header.path, partial(_open_images, header, layout), shape, dtype, narrow)
+
+
+def _open_images(header: SequenceHeader, layout: Layout) -> ReadFrame:
+    """Map or unpack images, and turn them."""
+    images = header.images()
+    return lambda i: layout.frame(images[i])
 
 
 def _length_text(lengths: Sequence[float]) -> str:

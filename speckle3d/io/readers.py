@@ -30,7 +30,7 @@ START_BYTES = 4096
 
 _MODULES = (
     "sweeps", "challenge", "formats.uff", "formats.zea", "formats.dicom", "formats.matlab", "metaimage",
-    "plus.device_set", "formats.ultrasonix", "clarius", "formats.pictures",
+    "plus.device_set", "formats.ultrasonix", "clarius.reader", "formats.pictures",
 )  # fmt: skip
 """Modules of this package that have a reader, in the order in which they are asked."""
 

@@ -161,16 +161,20 @@ class Recording:
         assumptions += self.assumptions
         words = [f"assumed, as the file does not say: {', '.join(assumptions)}"] if assumptions else []
         contradictions = filter(None, (self._number(name)[1] for name in self.numbers))
-        notes = [*self._frame_times[2], *self.remarks, *self._sweep_and_notes[1]]
-        return [*contradictions, *notes, *words]
+        return [*contradictions, *self._told, *words]
 
     def describe(self) -> list[Row]:
         """Rows of what the file says, where each number is from, and what is odd."""
+        numbers = (self._number(name)[0] for name in self.numbers)
+        return [*self.rows, *numbers, *(("note", text, "") for text in self._told)]
+
+    @cached_property
+    def _told(self) -> list[str]:
+        """What is odd of frames, file and path."""
         remarks = [*self._frame_times[2], *self.remarks]
         with suppress(InvalidInputError, FileError):  # which is told by who asks for the sweep
             remarks += self._sweep_and_notes[1]
-        numbers = (self._number(name)[0] for name in self.numbers)
-        return [*self.rows, *numbers, *(("note", text, "") for text in remarks)]
+        return remarks
 
     def _number(self, name: str) -> tuple[Row, str]:
         """Row of a number; and a line where it is given and the recording says another, by more than 1 %."""
@@ -271,7 +275,8 @@ class Recording:
         frames = self._images
         values = {name: value.value for name, value in self.numbers.items()}
         values |= {name: number for name, number in self.settings if name in values and number is not None}
-        if lacks := [self.substitutes.get(name, name) for name, number in values.items() if number is None]:
+        lacks = {self.substitutes.get(name, name): None for name, number in values.items() if number is None}
+        if lacks:
             raise MissingSettingsError(self.path, tuple(lacks))
         if (rate_hz := values.get("frame_rate_hz")) is not None:
             times = rows / float(rate_hz)
@@ -301,7 +306,7 @@ class Recording:
             tracker=self.tracker,
             orientation=self.orientation,
             name=printable(self.name or self.path.name.split(".")[0]),
-            probe=self.probe or self.settings.probe or "",
+            probe=self.settings.probe or self.probe,
         )
 
 

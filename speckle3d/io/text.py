@@ -34,9 +34,9 @@ def text_lines(path: PathLike) -> Iterator[tuple[int, str]]:
 
 
 def numbers(text: str, count: int | None, where: str) -> tuple[float, ...]:
-    """Read finite numbers separated by blanks; `count` of them unless it is None."""
+    """Read finite numbers separated by blanks, `count` of them unless it is None; commas are decimal ones."""
     try:
-        values = tuple(float(word) for word in text.split())
+        values = tuple(float(word.replace(",", ".")) for word in text.split())
     except ValueError:
         values = ()
     if not values or (count is not None and len(values) != count) or not np.isfinite(values).all():

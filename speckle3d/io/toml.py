@@ -40,7 +40,7 @@ def read_toml(path: Path) -> str:
     with open_regular(path) as stream:
         content = stream.read()
     try:
-        return content.decode("utf-8")
+        return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise InvalidInputError(f"{path}: expected UTF-8 text, got other bytes") from error
 

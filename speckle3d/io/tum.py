@@ -19,7 +19,7 @@ from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.streams import TimedPoses
 from speckle3d.io.hdf5 import PathLike, atomic_path
 from speckle3d.io.pose_paths import usable
-from speckle3d.io.text import text_lines
+from speckle3d.io.text import numbers, text_lines
 
 LengthUnit = Literal["m", "mm"]
 
@@ -100,10 +100,9 @@ def is_tum(path: PathLike) -> bool:
     return False
 
 
-def _eight(text: str) -> list[float]:
+def _eight(text: str) -> tuple[float, ...]:
     """Numbers of a line; NaN unless there are eight."""
     try:
-        values = [float(word) for word in text.split()]
-    except ValueError:
-        values = []
-    return values if len(values) == _COLUMNS else [np.nan] * _COLUMNS
+        return numbers(text, _COLUMNS, "")
+    except InvalidInputError:
+        return (np.nan,) * _COLUMNS

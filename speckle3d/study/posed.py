@@ -228,7 +228,8 @@ def posed_at(
     if reference is None:
         raise InsufficientDataError(
             f"{sweep.name}: expected a calibrated tracker or true poses, got none: make a reconstruction "
-            "first (speckle3d reconstruct)"
+            "first (speckle3d reconstruct), or give --calibration, or --transform with the image's own poses "
+            "if the recording has them, as ImageToReference"
         )
     frames = np.flatnonzero(reference.covered)
     return PosedSweep(sweep, frames, reference.world_from_image, reference.name, reconstruction)

@@ -65,7 +65,6 @@ def check(path, sweep, count):
     for i in range(len(read)):
         np.testing.assert_array_equal(read.frames[i], frame(sweep, i))
     np.testing.assert_allclose(read.frame_time_s, 0.04 * np.arange(len(read)))
-    read.frames.close()
 
 
 def main():

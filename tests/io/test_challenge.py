@@ -26,7 +26,6 @@ def test_a_scan_is_a_sweep(scan):
     expected = poses @ examples.TOOL_FROM_IMAGE @ pixel
     ours = sweep.tracker.world_from_image(sweep.frame_time_s).apply([2 * 0.25, 4 * 0.2, 0.0])
     np.testing.assert_allclose(ours, expected[:, :3], rtol=0, atol=1e-9)
-    sweep.frames.close()
 
 
 def test_landmarks_are_counted_from_frame_0_and_pixel_1(scan):

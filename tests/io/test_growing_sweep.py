@@ -34,7 +34,6 @@ def test_frames_are_read_while_a_file_grows_and_when_it_is_whole(tmp_path, kind,
             np.testing.assert_array_equal(sweep_so_far.frames[i], sweep.frames[i])
             assert (sweep_so_far.tracker, sweep_so_far.orientation) == (None, None)
             assert f"{i + 1} frames so far" in open_recording(path).notes[0]
-            sweep_so_far.frames.close()
     assert not any("frames" in note for note in open_recording(path).notes)
 
 

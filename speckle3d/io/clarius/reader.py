@@ -35,12 +35,13 @@ from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import FileError, InvalidInputError, naming
 from speckle3d.core.printable import printable
 from speckle3d.io.clarius.imu import SensorSamples, read_samples
-from speckle3d.io.clarius.package import find_files
+from speckle3d.io.clarius.package import find_files, is_package
 from speckle3d.io.clarius.raw import SAMPLES, open_frames, open_raw
 from speckle3d.io.clarius.sidecars import Description, yml_fields
 from speckle3d.io.clarius.spectrum import band_hz
 from speckle3d.io.frames import FileFrames
 from speckle3d.io.import_settings import SPEED_OF_SOUND_M_S, ImportSettings
+from speckle3d.io.readers import Reader
 from speckle3d.io.recordings import Facts, Recording, Value, step_of
 from speckle3d.io.toml import validated
 
@@ -235,3 +236,6 @@ def _spreading(
 
 def _model(probe: str) -> str:
     return re.sub(r"[^A-Z0-9]", "", probe.upper()).removeprefix("CLARIUS")
+
+
+READER = Reader(FORMAT, is_package, open_package, companions=package_files)

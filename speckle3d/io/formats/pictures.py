@@ -26,7 +26,8 @@ FORMAT = "arrays, pictures or video"
 
 _ARRAY = b"\x93NUMPY"
 _PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
-_VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".wmv", ".m4v", ".mpg", ".gif")
+_STACKS = (".gif", ".tif", ".tiff")
+_VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".wmv", ".m4v", ".mpg", *_STACKS)
 _NOTES = (".toml", ".txt", ".md", ".json", ".csv", ".db", ".ini")
 """Of files that may lie among pictures."""
 
@@ -56,17 +57,18 @@ class PictureFolder:
 
 
 class Video:
-    """Frames of a video, by imageio; those in order are read fastest."""
+    """Frames of a video, or of a file of several pictures, by imageio; those in order are read fastest."""
 
     def __init__(self, path: Path) -> None:
         iio = extra_module("imageio.v3", "video", "a video")
-        self._path = path
+        self._path, is_stack = path, path.suffix.lower() in _STACKS
+        plugin = "pillow" if is_stack else None
         with reading(path, Exception):  # of whichever plugin imageio takes
-            count = sum(1 for _ in iio.imiter(path))
-            metadata = iio.immeta(path, exclude_applied=False)
-            frame_ms = metadata.get("duration") if path.suffix.lower() == ".gif" else None
+            count = sum(1 for _ in iio.imiter(path, plugin=plugin))
+            metadata = iio.immeta(path, plugin=plugin, exclude_applied=False)
+            frame_ms = metadata.get("duration") if is_stack else None
             self.rate_hz = 1e3 / frame_ms if frame_ms else metadata.get("fps")
-            self._file = iio.imopen(path, "r")
+            self._file = iio.imopen(path, "r", plugin=plugin)
         first = self[0]
         self.shape, self.dtype = (count, *first.shape), first.dtype
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, reduce
 from pathlib import Path
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
@@ -26,7 +26,7 @@ from speckle3d.core.files import PathLike, open_regular
 from speckle3d.core.grid import ImageGrid
 from speckle3d.io.hdf5 import reading
 from speckle3d.io.import_settings import ImportSettings
-from speckle3d.io.plus.transforms import Names, pixel_axes
+from speckle3d.io.plus.transforms import Names, chain_between, pixel_axes
 from speckle3d.io.readers import Reader
 from speckle3d.io.recordings import Facts
 from speckle3d.io.text import numbers
@@ -208,14 +208,10 @@ class DeviceSet:
 
     def transform(self, start: str, end: str) -> FloatArray | None:
         """Product of the transforms, or their inverses, on the shortest way between two frames, if any."""
-        products, queue = {start: np.eye(4)}, [start]
-        for frame in queue:
-            for (a, b), matrix in self.transforms.items():
-                target = b if a == frame else a
-                if frame in (a, b) and target not in products:
-                    products[target] = (matrix if a == frame else np.linalg.inv(matrix)) @ products[frame]
-                    queue.append(target)
-        return products.get(end)
+        if (chain := chain_between(self.transforms, start, end)) is None:
+            return None
+        parts = self.transforms | {(b, a): np.linalg.inv(m) for (a, b), m in self.transforms.items()}
+        return reduce(lambda product, pair: parts[pair] @ product, chain, np.eye(4))
 
     def pixel_mm(self, size: tuple[float, ...] | None = None) -> tuple[float, ...] | None:
         """Distances of columns and rows of the image, by default the machine's, mm; None if unknown."""

@@ -91,7 +91,8 @@ class Layout:
             raise InvalidInputError(
                 f"{path}: UltrasoundImageOrientation: expected as MF, FM or MFA, got {self.orientation}"
             )
-        if self.is_complex and self._lines(size)[self._pair_axis] % 2:
+        # Lines count the second of (x, y) where they lie in rows.
+        if self.is_complex and size[self.has_lines_in_rows ^ self._pair_axis] % 2:
             raise InvalidInputError(f"{path}: expected I and Q in pairs, got images of size {size}")
 
     def frame(self, pixels: AnyArray) -> AnyArray:
@@ -107,15 +108,8 @@ class Layout:
 
     def shape(self, size: tuple[int, ...]) -> tuple[int, int]:
         """Vectors and samples of an image of a size (x, y)."""
-        lines = self._lines(size)
-        if self.is_complex:
-            lines[self._pair_axis] //= 2
-        vectors, samples = lines
+        vectors, samples = self.frame(np.broadcast_to(np.int8(0), size[1::-1])).shape
         return vectors, samples
-
-    def _lines(self, size: tuple[int, ...]) -> list[int]:
-        """Lines of an image of a size (x, y), and numbers in each."""
-        return [*size[1::-1]] if self.has_lines_in_rows else [*size[:2]]
 
     @property
     def _pair_axis(self) -> int:

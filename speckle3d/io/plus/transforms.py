@@ -6,8 +6,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -18,6 +19,9 @@ from speckle3d.core.geometry import nearest_rotation
 from speckle3d.io.headers import SequenceHeader
 from speckle3d.io.pose_paths import rigid
 from speckle3d.io.text import numbers
+
+Pair: TypeAlias = tuple[str, str]
+"""Frames from which and to which a transform leads."""
 
 SKEW_TOLERANCE = 0.1
 """How far the axes of a measured image calibration may be from square, as the cosine of their angle. PLUS's
@@ -30,6 +34,7 @@ IMAGE = "Image"
 ORIENTATION = "OrientationSensor"
 """Name of the frame of an orientation sensor, which PLUS's devices do not use: its transform to World is a
 rotation alone."""
+_REFERENCE = "Reference"
 
 
 @dataclass(frozen=True)
@@ -77,8 +82,8 @@ def tracked_poses(
     ----------
     tool_pose, reference : str, optional
         Names of transforms, or ``"none"``; by default the probe's, in the tracker or in the only frame that
-        it is tracked in, else that of what the image is on, else the image's; and that of ``Reference`` in
-        the same world.
+        it is tracked in, else that of what the image is on, else the image's; and that of ``Reference`` where
+        a chain leads there.
 
     Returns
     -------
@@ -94,39 +99,36 @@ def tracked_poses(
     name = _usual_pose(transforms, names) if tool_pose is None else tool_pose.removesuffix("Transform")
     if name is None or name == "none":
         return None
-    if reference is None and not _holds(transforms, name):
-        # Both may be there in a third frame: ProbeToReference is ProbeToTracker, from the reference.
-        tool, target = ends(name)
-        for world in dict.fromkeys(frame for transform in transforms for frame in ends(transform)):
-            if _holds(transforms, f"{tool}To{world}") and _holds(transforms, f"{target}To{world}"):
-                name, reference = f"{tool}To{world}", f"{target}To{world}"
     tool, world = ends(name)
-    # A reference counts if both are tracked in the same world.
-    fixed = f"ReferenceTo{world}" if reference is None else reference.removesuffix("Transform")
-    if reference is None and (tool == "Reference" or not _holds(transforms, fixed)):
-        fixed = "none"
-    for transform in {name, fixed} - {"none"}:
-        if not _holds(transforms, transform):
-            raise InvalidInputError(
-                f"{header.path}: expected a transform {transform}, got {', '.join(transforms) or 'none'}"
-            )
-    matrices, faults = _column(header, name)
-    pixels, chain = None, [name]
+    # A tool's poses do not lead by way of the image, whose transforms take pixels to mm.
+    pairs = [pair for pair in map(ends, transforms) if tool == names.image or names.image not in pair]
+    chain, target = chain_between(pairs, tool, world), _REFERENCE if reference is None else ends(reference)[0]
+    if chain and target not in (tool, "none"):
+        chain = chain_between(pairs, tool, target) or (chain if reference is None else None)
+    if not chain:
+        wanted = " and ".join(filter(None, (name, reference)))
+        listing = ", ".join(transforms) or "none"
+        raise InvalidInputError(f"{header.path}: expected transforms {wanted}, got {listing}")
+    matrices, faults = np.eye(4), [""] * header.frame_count
+    for pair in chain:
+        step, reasons = _column(header, *pair, is_rigid=names.image not in pair)
+        matrices, faults = step @ matrices, [a or b for a, b in zip(faults, reasons, strict=True)]
+    pixels = None
     if tool == names.image:
         matrices, pixels = _image_poses(matrices, faults, f"{header.path}: {name}Transform")
-    if fixed != "none":
-        world_from_reference, reference_faults = _column(header, fixed)
-        world_from_reference, deviations = rigid(world_from_reference)
-        matrices = np.asarray(np.linalg.inv(world_from_reference) @ matrices)
-        reasons = zip(faults, reference_faults, deviations, strict=True)
-        faults = [next(filter(None, of_frame), "") for of_frame in reasons]
-        chain.append(_back(fixed))
-    return Poses(tool, tuple(chain), matrices, faults, pixels)
+    return Poses(tool, tuple(map(_joined, chain)), matrices, faults, pixels)
 
 
-def _holds(transforms: Sequence[str], name: str) -> bool:
-    """Whether a transform is among some, itself or its inverse."""
-    return name in transforms or _back(name) in transforms
+def chain_between(pairs: Iterable[Pair], start: str, end: str) -> list[Pair] | None:
+    """Fewest steps between two frames, along transforms or against them; None if there is no way."""
+    steps = [step for a, b in pairs for step in ((a, b), (b, a))]
+    chains, queue = {start: list[Pair]()}, [start]
+    for frame in queue:
+        for a, b in steps:
+            if a == frame and b not in chains:
+                chains[b] = [*chains[a], (a, b)]
+                queue.append(b)
+    return chains.get(end)
 
 
 def fixed_transform(header: SequenceHeader, name: str) -> FloatArray | None:
@@ -140,7 +142,7 @@ def fixed_transform(header: SequenceHeader, name: str) -> FloatArray | None:
     key = f"{name}Transform"
     if key in header.fields:
         return np.reshape(numbers(header.fields[key], 16, f"{header.path}: {key}"), (4, 4))
-    matrices, faults = _column(header, name)
+    matrices, faults = _column(header, *ends(name))
     matrices = matrices[[not fault for fault in faults]]
     if not len(matrices):
         return None
@@ -227,12 +229,13 @@ def ends(name: str) -> tuple[str, str]:
 
 def names_of(header: SequenceHeader) -> list[str]:
     """Names of the transforms of any frame, as ``ProbeToTracker``."""
-    names = {name for frame in header.frames for name in frame if name.endswith("Transform")}
+    names = {name for frame in header.frames.values() for name in frame if name.endswith("Transform")}
     return sorted(name.removesuffix("Transform") for name in names)
 
 
-def _back(name: str) -> str:
-    return "To".join(reversed(ends(name)))
+def _joined(pair: tuple[str, str]) -> str:
+    """Name of the transform between two frames, or of one that names no world."""
+    return "To".join(filter(None, pair))
 
 
 def _usual_pose(transforms: Sequence[str], names: Names) -> str | None:
@@ -242,7 +245,7 @@ def _usual_pose(transforms: Sequence[str], names: Names) -> str | None:
         frames = {b if a == tool else a for a, b in map(ends, transforms) if tool in (a, b)}
         return frames - {names.probe, names.image, "TransducerOrigin", "TransducerOriginPixel", ""}
 
-    usual_worlds = names.tracker, "Reference"
+    usual_worlds = names.tracker, _REFERENCE
     carriers = sorted(partners(names.image) - {*usual_worlds})
     for tool in (names.probe, *carriers, names.image):
         worlds = partners(tool)
@@ -252,22 +255,25 @@ def _usual_pose(transforms: Sequence[str], names: Names) -> str | None:
     return None
 
 
-def _column(header: SequenceHeader, name: str) -> tuple[FloatArray, list[str]]:
+def _column(
+    header: SequenceHeader, start: str, end: str, is_rigid: bool = False
+) -> tuple[FloatArray, list[str]]:
     """Read one transform of every frame, either way round; the identity where it is not valid, and why."""
-    frames = header.frames
-    is_back = not any(f"{name}Transform" in frame for frame in frames)
-    key = f"{_back(name) if is_back else name}Transform"
-    matrices, faults = np.tile(np.eye(4), (len(frames), 1, 1)), [""] * len(frames)
-    for i, frame in enumerate(frames):
-        if key not in frame or frame.get(f"{key}Status", "OK") != "OK":
-            faults[i] = "without a valid pose"
-            continue
-        try:
-            matrix = np.reshape(numbers(frame[key], 16, key), (4, 4))
-            matrices[i] = np.linalg.inv(matrix) if is_back else matrix
-        except (InvalidInputError, np.linalg.LinAlgError):
-            faults[i] = "whose pose is not 16 finite numbers, or has no inverse"
-    return matrices, faults
+    key, back = (f"{_joined(pair)}Transform" for pair in ((start, end), (end, start)))
+    is_back = not any(header.column(key))
+    key = back if is_back else key
+    matrices = np.tile(np.eye(4), (header.frame_count, 1, 1))
+    faults, statuses = ["without a valid pose"] * len(matrices), dict(header.column(f"{key}Status"))
+    for i, text in header.column(key):
+        if statuses.get(i, "OK") == "OK":
+            try:
+                matrices[i], faults[i] = np.reshape(numbers(text, 16, key), (4, 4)), ""
+            except InvalidInputError:
+                faults[i] = "whose pose is not 16 finite numbers"
+    if is_rigid:
+        matrices, reasons = rigid(matrices)
+        faults = [a or b for a, b in zip(faults, reasons, strict=True)]
+    return np.asarray(np.linalg.pinv(matrices)) if is_back else matrices, faults
 
 
 def _image_poses(
@@ -280,10 +286,8 @@ def _image_poses(
     valid = np.flatnonzero([not fault for fault in faults])
     if not valid.size:
         return matrices, None
-    unmirrored = valid[np.linalg.det(matrices[valid, :3, :3]) >= 0]
-    rows = unmirrored if unmirrored.size else valid
-    widths = np.linalg.norm(matrices[rows, :3, 0], axis=1)
-    usual = matrices[rows[np.argsort(widths)[widths.size // 2]]]
+    widths = np.linalg.norm(matrices[valid, :3, 0], axis=1)
+    usual = matrices[valid[np.argsort(widths)[widths.size // 2]]]
     _, skew_rad = sensor_from_image(usual, 0.0, where)  # refuses what is no calibration
     pixels = image_matrix(RigidTransform.identity(), *pixel_axes(usual, where), 0.0, skew_rad)
     poses = matrices.copy()

@@ -22,7 +22,7 @@ from speckle3d.core.progress import Progress
 from speckle3d.core.sweep import OrientationSensor, RFSettings, Sweep, Tracker, stored_dtype
 from speckle3d.io.hdf5 import atomic_path, require_suffix
 from speckle3d.io.header_fields import NRRD_NAMES
-from speckle3d.io.image_writer import meta_header, nrrd_header, write_image
+from speckle3d.io.image_writer import write_image
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.plus.transforms import IMAGE, ORIENTATION, image_matrix
 from speckle3d.io.text import number_text, numbers
@@ -33,7 +33,11 @@ SUFFIXES = (".mha", ".nrrd")
 _OF_SLICER = ".seq.nrrd"
 """With four axes, the last of them the frames, as 3D Slicer reads it [3]_; other NRRD files have three."""
 
-_KINDS = "domain domain list"
+_META_AXES = """Kinds = domain domain list
+Offset = 0 0 0
+TransformMatrix = 1 0 0 0 1 0 0 0 1
+CenterOfRotation = 0 0 0
+AnatomicalOrientation = RAI"""
 _NRRD_NAMES = {name: nrrd for nrrd, name in NRRD_NAMES.items()}
 
 _PREFIX = "Speckle3D_"
@@ -54,7 +58,7 @@ def own_values(path: str, fields: Mapping[str, str]) -> dict[str, Any]:
         if text is None or name == "probe":
             values |= {} if text is None else {name: text}
             continue
-        parts = numbers(text, 2 if name == "bandwidth_hz" else 1, f"{path}: {_PREFIX}{name}")
+        parts = numbers(text, None, f"{path}: {_PREFIX}{name}")
         values[name] = parts if len(parts) > 1 else parts[0]
     return values
 
@@ -108,7 +112,14 @@ def write_sequence(
     dtype, is_nrrd = sweep.frames.dtype, suffix.endswith(".nrrd")
     if dtype.kind == "c":
         dtype = np.dtype(np.int16 if stored_dtype(sweep.frames) == np.int16 else np.float32)
-    shape = (*_pixels(sweep.frames[0]).shape[::-1], len(sweep))
+    shape, axes = (*_pixels(sweep.frames[0]).shape[::-1], len(sweep)), _META_AXES
+    if is_nrrd:
+        fields = {_NRRD_NAMES.get(name, name): value for name, value in fields.items()}
+        x, y, _ = fields.pop("ElementSpacing").split()
+        axes = f"space dimension: 2\nspace directions: ({x},0) (0,{y}) none\nkinds: domain domain list"
+        if suffix == _OF_SLICER:
+            shape, axes = (*shape[:2], 1, shape[2]), _slicer_axes(x, y)
+            fields |= _slicer_fields(sweep.frame_time_s)
 
     def planes() -> Iterator[AnyArray]:
         for i in range(len(sweep)):
@@ -116,14 +127,8 @@ def write_sequence(
             if progress is not None:
                 progress(i + 1, len(sweep))
 
-    def header(packed_bytes: int | None) -> str:
-        if not is_nrrd:
-            return meta_header(shape, dtype, _KINDS, fields, packed_bytes)
-        times = sweep.frame_time_s if suffix == _OF_SLICER else None
-        return _nrrd_header(fields, times, shape, dtype, compressed)
-
     with atomic_path(path) as part:
-        write_image(part, header, planes(), compressed, is_nrrd)
+        write_image(part, planes(), shape, dtype, axes, fields, compressed)
     return omissions
 
 
@@ -153,9 +158,8 @@ def write_transforms(path: PathLike, times_s: FloatArray, transforms: Mapping[st
     fields = {"ElementSpacing": "1 1 1", **_time_fields(times_s)}
     for name, matrices in transforms.items():
         _add(fields, name, matrices)
-    header = meta_header((0, 0, times_s.size), np.dtype(np.uint8), _KINDS, fields, None)
     with atomic_path(path) as part:
-        write_image(part, lambda _: header, (), False, False)
+        write_image(part, (), (0, 0, times_s.size), np.dtype(np.uint8), _META_AXES, fields)
 
 
 def _time_fields(times_s: FloatArray) -> dict[str, str]:
@@ -228,49 +232,26 @@ def _standard_fields(sweep: Sweep) -> dict[str, str]:
         "UltrasoundImageOrientation": "FM" if is_rf else "MF",
         "UltrasoundImageType": kind,
         "ElementSpacing": number_text((*spacing, 1.0)),
-        "Offset": "0 0 0",
-        "TransformMatrix": "1 0 0 0 1 0 0 0 1",
-        "CenterOfRotation": "0 0 0",
-        "AnatomicalOrientation": "RAI",
         **{_PREFIX + name: text for name, text in texts.items()},
     }
 
 
-def _nrrd_header(
-    fields: dict[str, str],
-    slicer_times_s: FloatArray | None,
-    shape: tuple[int, int, int],
-    dtype: np.dtype[Any],
-    compress: bool,
-) -> str:
-    """Header of images with an axis of frames: in a plane, as PLUS writes them, or as Slicer's.
-
-    Slicer's are one pixel thick in space; transforms count pixels from its origin.
-    """
-    plain = {_NRRD_NAMES.get(name, name): value for name, value in fields.items()}
-    x, y, _ = plain.pop("ElementSpacing").split()
-    width, height, count = shape
-    if slicer_times_s is None:
-        axes = f"""dimension: 3
-space dimension: 2
-sizes: {width} {height} {count}
-space directions: ({x},0) (0,{y}) none
-kinds: {_KINDS}
-space origin: (0,0)"""
-        return nrrd_header(4, dtype, axes, plain, compress)
-    axes = f"""dimension: 4
-space: right-anterior-superior
-sizes: {width} {height} 1 {count}
+def _slicer_axes(x: str, y: str) -> str:
+    """Axes of images that are one pixel thick in space; transforms count pixels from its origin."""
+    return f"""space: right-anterior-superior
 space directions: ({x},0,0) (0,{y},0) (0,0,1) none
 kinds: domain domain domain list
 labels: "" "" "" "time"
 units: "" "" "" "s"
 space origin: (0,0,0)"""
+
+
+def _slicer_fields(times_s: FloatArray) -> dict[str, str]:
     # Slicer finds what belongs together by frames' times; it rounds those of transforms to 1 ms.
-    times = [f"{time:.3f}" for time in slicer_times_s]
-    values = " ".join(times if len({*times}) == count else map(str, range(count)))
+    times = [f"{time:.3f}" for time in times_s]
+    values = " ".join(times if len({*times}) == len(times) else map(str, range(len(times))))
     # Slicer reads the transforms up to the first line of more than 1,000 characters.
-    plain["DataNodeClassName"] = "vtkMRMLScalarVolumeNode"
+    fields = {"DataNodeClassName": "vtkMRMLScalarVolumeNode"}
     for axis in (3, 0):  # up to version 5.6 Slicer knew the axis of frames as the first
-        plain |= {f"axis {axis} index type": "numeric", f"axis {axis} index values": values}
-    return nrrd_header(4, dtype, axes, plain, compress)
+        fields |= {f"axis {axis} index type": "numeric", f"axis {axis} index values": values}
+    return fields

@@ -27,7 +27,7 @@ from speckle3d.core.labels import LabelMap, Segment
 from speckle3d.core.printable import printable
 from speckle3d.core.volume import Volume
 from speckle3d.io.hdf5 import atomic_path, require_suffix
-from speckle3d.io.image_writer import meta_header, nrrd_header, write_image
+from speckle3d.io.image_writer import write_image
 from speckle3d.io.text import number_text
 from speckle3d.io.voxels.segments import segment_fields
 
@@ -87,8 +87,8 @@ def write_volume(path: PathLike, volume: Volume, compress: bool = True) -> None:
             return
         fields = {f"{PREFIX}{name}": value for name, value in volume.fields.items()} | plain
         fields = {name: _escape(value) for name, value in fields.items()}
-        header, is_nrrd = _nrrd_header if suffix == ".nrrd" else _meta_header, suffix == ".nrrd"
-        write_image(part, lambda size: header(volume, fields, size), volume.voxels.T, compress, is_nrrd)
+        axes = (_nrrd_axes if suffix == ".nrrd" else _meta_axes)(volume)
+        write_image(part, volume.voxels.T, volume.shape, volume.voxels.dtype, axes, fields, compress)
 
 
 class VolumeWriter:
@@ -190,29 +190,23 @@ def _write_nifti(path: Path, volume: Volume, fields: Mapping[str, str], is_label
     nibabel.save(image, path)
 
 
-def _nrrd_header(volume: Volume, fields: Mapping[str, str], packed_bytes: int | None) -> str:
+def _nrrd_axes(volume: Volume) -> str:
     *steps, origin = (f"({number_text(column, ',')})" for column in volume.world_from_index[:3].T)
-    axes = f"""dimension: 3
-space: left-posterior-superior
-sizes: {number_text(volume.shape)}
+    return f"""space: left-posterior-superior
 space directions: {" ".join(steps)}
 kinds: domain domain domain
 space units: "mm" "mm" "mm"
 space origin: {origin}"""
-    return nrrd_header(5, volume.voxels.dtype, axes, fields, packed_bytes is not None)
 
 
-def _meta_header(volume: Volume, fields: Mapping[str, str], packed_bytes: int | None) -> str:
+def _meta_axes(volume: Volume) -> str:
+    """Kinds are as PLUS tells a volume from a sequence of frames."""
     pose = volume.world_from_grid
-    place = {
-        "TransformMatrix": number_text(pose.rotation.as_matrix().T.ravel()),
-        "Offset": number_text(pose.translation),
-        "CenterOfRotation": "0 0 0",
-        "ElementSpacing": number_text(volume.spacing_mm),
-    }
-    # Kinds as PLUS tells a volume from a sequence of frames.
-    kinds = "domain domain domain"
-    return meta_header(volume.shape, volume.voxels.dtype, kinds, {**place, **fields}, packed_bytes)
+    return f"""Kinds = domain domain domain
+TransformMatrix = {number_text(pose.rotation.as_matrix().T)}
+Offset = {number_text(pose.translation)}
+CenterOfRotation = 0 0 0
+ElementSpacing = {number_text(volume.spacing_mm)}"""
 
 
 def volume_suffix(path: PathLike, is_labels: bool = False) -> str:
