@@ -174,7 +174,7 @@ class _Sequence:
             tracker=self._tracker(),
             orientation=self._orientation(),
             chain=self._chain(),
-            probe=own.get("probe") or self.device.text("TransducerName"),
+            probe=settings.probe or own.get("probe") or self.device.text("TransducerName"),
             full_scale=own.get("full_scale", 255.0),
             substitutes=dict.fromkeys(_PIXELS, "tracker_transform") if self.image_pose else {},
             assumptions=("parallel lines",) if self.layout.is_rf and not own else (),

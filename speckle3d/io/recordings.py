@@ -306,7 +306,7 @@ class Recording:
             tracker=self.tracker,
             orientation=self.orientation,
             name=printable(self.name or self.path.name.split(".")[0]),
-            probe=self.settings.probe or self.probe,
+            probe=self.probe or self.settings.probe or "",
         )
 
 
