@@ -1,11 +1,11 @@
-"""Running means of an image over a rectangular window, and what is divided by them."""
+"""Running means of an image over a rectangular window."""
 
 from __future__ import annotations
 
 import numpy as np
 from numba import njit
 
-from speckle3d.core.arrays import Complex64Array, Float32Array
+from speckle3d.core.arrays import Float32Array
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
@@ -36,30 +36,3 @@ def box_means(image: Float32Array, wide: int, high: int, out: Float32Array) -> N
         for k in range(samples):
             target[k] = (later[k] - upto[k]) / (wide * high)
             lateral[k] -= leaving[k]
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
-def squared_magnitude(analytic: Complex64Array, out: Float32Array) -> None:
-    """Fill `out` from complex samples of its shape, (vector, sample)."""
-    for v in range(len(out)):
-        source, target = analytic[v], out[v]
-        for k in range(target.size):
-            target[k] = source[k].real * source[k].real + source[k].imag * source[k].imag
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
-def amplify(analytic: Complex64Array, gain: Float32Array, image: Float32Array, parts: Float32Array) -> None:
-    """Fill `parts` with real and imaginary parts times the root of a gain, `image` with their power.
-
-    Parameters
-    ----------
-    analytic : complex64, shape (vector, sample)
-    gain, image : float32, shape (vector, sample)
-    parts : float32, shape (2, vector, sample)
-    """
-    for v in range(len(gain)):
-        source, power, real, imaginary = analytic[v], image[v], parts[0, v], parts[1, v]
-        for k in range(power.size):
-            root = np.sqrt(gain[v, k])
-            real[k], imaginary[k] = source[k].real * root, source[k].imag * root
-            power[k] = real[k] * real[k] + imaginary[k] * imaginary[k]

@@ -20,7 +20,7 @@ from speckle3d.core.arrays import BoolArray, Complex64Array, Float32Array, Float
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.grid import ImageGrid
 from speckle3d.core.sweep import BModeSettings, RFSettings
-from speckle3d.kernels.box_means import amplify, box_means, squared_magnitude
+from speckle3d.kernels.box_means import box_means
 
 _RATE_OVER_BAND = 100 / 27
 """Rate of the intensity's samples over the width of the pass-band, edges included, whatever the echoes were
@@ -105,9 +105,7 @@ class IntensityExtractor:
         if isinstance(self.signal, BModeSettings):
             return Echo(_decompress(frame, self.signal), None)
         analytic = self._analytic(frame)
-        intensity = np.empty(analytic.shape, np.float32)
-        squared_magnitude(analytic, intensity)
-        return Echo(intensity, analytic)
+        return Echo(np.square(analytic.real) + np.square(analytic.imag), analytic)
 
     def _analytic(self, frame: npt.NDArray[Any]) -> Complex64Array:
         """Band-passed analytic signal about the band's centre, resampled in depth."""
@@ -137,8 +135,8 @@ class IntensityExtractor:
         if echo.analytic is None:
             image, parts = echo.intensity * gain, np.empty((2, 0, 0), np.float32)
         else:
-            image, parts = np.empty_like(gain), np.empty((2, *gain.shape), np.float32)
-            amplify(echo.analytic, gain, image, parts)
+            parts = np.sqrt(gain) * np.stack([echo.analytic.real, echo.analytic.imag])
+            image = np.square(parts).sum(axis=0)
         image[~counted] = 1.0
         return image, parts
 
