@@ -22,9 +22,9 @@ from .io.load import load_sweep as load_sweep
 from .io.readers import Reader as Reader
 from .io.reconstructions import load_reconstruction as load_reconstruction
 from .io.reconstructions import read_reconstruction as read_reconstruction
-from .io.shapes.surfaces import read_surface as read_surface
-from .io.shapes.surfaces import write_surface as write_surface
-from .io.shapes.transforms import write_transform as write_transform
+from .io.shapes import read_surface as read_surface
+from .io.shapes import write_surface as write_surface
+from .io.shapes import write_transform as write_transform
 from .io.sweep_writer import write_sweep as write_sweep
 from .io.voxels.volume_writer import VolumeWriter as VolumeWriter
 from .io.voxels.volume_writer import write_volume as write_volume

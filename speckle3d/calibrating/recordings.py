@@ -9,9 +9,9 @@ from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.streams import TimedPoses, TimedRotations
 from speckle3d.core.sweep import BModeSettings, Sweep
 from speckle3d.imaging.voxels.settings import Levels
+from speckle3d.io.images.metaimage import lacking_poses, read_poses
 from speckle3d.io.import_settings import ImportSettings, MissingSettingsError, settings_for
 from speckle3d.io.load import IMAGE, SIZED, kind_of, load_sweep
-from speckle3d.io.metaimage import lacking_poses, read_poses
 from speckle3d.study.images import GreyImages
 
 DYNAMIC_RANGE_DB = 60.0

@@ -53,7 +53,7 @@ def require_own_place(out: Path, kind: str, *inputs: Path) -> None:
         If it is taken.
     """
     from speckle3d.io.hdf5 import require_suffix, require_target
-    from speckle3d.io.shapes.surfaces import SUFFIXES as SURFACES
+    from speckle3d.io.shapes import SUFFIXES as SURFACES
     from speckle3d.io.voxels.volume_writer import SUFFIXES as VOLUMES
     from speckle3d.io.voxels.volume_writer import volume_suffix
 

@@ -15,11 +15,12 @@ from speckle3d.core.files import PathLike
 from speckle3d.core.printable import written_path
 from speckle3d.core.reconstruction import ImportRecord
 from speckle3d.core.sweep import Sweep
-from speckle3d.io import challenge, sweeps
-from speckle3d.io.challenge import Landmarks
+from speckle3d.io import sweeps
+from speckle3d.io.formats import challenge
+from speckle3d.io.formats.challenge import Landmarks
 from speckle3d.io.hdf5 import file_format, one_line, sha256_of
+from speckle3d.io.images.metaimage import READER as _IMAGES
 from speckle3d.io.import_settings import ImportSettings, settings_file, settings_for
-from speckle3d.io.metaimage import READER as _IMAGES
 from speckle3d.io.readers import Reader, claim, find_reader, first_bytes, readers
 from speckle3d.io.recordings import Recording, Row
 

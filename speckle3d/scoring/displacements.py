@@ -46,7 +46,7 @@ from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
 from speckle3d.core.geometry import relative_poses
 from speckle3d.core.grid import ImageGrid
-from speckle3d.io.challenge import Landmarks
+from speckle3d.io.formats.challenge import Landmarks
 
 MEANINGS = {
     "FDR_percent": "final drift rate: drift of the image's centre at the end, in per cent of the path",

@@ -20,7 +20,7 @@ from speckle3d.core.grid import ImageGrid
 from speckle3d.core.reconstruction import Reconstruction
 from speckle3d.core.streams import TimedPoses
 from speckle3d.io import load
-from speckle3d.io.challenge import Landmarks
+from speckle3d.io.formats.challenge import Landmarks
 from speckle3d.io.load import load_landmarks, load_sweep, recording_sha256
 from speckle3d.io.reconstructions import FORMAT, read_reconstruction
 from speckle3d.io.tum import LengthUnit, read_tum

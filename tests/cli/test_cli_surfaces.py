@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.volume import Volume
-from speckle3d.io.shapes.surfaces import read_surface
+from speckle3d.io.shapes import read_surface
 from speckle3d.io.voxels.volume_writer import write_volume
 
 RADIUS_MM, STEP_MM = 3.0, 0.25

@@ -7,7 +7,7 @@ from drifting import CENTRE_MM, drifting_poses
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
-from speckle3d.io.challenge import Landmarks
+from speckle3d.io.formats.challenge import Landmarks
 from speckle3d.io.load import load_landmarks, load_sweep
 from speckle3d.scoring.displacements import (
     challenge_score,

@@ -151,7 +151,7 @@ def surface(
         surface_of,
         surfaces_of_labels,
     )
-    from speckle3d.io.shapes.surfaces import write_surface
+    from speckle3d.io.shapes import write_surface
     from speckle3d.io.voxels.volumes import read_states, read_volume
 
     volume = read_volume(volume_file)

@@ -55,7 +55,7 @@ def _quantity(text: object) -> float | None:
     """Parse text as ``60 MHz`` into Hz, mm, m/s or degrees; None if it is empty."""
     if text in (None, "", "~"):
         return None
-    parts = _NUMBER.fullmatch(str(text))
+    parts = _NUMBER.fullmatch(str(text).replace(",", "."))
     value = math.nan if parts is None else float(parts[1]) * _UNITS.get(parts[2].lower(), math.nan)
     if not math.isfinite(value):
         raise ValueError("expected a number and its unit")

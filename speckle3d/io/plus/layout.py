@@ -16,7 +16,7 @@ import numpy as np
 
 from speckle3d.core.arrays import AnyArray
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.io.headers import SequenceHeader
+from speckle3d.io.images.headers import SequenceHeader
 
 RF_TYPES = ("RF_REAL", "RF_IQ_LINE", "RF_I_LINE_Q_LINE")
 _SIDES = ({"M", "F"}, {"M", "N"}, {"U", "F"}, {"U", "N"})

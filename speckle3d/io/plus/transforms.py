@@ -16,7 +16,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.geometry import nearest_rotation
-from speckle3d.io.headers import SequenceHeader
+from speckle3d.io.images.headers import SequenceHeader
 from speckle3d.io.pose_paths import rigid
 from speckle3d.io.text import numbers
 

@@ -27,7 +27,7 @@ from speckle3d.core.labels import LabelMap, Segment
 from speckle3d.core.printable import printable
 from speckle3d.core.volume import Volume
 from speckle3d.io.hdf5 import atomic_path, require_suffix
-from speckle3d.io.image_writer import write_image
+from speckle3d.io.images.image_writer import write_image
 from speckle3d.io.text import number_text
 from speckle3d.io.voxels.segments import segment_fields
 

@@ -18,8 +18,8 @@ from speckle3d.core.geometry import transforms_from_matrices
 from speckle3d.core.labels import LABEL_TYPES, LabelMap
 from speckle3d.core.volume import VOXEL_TYPES, Volume
 from speckle3d.io.hdf5 import reading
-from speckle3d.io.header_fields import is_image, mm_per
-from speckle3d.io.headers import read_header
+from speckle3d.io.images.header_fields import is_image, mm_per
+from speckle3d.io.images.headers import read_header
 from speckle3d.io.readers import first_bytes
 from speckle3d.io.text import unescape
 from speckle3d.io.voxels.segments import is_segmentation, read_segments

@@ -20,8 +20,7 @@ from speckle3d.core.reconstruction import MODES
 from speckle3d.imaging.cuts.outlines import frame_outlines
 from speckle3d.io.fileset import FileSet
 from speckle3d.io.plus.write import write_sequence, write_transforms
-from speckle3d.io.shapes.surfaces import write_polylines
-from speckle3d.io.shapes.transforms import write_transform
+from speckle3d.io.shapes import write_polylines, write_transform
 from speckle3d.scoring.references import REFERENCES
 from speckle3d.study.figures import colour_of
 from speckle3d.study.posed import PosedSweep

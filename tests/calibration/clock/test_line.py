@@ -8,9 +8,9 @@ from calibration.clock.line import delay_from_lines, line_signal
 from calibration.detection.lines import detect_lines
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.streams import TimedPoses, TimedRotations
+from speckle3d.io.images.metaimage import read_poses
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.load import load_sweep
-from speckle3d.io.metaimage import read_poses
 
 DELAY_S = 0.08
 

@@ -7,7 +7,7 @@ import pytest
 import sweep_examples
 from image_examples import grey, write_mha
 
-from speckle3d.io.headers import read_header
+from speckle3d.io.images.headers import read_header
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.load import load_sweep, open_recording
 from speckle3d.io.plus.write import write_sequence

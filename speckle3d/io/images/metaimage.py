@@ -20,8 +20,8 @@ from speckle3d.core.sweep import OrientationSensor, Tracker
 from speckle3d.io.carrier import CARRIER, carrier_share
 from speckle3d.io.frames import FileFrames, ReadFrame
 from speckle3d.io.hdf5 import reading
-from speckle3d.io.header_fields import is_image
-from speckle3d.io.headers import SequenceHeader, read_header
+from speckle3d.io.images.header_fields import is_image
+from speckle3d.io.images.headers import SequenceHeader, read_header
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.plus.device_set import DeviceSet, read_device_set
 from speckle3d.io.plus.layout import Layout

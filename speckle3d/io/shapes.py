@@ -1,4 +1,14 @@
-"""Surfaces as STL, PLY or VTK files, by meshio, and lines as VTK; headers say LPS, as 3D Slicer reads it."""
+"""What is placed in space as files: surfaces (STL, PLY, VTK), lines (VTK), poses (transforms of ITK).
+
+World axes lead left, posterior and superior, as headers say for 3D Slicer. A transform file of ITK (.tfm)
+holds what takes points of the parent to those of the child, as for resampling [1]_; Slicer shows its inverse
+as the node's "transform to parent". So what is written is `world_from_image`'s inverse, in mm. A node with
+that transform has image coordinates of P below it.
+
+References
+----------
+.. [1] 3D Slicer user guide, "Transforms", section "ITK transform files".
+"""
 
 from __future__ import annotations
 
@@ -7,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError, naming
@@ -14,11 +25,14 @@ from speckle3d.core.extras import extra_module
 from speckle3d.core.files import PathLike
 from speckle3d.core.surface import Surface
 from speckle3d.io.hdf5 import atomic_path, reading, require_suffix
+from speckle3d.io.text import number_text
 
 SUFFIXES = (".stl", ".ply", ".vtk")
 SPACE = "SPACE=LPS"
 """What 3D Slicer looks for in the header of STL and VTK, and among the comments of PLY."""
 _STL_HEADER_BYTES = 80
+_TRANSFORM, _TYPE = ".tfm", "AffineTransform_double_3_3"
+"""Rigid, but of the type that all of ITK's readers know."""
 
 
 def write_surface(path: PathLike, surface: Surface) -> None:
@@ -131,3 +145,46 @@ def write_polylines(path: PathLike, lines_mm: FloatArray, frames: npt.NDArray[np
     )
     with atomic_path(path) as part:
         part.write_bytes(b"".join(pieces) + b"\n")
+
+
+def write_transform(path: PathLike, world_from_image: RigidTransform) -> None:
+    """Write one pose as a transform of ITK; the file appears whole or not at all.
+
+    Parameters
+    ----------
+    path : path
+        Ends in .tfm.
+    world_from_image : RigidTransform
+        A single pose; its world's axes lead left, posterior and superior; mm.
+
+    Raises
+    ------
+    InvalidInputError
+        If the suffix is another, or the pose is a row of poses: Slicer reads one transform of a file.
+    FileError
+        If the file cannot be written.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     write_transform(f"{folder}/t.tfm", RigidTransform.from_translation([1.0, 2.0, 3.0]))
+    ...     print(Path(f"{folder}/t.tfm").read_text().splitlines()[3])
+    Parameters: 1 0 0 0 1 0 0 0 1 -1 -2 -3
+    """
+    require_suffix(path, [_TRANSFORM])
+    if not world_from_image.single:
+        raise InvalidInputError(f"{path}: expected one pose, got a row of {len(world_from_image)}")
+    matrix = world_from_image.inv().as_matrix()
+    # Matrix, row by row, and translation.
+    parameters = np.concatenate((matrix[:3, :3].ravel(), matrix[:3, 3]))
+    lines = (
+        "#Insight Transform File V1.0",
+        "#Transform 0",
+        f"Transform: {_TYPE}",
+        f"Parameters: {number_text(parameters)}",
+        "FixedParameters: 0 0 0",
+    )
+    with atomic_path(path) as part:
+        part.write_text("\n".join(lines) + "\n", encoding="ascii")

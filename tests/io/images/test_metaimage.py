@@ -8,9 +8,9 @@ from sweep_examples import frames_of
 
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.sweep import BModeSettings
+from speckle3d.io.images.metaimage import read_poses
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.load import load_sweep, open_recording
-from speckle3d.io.metaimage import read_poses
 
 BMODE = ImportSettings(column_pitch_mm=0.1, row_spacing_mm=0.2, dynamic_range_db=60.0)
 RF = ImportSettings(

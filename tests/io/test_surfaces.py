@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from speckle3d.core.surface import Surface
-from speckle3d.io.shapes.surfaces import SUFFIXES, read_surface, write_surface
+from speckle3d.io.shapes import SUFFIXES, read_surface, write_surface
 
 CORNERS = np.array([[10.0, -20, 30], [11, -20, 30], [10, -19, 30], [10, -20, 31]])
 FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from image_examples import frame_fields, grey, write_mha
 
-from speckle3d.io.headers import read_header
+from speckle3d.io.images.headers import read_header
 from speckle3d.io.import_settings import ImportSettings
 
 BMODE = ImportSettings(column_pitch_mm=0.1, row_spacing_mm=0.2, dynamic_range_db=60.0)

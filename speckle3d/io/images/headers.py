@@ -21,7 +21,7 @@ from speckle3d.core.arrays import AnyArray, FloatArray
 from speckle3d.core.errors import FileError, InvalidInputError, naming
 from speckle3d.core.files import PathLike, open_regular
 from speckle3d.io.hdf5 import reading
-from speckle3d.io.header_fields import (
+from speckle3d.io.images.header_fields import (
     frame_fields,
     is_image,
     meta_fields,

@@ -1,0 +1,1 @@
+"""Image files, MetaImage and NRRD: headers, pixels, sequences."""

@@ -1,1 +1,0 @@
-"""What is placed in space as files: surfaces, lines, transforms, picked points."""
