@@ -252,7 +252,8 @@ def _claim(table: TextTable, plain: bool, dot: bool) -> Claim:
         if match := _WORLD.match(line):
             return Claim(match[2].upper(), "as the file says", final=match[1] == "# world")
     if plain:
-        return Claim("NWU", "as plain files are" if table.names else "as the MT9 software's are")
+        by = "as plain files are" if table.names else "as the MT9 software's are"
+        return Claim("NWU", by, by_default=bool(table.names))
     return Claim("ENU", "as the sensor's are" if dot else "the program's default", by_default=True)
 
 

@@ -40,10 +40,15 @@ _DIGIT = re.compile("[0-9]")
 
 _DEG = 0.017453292519943295
 TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}
-_FORCES = {"m_s2": 1.0, "m_s_2": 1.0, "m_s_s": 1.0, "g": g, "mg": 1e-3 * g}
+_FORCES = dict.fromkeys(("m_s2", "m_s_2", "m_s_s", "mps2"), 1.0) | {"g": g, "mg": 1e-3 * g}
 _RATES = {
     f"{unit}{power}": scale
-    for units, scale in (("rad_s", 1.0), ("mrad_s", 1e-3), ("deg_s dps °_s", _DEG), ("mdps", 1e-3 * _DEG))
+    for units, scale in (
+        ("rad_s rads", 1.0),
+        ("mrad_s", 1e-3),
+        ("deg_s dps °_s", _DEG),
+        ("mdps", 1e-3 * _DEG),
+    )
     for unit in units.split()
     for power in ("", "_1")
 }
@@ -69,7 +74,7 @@ _COLUMNS: tuple[tuple[str, str, str, Mapping[str, float], Mapping[str, str]], ..
     ("optical", "vicon_orientation", "[wxyz]", {}, {}),
     (
         "time",
-        "(?:(?:sample|system|sensor|elapsed|date|local|chip)_?)?time(?:_?stamp)?|ts?|epoch|(?:s_)?elapsed",
+        "(?:[a-z]+_?)?(?:and_)?time(?:_?stamp)?(?:_?startup|_since_?[a-z0-9]+)?|ts?|epoch|(?:s_)?elapsed",
         "",
         TIMES,
         {},
@@ -82,12 +87,12 @@ _COLUMNS: tuple[tuple[str, str, str, Mapping[str, float], Mapping[str, str]], ..
         {},
     ),
     ("ticks", "sampletimefine", "", {}, {}),
-    ("utc", "utc", "year|month|day|hour|minute|s|nano", {}, {}),
+    ("utc", "utc|(?:header_)?stamp", "year|month|day|hour|minute|s|nano|ns", {}, {"ns": "nano"}),
 )
 """Quantity; its names with other characters than letters and digits as underscores, and those of its axes;
 factors from its units to SI, angles to degrees, while fields stay in theirs; axes by their other names."""
 
-_PREFIX = "(?:(?:imu|field|sensor|data|shimmer(?:_[0-9a-f]{4})?)_)*"
+_PREFIX = "(?:(?:imu|field|sensor|data|shimmer(?:_[0-9a-f]{4})?)_|uncomp)*"
 _SUFFIX = "(?:_rs_s|_ln|_wr|_unix|_startup)?"
 _PATTERNS = [
     (quantity, re.compile(rf"{_PREFIX}(?:{names}){_SUFFIX}_?({axes})(?:_cal)?(?:_(.+))?$"), units, letters)
