@@ -22,8 +22,8 @@ from speckle3d.core.geometry import nearest_rotation
 from speckle3d.core.leastsquares import robust_sigma
 from speckle3d.core.sweep import OrientationSensor, Sweep, Tracker
 
-LONGEST_STILL_S = 0.5
-"""Beyond which unchanged readings are told: loggers repeat one until the next."""
+LONGEST_STILL_S = 0.2
+"""Beyond which unchanged readings are told: loggers repeat one until the next, of 5 Hz at least."""
 MOST_STILL = 0.2
 """Share of the sweep over which readings that do not change at all refute a sensor."""
 LEAST_TRAVEL_MM = 0.5

@@ -14,9 +14,9 @@ from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError, MismatchError
 from speckle3d.core.shown import shown
 from xsens.fusion.engines import Filter
-from xsens.fusion.readings import FASTEST_RAD_S, PAUSE_S, Samples, lost_variance
+from xsens.fusion.readings import PAUSE_S, Samples, lost_variance
 from xsens.fusion.settings import LOST, FusionSettings
-from xsens.logs.contradictions import not_in_metres
+from xsens.logs.contradictions import FASTEST_RAD_S, not_in_metres
 from xsens.logs.faults import LIMITS
 from xsens.logs.samples import VECTORS
 
@@ -171,28 +171,20 @@ class OnlineFilter:
         return step_s, rate, self._force, field, lost_rad2
 
 
-def _require_readings(
-    step_s: npt.ArrayLike,
-    gyroscope_rad_s: npt.ArrayLike,
-    accelerometer_m_s2: npt.ArrayLike,
-    magnetometer_au: npt.ArrayLike | None,
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+def _require_readings(step_s: npt.ArrayLike, *vectors: npt.ArrayLike | None) -> list[FloatArray]:
     """Steps and readings; what is no measurement, zeros or out of range, is NaN."""
     step = np.atleast_1d(np.asarray(step_s, dtype=float))
     if not (np.isfinite(step) & (step > 0.0)).all():
         raise InvalidInputError("step_s: expected positive numbers, got one that is not")
-    if magnetometer_au is None:
-        magnetometer_au = np.full((step.size, 3), np.nan)
-    vectors = (accelerometer_m_s2, gyroscope_rad_s, magnetometer_au)
-    force, rate, field = (np.array(rows, dtype=float, ndmin=2) for rows in vectors)
-    if not rate.shape == force.shape == field.shape == (step.size, 3):
-        raise MismatchError(
-            f"expected readings of shape {(step.size, 3)}, got {rate.shape}, {force.shape} and {field.shape}"
-        )
+    shape = (step.size, 3)
+    readings = [np.full(shape, np.nan) if v is None else np.array(v, dtype=float, ndmin=2) for v in vectors]
+    if any(rows.shape != shape for rows in readings):
+        raise MismatchError(f"expected readings of shape {shape}, got {[rows.shape for rows in readings]}")
+    rate, force, field = readings
     fast = np.linalg.norm(np.nan_to_num(rate), axis=1).max(initial=0.0)
     if fast > FASTEST_RAD_S:
         raise InvalidInputError(f"gyroscope_rad_s: expected rad/s, got a reading of {fast:.3g}: in deg/s?")
     force[~force.any(axis=1) | ~(np.abs(force) < LIMITS[VECTORS[0]].largest).all(axis=1)] = np.nan
     field[~field.any(axis=1)] = np.nan
     rate[~rate.any(axis=1) & np.isnan(force[:, 0])] = np.nan
-    return step, rate, force, field
+    return [step, *readings]

@@ -43,21 +43,20 @@ def by_vqf(stretch: Samples, claims: Estimate, offline: bool, magnetic: bool) ->
             "the methods vqf and vqf-online need the package vqf, got none installed: pip install vqf, "
             "which may need a C++ compiler, or choose smoother or filter"
         ) from error
-    with_field = np.flatnonzero(np.isfinite(stretch.field_au[:, 0]))
-    magnetic = magnetic and with_field.size > 0
-    place = np.cumsum(stretch.step_s) - stretch.step_s[0]
-    mean_s = float(place[-1]) / max(len(place) - 1, 1) or float(stretch.step_s[0])
+    magnetic = magnetic and bool(np.isfinite(stretch.field_au[:, 0]).any())
+    time_s = np.cumsum(stretch.step_s)
+    mean_s = float(stretch.step_s[1:].mean()) if len(stretch) > 1 else float(time_s[0])
     # Losses make the mean step longer than the median, bursts shorter: at most two for one.
     step_s = float(np.clip(np.median(stretch.step_s), 0.5 * mean_s, mean_s))
-    place /= step_s
+    place = (time_s - time_s[0]) / step_s
     grid = np.arange(max(round(float(place[-1])), 1) + 1.0)
     # A gyroscope's reading is the mean rate since the one before, here too: turns stay what they were.
-    angle = np.cumsum(stretch.rate_rad_s * np.diff(place, prepend=place[0])[:, None], axis=0)
+    angle = np.cumsum(stretch.rate_rad_s * np.diff(place, prepend=0.0)[:, None], axis=0)
     rate = np.diff(_at(grid, place, angle), axis=0, prepend=0.0)
     rate[0] = stretch.rate_rad_s[0]
     force, field = _at(grid, place, stretch.force_m_s2), None
     if magnetic:
-        field = _at(grid, place[with_field], stretch.field_au[with_field])
+        field = _at(grid, place, stretch.field_au)
     find = vqf.offlineVQF if offline else vqf.VQF(step_s).updateBatch
     estimate = find(rate, force, field, *([step_s] if offline else []))
     rotations = Rotation.from_quat(estimate["quat9D" if magnetic else "quat6D"], scalar_first=True)
@@ -82,8 +81,9 @@ def by_vqf(stretch: Samples, claims: Estimate, offline: bool, magnetic: bool) ->
 
 
 def _at(places: FloatArray, grid: FloatArray, values: FloatArray) -> FloatArray:
-    """Columns interpolated at places, from those at known ones."""
-    return np.column_stack([np.interp(places, grid, column) for column in values.T])
+    """Finite rows interpolated at places, from those at known ones."""
+    rows = np.isfinite(values[:, 0])
+    return np.column_stack([np.interp(places, grid[rows], column[rows]) for column in values.T])
 
 
 def _apart(first: FloatArray, second: FloatArray) -> FloatArray:

@@ -15,6 +15,10 @@ from xsens.logs.samples import ImuLog, finite_rows
 FORCE_M_S2 = (4.0, 25.0)
 """Limits of the median of the accelerometer's norm if it is in m/s^2."""
 
+FASTEST_RAD_S = 60.0
+"""The widest range of the sensors' gyroscopes ends at 35 rad/s about an axis, and a hand's ordinary movement
+in deg/s exceeds 60."""
+
 _COMPARED_S = 0.1
 """Interval over which turns are compared: a hand turns by less than a radian in it."""
 
@@ -53,7 +57,7 @@ def contradictions(log: ImuLog) -> dict[str, str]:
     """
     force, field = log.accelerometer_m_s2, log.magnetometer_au
     directions = {"accelerometer": force, "magnetometer": field, "own orientation": log.own_direction}
-    sentences = {"gyroscope": ""}
+    sentences = {"gyroscope": "" if log.gyroscope_rad_s is None else _not_in_radians(log.gyroscope_rad_s)}
     for name, direction in directions.items():
         turns = None if direction is None else _turns(log, direction)
         if turns is not None:
@@ -73,6 +77,13 @@ def not_in_metres(force: FloatArray) -> str:
         return ""
     unit = ": in g, without saying so?" if 0.9 < median < 1.1 else ""
     return f"expected an accelerometer in m/s^2, with norm near 9.8, got a median of {median:.3g}{unit}"
+
+
+def _not_in_radians(rate: FloatArray) -> str:
+    fast = float(np.nanpercentile(np.linalg.norm(rate, axis=1), 99.0))
+    if fast <= FASTEST_RAD_S:
+        return ""
+    return f"expected a gyroscope in rad/s, got one in a hundred over {fast:.3g}: in deg/s?"
 
 
 def _upward_field(force: FloatArray, field: FloatArray) -> str:

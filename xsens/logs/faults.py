@@ -7,7 +7,6 @@ become NaN, as if they had not come, so that whatever uses the log grows less ce
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -59,9 +58,6 @@ _TURNS_APART = 5.0
 
 _NOISY = 10.0
 """Last digits: readings that change by more are not repeated by chance. Usual changes: more is a jump."""
-
-_WRAPS = 1.5
-"""Least change of an overflow, in largest readings: one changes by two, less what the sensor turned."""
 
 _ENOUGH = 50
 _MOST_SENSORS = 8
@@ -136,14 +132,12 @@ def _bad(name: str, rows: FloatArray, force: FloatArray, rate: FloatArray) -> di
     if valid.any():
         repeats[valid] = _repeats(name, limits.change * unit, rows[valid], force[valid], rate[valid])
     rows = np.where((valid & ~repeats)[:, None], rows, np.nan)
-    ends, overflows = at_ends(rows), _overflows(rows)
     return {
         "readings of zero": zero,
         "out of range": beyond,
         "repeated": repeats,
-        "at the end of the range": ends,
-        "beyond the range, wrapped round": overflows & ~ends,
-        "single spikes": _spikes(rows, limits.spike * unit) & ~overflows,
+        "at the end of the range": at_ends(rows),
+        "single spikes": _spikes(rows, limits.spike * unit),
     }
 
 
@@ -195,26 +189,6 @@ def at_ends(rows: FloatArray) -> BoolArray:
             for i, k in zip(first[steep], last[steep], strict=True):
                 others_go_on = (rows[i + 1 : k + 1] != rows[i:k]).any(axis=1).sum() > 1
                 bad[i : k + 1] |= others_go_on
-    return bad
-
-
-def _overflows(rows: FloatArray) -> BoolArray:
-    """Rows in which an axis has overflowed: readings wrap round from one end of the range to the other."""
-    bad = np.zeros(len(rows), dtype=bool)
-    for axis in rows.T:
-        steps = np.diff(axis)
-        jumps = (np.flatnonzero(np.abs(steps) > _WRAPS * np.fmax.reduce(np.abs(axis))) + 1).tolist()
-        spans, ends = list[tuple[int, int]](), set[int]()
-        # A jump without another shows that the log begins or ends beyond the range.
-        for i, k in (*pairwise(jumps), (0, *jumps[:1]), (*jumps[-1:], len(axis))) if jumps else ():
-            opposite = i == 0 or k == len(axis) or steps[i - 1] * steps[k - 1] < 0.0
-            if opposite and not ends & {i, k} and (axis[i:k] * axis[i] > 0.0).all():
-                spans.append((i, k))
-                ends |= {i, k}
-        lengths = [k - i for i, k in spans]
-        if 2 * sum(length for length in lengths if length > 2) > sum(lengths):  # no vibration to and fro
-            for i, k in spans:
-                bad[i:k] = True
     return bad
 
 

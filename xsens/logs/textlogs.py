@@ -58,6 +58,9 @@ _SLOWEST_HZ = 5.0
 _EPOCH_S = (1e9, 4e9)
 """Seconds since 1970 of the years 2001 to 2096."""
 
+_LARGEST = 2.0**53
+"""Larger numbers count nothing: they are not whole."""
+
 _HALF_TURN = 3.2
 """Angles that are none of them larger may be in radians."""
 
@@ -147,9 +150,7 @@ def _samples(table: TextTable, rate_hz: float | None) -> Parts:
             f"expected a column of time with its unit, as time_s, got {', '.join(unknown[:9]) or 'none'}: "
             "name it so, or give --rate-hz"
         )
-    timely = np.ones(len(next(iter(columns.values()), ())), dtype=bool)
-    for key in columns.keys() & set(STAMPS):
-        timely &= np.abs(columns[key]) < (np.inf if key == "time" else 2.0**53)
+    timely = np.all([np.abs(columns[key]) < _LARGEST for key in STAMPS if key in columns], axis=0)
     if not timely.any():
         raise InvalidInputError("expected lines with a time, got none")
     if not timely.all():
@@ -222,22 +223,17 @@ def _unit_open(table: TextTable, plain: bool, angles: FloatArray) -> bool:
 
 
 def _utc_s(columns: dict[str, FloatArray]) -> FloatArray | None:
-    """Seconds since 1970, or since a minute, hour or day began, of columns of UTC; None without any."""
+    """Seconds of columns of UTC, since the first minute, hour or day began; None without any."""
     if "utc_s" not in columns:
         return None
-    start = {"day": 1, "month": 1, "year": 1970, "hour": 0, "minute": 0, "s": 0, "nano": 0}
-    day, month, year, hour, minute, seconds, nano = (
-        columns.get(f"utc_{part}", np.full(1, float(least))) for part, least in start.items()
+    hour, minute, seconds, nano = (
+        columns.get(f"utc_{part}", 0.0) for part in ("hour", "minute", "s", "nano")
     )
-    months = np.nan_to_num(12.0 * (year - 1970.0) + month - 1.0).astype("M8[M]")
-    days = months.astype("M8[D]").astype(float) + day
-    times = 86400.0 * days + 3600.0 * hour + 60.0 * minute + seconds + 1e-9 * nano
-    spans = {"minute": 60, "hour": 3600, "day": 86400}
-    span = next((span for part, span in spans.items() if f"utc_{part}" not in columns), None)
-    if span is not None:
-        finite = np.isfinite(times)
-        times[finite] = unwrap(times[finite], span)
-    return np.asarray(times)
+    times = np.asarray(3600.0 * hour + 60.0 * minute + seconds + 1e-9 * nano)
+    span = 60 if "utc_minute" not in columns else 3600 if "utc_hour" not in columns else 86400
+    finite = np.isfinite(times)
+    times[finite] = unwrap(times[finite], span)
+    return times
 
 
 def _side_by_side(columns: dict[str, FloatArray], keys: list[str]) -> FloatArray | None:
