@@ -34,7 +34,6 @@ from xsens.logs.texttables import (
 )
 from xsens.logs.worlds import Claim, are_rotations
 
-_SENSOR_LIKE = re.compile(r"acc|gyr|mag|quat|euler|roll|pitch|yaw|time", re.ASCII)
 _EQUALS = r"\s*[:=,;][,;\s]*"
 _RATE = re.compile(
     r"(?:update|output|sampl(?:e|ing)|data)[ _]?(?:rate|frequency)(?:[ _]?\(?hz\)?)?"
@@ -175,7 +174,7 @@ def _samples(table: TextTable, rate_hz: float | None) -> Parts:
             force = None
             notes.append("acceleration without gravity is no accelerometer's reading and was left out")
     plain = "time" in table.columns
-    odd = _unknown_columns(table, plain)
+    odd = _unknown_columns(table)
     increments = (_side_by_side(columns, _VELOCITY_STEPS), _side_by_side(columns, _TURNS))
     claim = otherwise = None
     otherwise_note = "the scalar is the last number"
@@ -253,13 +252,10 @@ def _claim(table: TextTable, plain: bool, dot: bool) -> Claim:
     return Claim("ENU", "as the sensor's are" if dot else "the program's default", by_default=True)
 
 
-def _unknown_columns(table: TextTable, plain: bool) -> Names:
-    """Note on unknown columns, and on those of a quantity some of whose axes are missing.
-
-    A program's exports hold many other columns: of theirs, only those that look like a sensor's are listed.
-    """
+def _unknown_columns(table: TextTable) -> Names:
+    """Note on unknown columns, and on those of a quantity some of whose axes are missing."""
     keys = {name: column[0] for name in table.names if (column := column_of(name))}
-    odd = [name for name in table.names if name not in keys and (plain or _SENSOR_LIKE.match(name))]
+    odd = [name for name in table.names if name not in keys]
     for quantity in (*_VECTORS, _QUATERNION):
         columns = [name for name, key in keys.items() if key in quantity]
         odd += columns if len(columns) < len(quantity) else []

@@ -282,7 +282,7 @@ def _rows(
     count = len(names or columns)
     indices = [i for i, _ in columns.values()]
     sensors = {i: dict[str, None]() for i, name in enumerate(names) if _WHOSE.match(name)}
-    values, left_out, words = array("d"), 0, 0
+    values, left_out = array("d"), 0
     for line in lines:
         cells = _split(line if separator == "," else line.replace(",", "."), separator)
         while len(cells) > count and not cells[-1].strip():
@@ -295,10 +295,7 @@ def _rows(
         try:
             values.extend([float(cells[i]) for i in indices])
         except ValueError:  # quoted, blank, a time, or a word
-            row = [number(cells[i]) for i in indices]
-            blank = [cells[i].strip().lower() in ("", "nan") for i in indices]
-            words += int(np.sum(np.isnan(row) & ~np.array(blank)))
-            values.extend(row)
+            values.extend([number(cells[i]) for i in indices])
     if not values:
         raise InvalidInputError(
             f"expected lines of {count} cells below the names, got {left_out} lines of another length"
@@ -313,8 +310,6 @@ def _rows(
     notes = []
     if left_out:
         notes.append(f"{left_out} lines of another length or without a digit were left out")
-    if words:
-        notes.append(f"{words} cells hold something else than a number: missing")
     rows, quantities = np.frombuffer(values).reshape(-1, len(indices)), {}
     for (key, (_, scale)), column in zip(columns.items(), rows.T, strict=True):
         if not names or np.isfinite(column).any():

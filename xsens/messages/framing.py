@@ -25,8 +25,6 @@ MOST_PAYLOAD = 8192
 beyond it are damage, and waiting for so many bytes would stop a live stream."""
 
 _LONG_LENGTH = 0xFF
-_BLOCK = 1 << 20
-"""Bytes scanned at a time, which bounds the memory that a file of nothing but FA takes."""
 
 
 @dataclass(frozen=True)
@@ -169,21 +167,13 @@ def rows_at(data: ByteArray, start: IntArray, size: int) -> ByteArray:
 
 
 def find_frames(data: bytes | ByteArray) -> Frames:
-    """Find every message in `data`, which may hold other bytes before, between and after them.
-
-    Time and memory are proportional to the size of `data`, whatever lengths the bytes claim.
-    """
+    """Find every message in `data`, which may hold other bytes before, between and after them."""
     array = data if isinstance(data, np.ndarray) else np.frombuffer(data, dtype=np.uint8)
     array = np.ascontiguousarray(array)
+    start, end, _ = _scan(array, True)
     # Positions take as much memory as short messages: half of it where they fit.
     place = np.int32 if array.size < np.iinfo(np.int32).max else np.int64
-    starts, ends, at = [np.zeros(0, place)], [np.zeros(0, place)], 0
-    while at < array.size:
-        start, end, stop = _scan(array[at : at + _BLOCK], at + _BLOCK >= array.size)
-        starts.append((start + at).astype(place))
-        ends.append((end + at).astype(place))
-        at += stop
-    return Frames(array, np.concatenate(starts), np.concatenate(ends))
+    return Frames(array, start.astype(place), end.astype(place))
 
 
 class Framer:

@@ -24,9 +24,6 @@ COMPENSATION_NOTE = (
     "nor the housing's alignment applied"
 )
 
-_CHUNK = 1 << 12
-"""Rows at a time."""
-
 _BLOCK = np.dtype(
     {
         "names": ("inertial", "period", "offsets", "gains", "magnetic"),
@@ -92,11 +89,6 @@ class RawCalibration:
         )
 
     def to_units(self, sensor: int, counts: FloatArray) -> FloatArray:
-        """Acceleration in m/s², rate of turn in rad/s or field in arbitrary units, of counts, shape (n, 3).
-
-        The numbers take the place of the counts, as logs may be large.
-        """
+        """Acceleration in m/s², rate in rad/s or field in arbitrary units, of counts, shape (n, 3)."""
         axes = (np.linalg.inv(self.misalignments[sensor]) / self.gains[sensor]).T
-        for part in np.array_split(counts, 1 + len(counts) // _CHUNK):
-            part[:] = (part - self.offsets[sensor]) @ axes
-        return counts
+        return np.asarray((counts - self.offsets[sensor]) @ axes)
