@@ -58,18 +58,21 @@ def turns_about(angle: str, experiments: Mapping[str, PairErrors]) -> list[Turn]
 
 def _turns(name: str, errors: PairErrors, angle: str) -> Iterator[Turn]:
     axis, n = ANGLES.index(angle), errors.frames
-    first, second = np.triu_indices(n, 1)
-    reference, error = np.zeros((n, n, 3)), np.zeros((len(errors.error_rad), n, n))
-    reference[first, second], reference[second, first] = errors.reference_rad, -errors.reference_rad
-    error[:, first, second] = errors.error_rad[..., axis]
-    error[:, second, first] = -errors.error_rad[..., axis]
-    alone = (np.abs(np.delete(reference, axis, axis=2)) <= OFF_AXIS_RAD).all(axis=2)
-    for start in range(n):
-        angles = reference[start, :, axis]
+    reference, error = _between(errors.reference_rad.T, n), _between(errors.error_rad[..., axis], n)
+    alone = (np.abs(np.delete(reference, axis, axis=0)) <= OFF_AXIS_RAD).all(axis=0)
+    for start, angles in enumerate(reference[axis]):
         frames = np.flatnonzero(alone[start] & (angles >= 0))
         frames = frames[np.argsort(angles[frames], kind="stable")]
         if frames.size >= FEWEST_FRAMES and angles[frames[-1]] > 0:
             yield Turn(name, angle, angles[frames], error[:, start, frames])
+
+
+def _between(values: FloatArray, n: int) -> FloatArray:
+    """Values of the pairs of n frames, last axis, from each frame to each, shape (..., n, n)."""
+    square = np.zeros((*values.shape[:-1], n, n))
+    first, second = np.triu_indices(n, 1)
+    square[..., first, second] = values
+    return square - square.swapaxes(-1, -2)
 
 
 def figure_turns(experiments: Mapping[str, PairErrors], title: str = "") -> Figure:

@@ -168,20 +168,15 @@ def world_of(
     north_deg = _north_deg(wxyz, field)
     likely = [name for name in (world, *WORLDS) if _EVIDENCE[name][0] * up > 0.0]
     by_north = [name for name in likely if abs(north_deg - _EVIDENCE[name][1]) <= _NORTH_DEG]
-    evident, sensors = (by_north or likely)[0], "its own accelerometer"
-    sensors += " and magnetometer" if by_north else ""
-    if claim.final:
-        note = f"{world}, {claim.by}; by {sensors} it is {evident}"
-    elif world != evident:
-        note = f"{evident} by {sensors}, not {world}, {claim.by}"
-    elif np.isnan(north_deg):
-        note = f"taken as {world}, {claim.by}: no steady field tells; see --world"
-    else:
-        note = f"{evident} by {sensors}"
-    if np.isfinite(north_deg) and not by_north:
-        note += f", although its magnetometer has north {north_deg:.0f} degrees from x"
-    told = world != evident or claim.by_default or "although" in note
-    return world if claim.final else evident, ((f"orientation: {note}",) if told else ())
+    evident, sensors = (by_north or likely)[0], "its own accelerometer alone"
+    if by_north:
+        sensors = "its own accelerometer and magnetometer"
+    elif np.isfinite(north_deg):
+        sensors = f"its own accelerometer, while the magnetometer has north {north_deg:.0f} degrees from x"
+    chosen = world if claim.final else evident
+    note = f"orientation: {chosen} ({claim.by}: {world}; by {sensors}: {evident}); --world decides"
+    told = world != evident or claim.by_default or (np.isfinite(north_deg) and not by_north)
+    return chosen, ((note,) if told else ())
 
 
 def _north_deg(wxyz: FloatArray, field: FloatArray | None) -> float:

@@ -70,7 +70,7 @@ def test_column_major_matrices_and_blank_cells_whatever_the_separator(s, separat
     np.testing.assert_allclose(log.accelerometer_m_s2, s["accelerometer_m_s2"], atol=1e-6)
     np.testing.assert_allclose(log.time_s, s["time_s"], atol=1e-9)
     assert len(log.notes) == 1
-    assert "ENU, the program's default" in log.notes[0]
+    assert "the program's default: ENU" in log.notes[0]
 
 
 # Xsens DOT's
