@@ -24,8 +24,8 @@ from speckle3d.core.sweep import OrientationSensor, Sweep, Tracker
 
 LONGEST_STILL_S = 0.2
 """Beyond which unchanged readings are told: loggers repeat one until the next, of 5 Hz at least."""
-MOST_STILL = 0.2
-"""Share of the sweep over which readings that do not change at all refute a sensor."""
+MOST_STILL, MOST_STILL_S = 0.2, 0.5
+"""Share of the sweep, and time, over which readings that do not change at all refute a sensor."""
 LEAST_TRAVEL_MM = 0.5
 """By which images must have moved meanwhile: a probe may rest, and a simulated sensor have no noise."""
 DOUBTFUL_JITTER, ABSURD_JITTER = 1.5, 10.0
@@ -154,7 +154,7 @@ def _doubt_still(sensor: OrientationSensor | Tracker, sweep: Sweep, image: Rigid
     if travel_mm > LEAST_TRAVEL_MM and same_s > LONGEST_STILL_S:
         evidence = f"expected readings that change, got the same one for {same_s:.2f} of {whole_s:.2f} s"
         where = runs_of(np.flatnonzero(during))
-        yield Doubt(sensor.label, "frozen", evidence, same_s > MOST_STILL * whole_s, where)
+        yield Doubt(sensor.label, "frozen", evidence, same_s > max(MOST_STILL * whole_s, MOST_STILL_S), where)
 
 
 def conventions(turned: Rotation) -> Iterator[tuple[str, Rotation]]:
