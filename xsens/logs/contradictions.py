@@ -31,8 +31,8 @@ _TURNING_RAD_S = 0.5
 _HONEST_SHARES = (0.7, 1.6)
 """Share of the gyroscope's turn that the other must show, in all and about each axis: 1 if all is right, 1/57
 if the unit is deg/s, another if the rate of samples is, -1 or about 0 if axes are exchanged. BROAD's trials
-and simulated hands show 0.78 to 1.16; rocking once a second about a point 0.07 m above the sensor shows 0.7,
-0.12 m below it 1.5."""
+and simulated hands show 0.78 to 1.16, by the field 0.91 to 1.16; rocking once a second about a point 0.07 m
+above the sensor shows 0.7, 0.12 m below it 1.5."""
 
 _ALIKE, _TIMES_LARGER = 0.9, 3.0
 """Correlation from which so many times the gyroscope's turn is another unit, not the hand's acceleration."""
@@ -59,7 +59,7 @@ def contradictions(log: ImuLog) -> dict[str, str]:
     directions = {"accelerometer": force, "magnetometer": field, "own orientation": log.own_direction}
     sentences = {"gyroscope": "" if log.gyroscope_rad_s is None else _not_in_radians(log.gyroscope_rad_s)}
     for name, direction in directions.items():
-        turns = None if direction is None else _turns(log, direction)
+        turns = None if direction is None else _turns(log, direction, name == "magnetometer")
         if turns is not None:
             sentences["gyroscope"] = sentences["gyroscope"] or _still_axis(name, *turns)
             sentences[name] = _against_gyroscope(name, *turns[:2])
@@ -98,8 +98,12 @@ def _upward_field(force: FloatArray, field: FloatArray) -> str:
     )
 
 
-def _turns(log: ImuLog, direction: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray] | None:
+def _turns(
+    log: ImuLog, direction: FloatArray, magnetic: bool
+) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray] | None:
     """What the gyroscope's turns make of a direction that rests in the world; None if it tells nothing.
+
+    From a magnetic one the field of iron on the sensor is taken off first.
 
     Returns
     -------
@@ -121,15 +125,23 @@ def _turns(log: ImuLog, direction: FloatArray) -> tuple[FloatArray, FloatArray, 
     width = max(1, round(_COMPARED_S / float(np.median(np.diff(columns[:, 0])))))
     count = len(columns) // width
     means = columns[: count * width].reshape(count, width, 7).mean(axis=1)
-    norm, step_s = np.linalg.norm(means[:, 4:], axis=1), np.diff(means[:, 0])
+    step_s, rates = np.diff(means[:, 0]), means[:, 1:4]
+    rate = 0.5 * (rates[1:] + rates[:-1])
+    if magnetic:  # less the field b of iron on the sensor, with which it changes at the rate u x w + w x b
+        off = np.diff(means[:, 4:], axis=0) / step_s[:, None] - np.cross(
+            0.5 * (means[1:, 4:] + means[:-1, 4:]), rate
+        )
+        by_axis = np.cross(rate[:, None], np.eye(3)).swapaxes(1, 2)
+        means[:, 4:] -= np.linalg.lstsq(by_axis.reshape(-1, 3), off.ravel())[0]
+    norm = np.linalg.norm(means[:, 4:], axis=1)
     calm = np.abs(norm / np.median(norm) - 1.0) < _CALM
     calm = calm[1:] & calm[:-1] & (step_s < 2.0 * np.median(step_s))
     if calm.sum() < _FEWEST:
         return None
-    u, rates = means[:, 4:] / np.maximum(norm, 1e-9)[:, None], means[:, 1:4]
+    u = means[:, 4:] / np.maximum(norm, 1e-9)[:, None]
     change = (np.diff(u, axis=0) / step_s[:, None])[calm]
     arms = np.cross(0.5 * (u[1:] + u[:-1])[calm], np.eye(3)[:, None])
-    turns = arms * 0.5 * (rates[1:] + rates[:-1])[calm].T[:, :, None]
+    turns = arms * rate[calm].T[:, :, None]
     if max(_rms(turns.sum(axis=0)), _rms(change)) < _MOVING_RAD_S:
         return None
     same = np.diff(rates, axis=0)[calm].T == 0.0
@@ -150,8 +162,7 @@ def _still_axis(name: str, turns: FloatArray, change: FloatArray, arms: FloatArr
 def _against_gyroscope(name: str, turns: FloatArray, change: FloatArray) -> str:
     """Sentence on a direction that turns otherwise than the gyroscope; empty if it agrees."""
     whole = turns.sum(axis=0)
-    axes = () if name == "magnetometer" else (" x", " y", " z")  # iron on the sensor spoils single axes
-    for axis, turn in (("", whole), *zip(axes, turns, strict=False)):
+    for axis, turn in (("", whole), *zip((" x", " y", " z"), turns, strict=True)):
         share = 1.0 + (turn * (change - whole)).sum() / max((turn**2).sum(), 1e-12)
         if _rms(turn) > _TURNING_RAD_S and not _HONEST_SHARES[0] < share < _HONEST_SHARES[1]:
             doubt = "in deg/s" if 0.0 < share < 0.05 else "as it is told, in rate, axes and signs"
