@@ -174,10 +174,8 @@ def timeline(stamps: Stamps) -> Timeline:
 
 
 def _running_sums(steps: Any) -> Any:
-    """Sums of steps, from zero on; in one array, as logs may be large."""
-    sums = np.zeros(len(steps) + 1, steps.dtype)
-    np.cumsum(steps, out=sums[1:])
-    return sums
+    """Sums of steps, from zero on."""
+    return np.append(steps.dtype.type(0), np.cumsum(steps))
 
 
 def _usual_step(steps: FloatArray) -> float:
@@ -219,18 +217,16 @@ def _build(
     """Times, rising counter and gaps of samples in order, without repeats."""
     seconds, irregular = np.diff(values), False
     period_s = float(np.median(seconds[~anew])) if (~anew).any() else float("nan")
-    stated_hz = 1.0 / stamps.period_s
     if numbers is None:
         periods, irregular = _by_clock(seconds, anew)
-        if stated_hz > 0.0 and not 1.0 / _AGREES < stated_hz * period_s < _AGREES:
-            rate = f"{1.0 / period_s:.4g} Hz"
-            notes.append(f"stated rate {stated_hz:g} Hz: by the times it is {rate}, which holds")
     else:
-        assert stamps.counter is not None
         periods = np.maximum(np.diff(numbers), 1.0)
         if stamps.time_s is None:
             period_s, seconds = stamps.period_s, periods * stamps.period_s
-        _require_agreement(seconds[~anew], np.diff(stamps.counter)[~anew], stated_hz)
+    if contradiction := _stated_otherwise(stamps, seconds, anew):
+        if numbers is not None:
+            raise InvalidInputError(contradiction)
+        notes.append(f"{contradiction}, which holds")
     if irregular:
         shortest, longest = 1e3 * seconds.min(), 1e3 * seconds.max()
         notes.append(
@@ -256,16 +252,18 @@ def _build(
     return Timeline(slice(None), time_s, counter, gaps, tuple(notes))
 
 
-def _require_agreement(seconds: FloatArray, counts: IntArray, stated_hz: float) -> None:
-    """Raise if a stated rate is neither that of the samples nor that of the counter by their clock."""
-    going = (seconds > 0.0) & (counts > 0)
-    if not (stated_hz > 0.0 and going.any()):
-        return
-    rates = (float(np.median(1.0 / seconds[going])), float(np.median(counts[going] / seconds[going])))
-    if not any(1.0 / _AGREES < rate / stated_hz < _AGREES for rate in rates):
-        raise InvalidInputError(
-            f"expected times at the stated rate, {stated_hz:g} Hz, got {rates[0]:.4g} Hz by their clock"
-        )
+def _stated_otherwise(stamps: Stamps, seconds: FloatArray, anew: BoolArray) -> str:
+    """Sentence on a stated rate that is neither the samples' nor the counter's by their clock."""
+    going = (seconds > 0.0) & ~anew
+    if not (stamps.period_s > 0.0 and going.any()):
+        return ""
+    rates = [float(np.median(1.0 / seconds[going]))]
+    if stamps.counter is not None:
+        rates.append(float(np.median(np.diff(stamps.counter)[going] / seconds[going])))
+    if any(1.0 / _AGREES < rate * stamps.period_s < _AGREES for rate in rates):
+        return ""
+    stated_hz = 1.0 / stamps.period_s
+    return f"expected times at the stated rate, {stated_hz:g} Hz, got {rates[0]:.4g} Hz by their clock"
 
 
 def _by_clock(seconds: FloatArray, anew: BoolArray) -> tuple[FloatArray, bool]:

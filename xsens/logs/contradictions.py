@@ -34,9 +34,6 @@ if the unit is deg/s, another if the rate of samples is, -1 or about 0 if axes a
 and simulated hands show 0.78 to 1.16, by the field 0.91 to 1.16; rocking once a second about a point 0.07 m
 above the sensor shows 0.7, 0.12 m below it 1.5."""
 
-_ALIKE, _TIMES_LARGER = 0.9, 3.0
-"""Correlation from which so many times the gyroscope's turn is another unit, not the hand's acceleration."""
-
 _ABOUT_AXIS = 0.9
 """Share of the turn missed by a gyroscope that is about an axis which stands still. By the field, BROAD's
 trials with an axis set to zero show 0.8 to 1.0, and any axis as it is 0.4 to 0.91."""
@@ -163,21 +160,15 @@ def _against_gyroscope(name: str, turns: FloatArray, change: FloatArray) -> str:
     """Sentence on a direction that turns otherwise than the gyroscope; empty if it agrees."""
     whole = turns.sum(axis=0)
     for axis, turn in (("", whole), *zip((" x", " y", " z"), turns, strict=True)):
-        share = 1.0 + (turn * (change - whole)).sum() / max((turn**2).sum(), 1e-12)
-        if _rms(turn) > _TURNING_RAD_S and not _HONEST_SHARES[0] < share < _HONEST_SHARES[1]:
-            doubt = "in deg/s" if 0.0 < share < 0.05 else "as it is told, in rate, axes and signs"
-            return _sentence(name, axis, _rms(turn), share, doubt)
-    rate, common = _rms(whole), float((whole * change).sum(axis=1).mean())
-    if common > _ALIKE * rate * _rms(change) and _rms(change) > _TIMES_LARGER * rate:
-        return _sentence(name, "", rate, common / rate**2, "in rad/s")
+        rate, share = _rms(turn), 1.0 + (turn * (change - whole)).sum() / max((turn**2).sum(), 1e-12)
+        if rate * max(share, 1.0) > _TURNING_RAD_S and not _HONEST_SHARES[0] < share < _HONEST_SHARES[1]:
+            doubt = "in rad/s" if share > 20.0 else "as it is told, in rate, axes and signs"
+            return (
+                f"gyroscope{axis} and {name} contradict each other: the one turns by {rate:.2g} rad/s, the "
+                f"other shows {100.0 * share:.3g} % of it: is the gyroscope "
+                f"{'in deg/s' if 0.0 < share < 0.05 else doubt}?"
+            )
     return ""
-
-
-def _sentence(name: str, axis: str, rms_rad_s: float, share: float, doubt: str) -> str:
-    return (
-        f"gyroscope{axis} and {name} contradict each other: the one turns by {rms_rad_s:.2g} rad/s, the "
-        f"other shows {100.0 * share:.3g} % of it: is the gyroscope {doubt}?"
-    )
 
 
 def _rms(vectors: FloatArray) -> float:

@@ -98,15 +98,6 @@ def _norm(rows: FloatArray) -> FloatArray:
         return np.asarray(np.sqrt(np.einsum("ij,ij->i", rows, rows)))
 
 
-def _change(rows: FloatArray, order: int) -> FloatArray:
-    """Length of the difference of that order along the rows; axis by axis, as logs may be large."""
-    square = np.zeros(len(rows) - order)
-    with np.errstate(over="ignore", invalid="ignore"):
-        for axis in rows.T:
-            square += np.diff(axis, n=order) ** 2
-    return np.sqrt(square, out=square)
-
-
 def _digit(readings: FloatArray) -> float:
     """Smallest change along the rows, of any axis: the last digit of a sensor."""
     steps = np.abs(np.diff(readings, axis=0))
@@ -123,9 +114,7 @@ def _bad(name: str, rows: FloatArray, force: FloatArray, rate: FloatArray) -> di
         zero &= np.isnan(force[:, 0]) | ~force.any(axis=1)
     if name == VECTORS[2] and (finite & ~zero).any():
         unit = float(np.median(size[finite & ~zero]))
-    beyond = size > limits.largest * unit
-    if beyond.any():
-        beyond = finite & (np.abs(rows).max(axis=1) > limits.largest * unit)
+    beyond = np.abs(rows).max(axis=1) > limits.largest * unit
     if beyond.sum() > _FEW * finite.sum():  # another unit, which whoever uses the log refuses
         beyond = size >= _ABSURD
     valid, repeats = finite & ~beyond & ~zero, np.zeros(len(rows), dtype=bool)
@@ -154,7 +143,7 @@ def _repeats(name: str, change: float, rows: FloatArray, force: FloatArray, rate
     long = length > max(2, 2 * usual)
     if not long.any():
         return np.zeros(len(rows), dtype=bool)
-    step = np.pad(_change(rows, 1), 1, constant_values=np.nan)
+    step = np.pad(_norm(np.diff(rows, axis=0)), 1, constant_values=np.nan)
     before, after = step[start], step[start + length]
     noisy = np.minimum(before, after) > _NOISY * _digit(rows)
     moves = noisy | (after > change) | (np.isnan(after) & (start > 0))
@@ -194,13 +183,12 @@ def at_ends(rows: FloatArray) -> BoolArray:
 
 def _spikes(rows: FloatArray, height: float) -> BoolArray:
     """Single rows far from both neighbours, which are near each other."""
-    bad = np.zeros(len(rows), dtype=bool)
-    if np.isfinite(height) and len(rows) > 2:
-        at = np.flatnonzero(np.pad(_change(rows, 2), 1, constant_values=np.inf) > 2.0 * height)
-        before, after = np.abs(at - 1), np.where(at + 1 < len(rows), at + 1, at - 1)
-        away = 0.5 * _norm(rows[before] - 2.0 * rows[at] + rows[after])
-        bad[at[(away > height) & (_norm(rows[after] - rows[before]) < 0.2 * away)]] = True
-    return bad
+    if len(rows) < 3:
+        return np.zeros(len(rows), dtype=bool)
+    around = np.pad(rows, ((1, 1), (0, 0)), "reflect")
+    before, after = around[:-2], around[2:]
+    away = _norm(rows - 0.5 * (before + after))
+    return np.asarray((away > height) & (_norm(after - before) < 0.2 * away))
 
 
 def _require_one_sensor(readings: dict[str, FloatArray]) -> None:

@@ -131,7 +131,7 @@ def _of_one_kind(frames: Frames) -> IntArray:
             f"expected messages with data, got {content if frames.data.any() else 'nothing but zeros'}"
         )
     kinds = frames.mid[data].astype(np.uint16) * 256 + frames.bid[data]
-    return np.asarray(data[kinds == np.bincount(kinds).argmax()].astype(frames.start.dtype))
+    return np.asarray(data[kinds == np.bincount(kinds).argmax()])
 
 
 def _passed_over(frames: Frames, indices: IntArray) -> Iterator[str]:

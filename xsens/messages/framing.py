@@ -133,7 +133,7 @@ class Frames:
     def payload_start(self) -> IntArray:
         """First bytes of the payloads, shape (n,)."""
         head = np.where(self.data[self.start + 3] == _LONG_LENGTH, 6, 4)
-        return np.asarray(self.start + head.astype(self.start.dtype))
+        return np.asarray(self.start + head)
 
     @cached_property
     def payload_size(self) -> IntArray:
@@ -171,9 +171,7 @@ def find_frames(data: bytes | ByteArray) -> Frames:
     array = data if isinstance(data, np.ndarray) else np.frombuffer(data, dtype=np.uint8)
     array = np.ascontiguousarray(array)
     start, end, _ = _scan(array, True)
-    # Positions take as much memory as short messages: half of it where they fit.
-    place = np.int32 if array.size < np.iinfo(np.int32).max else np.int64
-    return Frames(array, start.astype(place), end.astype(place))
+    return Frames(array, start, end)
 
 
 class Framer:
