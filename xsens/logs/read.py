@@ -20,8 +20,8 @@ from xsens.messages.control import MessageId
 from xsens.messages.framing import Frames, find_frames
 
 MOST_BYTES = 1 << 27
-"""Of a log: five hours of raw counts at 256 Hz. Reading takes 2 times the memory of text, 4 to 10 times that of
-messages, whose numbers are shorter than a double."""
+"""Of a log: five hours of raw counts at 256 Hz. Reading takes 2 times the memory of text, 4 to 10 times that
+of messages, whose numbers are shorter than a double."""
 
 _HEAD_BYTES = 1 << 16
 _DAMAGE_SHARE = 0.01
