@@ -162,8 +162,8 @@ def command_of(name: str, function: Command) -> TyperCommand:
             numbers, text = function(**values) or (None, "")
         except InvalidInputError as error:  # of a parameter: the option is named as it was typed
             name, _, reason = str(error).partition(": ")
-            if name not in options:
-                raise
+            if name not in options or name in {Path(str(value)).stem for value in values.values()}:
+                raise  # of a file of that name
             raise InvalidInputError(f"{_flag_of(options[name])}: {reason}") from error
         if as_json:
             from speckle3d.study.results import json_text

@@ -82,13 +82,15 @@ def require_target(path: PathLike) -> Path:
     Raises
     ------
     FileError
-        If the folder does not exist, or `path` is not an ordinary file.
+        If the folder does not exist or is read-only, or `path` is not an ordinary file.
     """
     target = Path(path).resolve()
     if target.exists() and not target.is_file():
         raise FileError(f"{path}: expected an ordinary file to write, got a folder or device")
     if not target.parent.is_dir():
         raise FileError(f"{path}: expected an existing folder, got {target.parent}")
+    if not os.access(target.parent, os.W_OK):
+        raise FileError(f"{path}: cannot be written: {target.parent} is read-only")
     return target
 
 

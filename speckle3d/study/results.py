@@ -22,7 +22,7 @@ from speckle3d.core.doubts import Doubt
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.tables import text_table
 from speckle3d.io.fileset import FileSet
-from speckle3d.io.hdf5 import atomic_path, make_folder
+from speckle3d.io.hdf5 import atomic_path, make_folder, require_target
 from speckle3d.scoring.lengths import ModeError
 from speckle3d.study.overall import FITTED_TO_TRACKER, number, over_sweeps, overall_text
 
@@ -268,7 +268,7 @@ def write_study(study: Study) -> None:
 
 
 def require_own(directory: Path, files: FileSet) -> None:
-    """Refuse a folder in which names of a result stand for something else.
+    """Refuse a folder that cannot be written, or in which names of a result stand for something else.
 
     Raises
     ------
@@ -277,6 +277,9 @@ def require_own(directory: Path, files: FileSet) -> None:
     """
     if directory.is_file():
         raise InvalidInputError(f"{directory}: expected a folder or a new name, got a file")
+    resolved = directory.resolve()
+    base = next(path for path in (resolved, *resolved.parents) if path.exists())
+    require_target(base / files.primary)
     names = [name for name in files.names if (directory / name).exists()]
     if names and files.primary not in names:
         raise InvalidInputError(

@@ -21,8 +21,8 @@ from speckle3d.imaging.measures.belonging import belonging_of
 Inside = Literal["above", "below"]
 TAUBIN = (0.5, -0.53)
 """Shares of the way to the neighbours' mean that a vertex goes, in and out again, in a pass of smoothing."""
-MAX_LABELS = 256
-"""More different values than a label map has: such a volume holds grey levels."""
+MAX_LABELS = 200
+"""Each label gets a file, and organs are segmented into 120; a volume of 8 bits has some 250 grey levels."""
 
 
 def surface_of(
@@ -105,7 +105,7 @@ def surfaces_of_labels(volume: Volume) -> dict[int, Surface]:
     labels = np.unique(voxels)
     if not np.array_equal(labels, np.rint(labels)) or len(labels) > MAX_LABELS:
         raise InvalidInputError(
-            f"labels: expected whole numbers, at most {MAX_LABELS}, got others: are these grey levels?"
+            f"labels: expected at most {MAX_LABELS} whole numbers, got {len(labels)} values: grey levels? (--level)"
         )
     everywhere, surfaces = np.ones(volume.shape, dtype=bool), {}
     for label in labels[labels != 0].astype(int).tolist():
