@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
 from pathlib import Path
 
 from speckle3d.core.errors import InvalidInputError
@@ -28,13 +27,3 @@ def new_path(folder: Path, name: str) -> Path:
     if path.is_symlink() or path.exists():
         raise InvalidInputError(f"{path}: expected a new name, got one that is taken")
     return path
-
-
-def save_new(folder: Path, name: str, write: Callable[[Path], object]) -> Path:
-    """Let `write` make a new file of that name, whole or not at all."""
-    from speckle3d.io.hdf5 import atomic_path
-
-    target = new_path(folder, name)
-    with atomic_path(target) as path:
-        write(path)
-    return target

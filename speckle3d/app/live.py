@@ -14,6 +14,7 @@ from bokeh.models import ColumnDataSource
 from panel.viewable import Viewable
 
 from speckle3d.app.look import batch_changes
+from speckle3d.app.page import SimplePage
 from speckle3d.app.plots import ImagePlot, empty_plot, greys
 from speckle3d.app.server import AppServer
 from speckle3d.core.geometry import roll_yaw_tilt
@@ -26,29 +27,22 @@ _LINES = {"tilt": "#b3261e", "yaw": "#2e7d32"}
 _BIG = "font-size:26px;font-weight:600"
 
 
-class LivePage:
-    """What a live session has so far.
+@contextmanager
+def watch(session: Session, status: Callable[[], str]) -> Iterator[tuple[str, str]]:
+    """Serve what a session has so far beside the work of a block.
 
     Parameters
     ----------
     session : Session
     status : callable
         Says what there is to say beside: trouble of the connection, the end.
+
+    Yields
+    ------
+    tuple of (str, str)
+        Its address, and one that leads there once.
     """
-
-    title = "Live"
-
-    def __init__(self, session: Session, status: Callable[[], str]) -> None:
-        self._session, self._status = session, status
-
-    def view(self) -> Viewable:
-        """The picture, the volume's cut along the sweep, and the path over time."""
-        return _Viewer(self._session, self._status).layout()
-
-
-@contextmanager
-def watch(page: LivePage) -> Iterator[tuple[str, str]]:
-    """Serve a page beside the work of a block; yields its address, and one that leads there once."""
+    page = SimplePage("Live", lambda: _Viewer(session, status).layout())
     loop = asyncio.new_event_loop()
     asyncio.set_event_loop(loop)
     server = AppServer([page], "live", unseen_s=float("inf"))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Protocol
 
 from panel.viewable import Viewable
@@ -14,3 +16,11 @@ class Page(Protocol):
 
     def view(self) -> Viewable:
         """Return what is shown, made anew for every viewer."""
+
+
+@dataclass
+class SimplePage:
+    """A page of a function that makes its view."""
+
+    title: str
+    view: Callable[[], Viewable]

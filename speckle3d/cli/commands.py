@@ -332,7 +332,7 @@ class Group(TyperGroup):
         return super().get_command(ctx, cmd_name)
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
-        """Print usage, what the group is for, its options and its commands, each with its first sentence."""
+        """Print usage, what the group is for, and its commands, each with its first sentence."""
         self.format_usage(ctx, formatter)
         self.format_help_text(ctx, formatter)
         rows = []
@@ -340,12 +340,8 @@ class Group(TyperGroup):
             text = entry[0] if isinstance(entry, tuple) else inspect.getdoc(_function(entry)) or ""
             sentence = re.split(r"[.;](?:\s|$)", text, maxsplit=1)[0]
             rows.append((name, " ".join(sentence.split()) + "."))
-        for title, lines in (
-            ("Options", [p.get_help_record(ctx) for p in self.get_params(ctx)]),
-            ("Commands", rows),
-        ):
-            with formatter.section(title):
-                formatter.write_dl(lines)
+        with formatter.section("Commands"):
+            formatter.write_dl(rows)
 
 
 def _function(place: str) -> Command:

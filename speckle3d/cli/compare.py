@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Annotated
 
@@ -14,7 +15,7 @@ from speckle3d.cli.common import (
     Out,
     Paths,
     Reference,
-    emit,
+    Result,
     load_settings,
     note,
 )
@@ -34,8 +35,7 @@ def compare(
     scheduler: MaybeText = None,
     workers: Annotated[int | None, typer.Option(min=1)] = None,
     paper: bool = False,
-    as_json: Annotated[bool, typer.Option("--json")] = False,
-) -> None:
+) -> Result:
     """Compare drift-correction modes over sweeps with a reference: tables, curves, a report.
 
     One of SWEEPS or --paper. A sweep that fails is a row that says why; the exit code is 2 only if all do.
@@ -86,7 +86,6 @@ def compare(
                 paths, out, drift, reference, curves_file, settings, calibration or (), runner, bar
             )
     write_report(study)
-    emit((out / "study.json").read_text(encoding="utf-8") if as_json else table or study.table)
     if old := sum(outcome.is_old for outcome in study.outcomes):
         note(f"{old} of {len(study.outcomes)} sweeps were finished before and are taken as they are")
     for outcome in study.failures:
@@ -94,3 +93,4 @@ def compare(
     note(f"results in {out}; the report is {out / 'report.html'}")
     if not study.successes:
         raise InsufficientDataError(f"{out}: expected a sweep that can be compared, got none")
+    return json.loads((out / "study.json").read_text(encoding="utf-8")), table or study.table

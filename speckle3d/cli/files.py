@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -23,9 +23,6 @@ from speckle3d.cli.common import (
 from speckle3d.cli.outputs import require_own_place
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.progress import progress_bar
-
-if TYPE_CHECKING:
-    from speckle3d.simulation.presets import SimulatedSweep
 
 
 def info(path: Path) -> Result:
@@ -169,24 +166,13 @@ def simulate(
     --------
     $ speckle3d simulate sweep.h5 --preset tissue --length-mm 8 --seed 4
     """
-    from speckle3d.io.fileset import FileSet
+    from speckle3d.io.sweep_writer import write_sweep
     from speckle3d.simulation.presets import simulate as prepare
 
     with progress_bar("computing the beam"):
         simulations = prepare(settings)
     paths = [out, out.with_name(f"{out.stem}-crossing{out.suffix}")][: len(simulations)]
     require_own_place(paths[-1], "simulation")
-    if len(paths) == 1:
-        _write(out, simulations[0])
-        return
-    # A pair is replaced together: two sweeps of different simulations do not cross.
-    with FileSet(out.name, (paths[1].name,)).replaced(out.parent) as part:
-        for path, simulation in zip(paths, simulations, strict=True):
-            _write(part / path.name, simulation)
-
-
-def _write(path: Path, simulation: SimulatedSweep) -> None:
-    from speckle3d.io.sweep_writer import write_sweep
-
-    with progress_bar(f"simulating {path.name}") as progress:
-        write_sweep(path, simulation.sweep, progress, simulation=simulation.description())
+    for path, simulation in zip(paths, simulations, strict=True):
+        with progress_bar(f"simulating {path.name}") as progress:
+            write_sweep(path, simulation.sweep, progress, simulation=simulation.description())

@@ -4,7 +4,7 @@ import os
 
 import pytest
 
-from speckle3d.app.folder import save_new
+from speckle3d.app.folder import new_path
 from speckle3d.core.errors import InvalidInputError
 
 
@@ -18,6 +18,4 @@ def test_a_name_must_be_new_and_in_the_folder(folder, tmp_path):
     os.symlink(tmp_path.parent / "elsewhere.csv", tmp_path / "link.csv")
     for wrong in ("", "../a.csv", "/x/a.csv", ".hidden", "a\0.csv", "sweep.h5", "link.csv"):
         with pytest.raises(InvalidInputError):
-            save_new(folder, wrong, lambda path: path.write_text("new"))
-    assert (tmp_path / "sweep.h5").read_bytes() == b"sweep"
-    assert not (tmp_path.parent / "elsewhere.csv").exists()
+            new_path(folder, wrong)

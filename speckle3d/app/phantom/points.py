@@ -15,7 +15,7 @@ from panel.viewable import Viewable
 
 from calibration.points import Detections, Recording
 from calibration.recording import choose_crossings
-from speckle3d.app.folder import save_new
+from speckle3d.app.folder import new_path
 from speckle3d.app.look import batch_changes
 from speckle3d.app.phantom.plots import BLUE, ORANGE, SKY_BLUE
 from speckle3d.app.phantom.run import run_in_thread, sentence
@@ -91,7 +91,6 @@ class PointsViewer(PhantomViewer):
             points = read_points(settings.points, self._phantom.names)
             points.require_inside(recording.images.shape)
             self.picks.take(points)
-        self._run_points = self.picks.points()
         self._points = ColumnDataSource(_NO_POINTS, name="points")
         self._points.on_change("data", self._edit)
         dots = self.frame_plot.plot.scatter(
@@ -154,14 +153,13 @@ class PointsViewer(PhantomViewer):
 
     def find(self, settings: ScanSettings) -> Detections:
         """Take the points that are there."""
-        self._run_points = self.picks.points()
-        if not len(self._run_points):
+        if not self.picks:
             raise InvalidInputError("expected points: find them, or click where they are")
-        return detections_by_hand(self.recording, self._run_points, settings)
+        return detections_by_hand(self.recording, self.picks.points(), settings)
 
     def before_saving(self, settings: ScanSettings, out: Path) -> ScanSettings:
-        """Save the points that a calibration was made from, for the command to be given them."""
-        return with_values(settings, {"points": self._write(f"{out.stem}-points.csv", self._run_points)})
+        """Save the points, which are those of the calibration, for the command to be given them."""
+        return with_values(settings, {"points": self._write(f"{out.stem}-points.csv")})
 
     def _edit(self, attribute: str, old: object, new: Any) -> None:
         if not self._drawing:
@@ -197,13 +195,15 @@ class PointsViewer(PhantomViewer):
 
     def _save_points(self, _: object) -> None:
         try:
-            path = self._write(self._points_name.value or "", self.picks.points())
+            path = self._write(self._points_name.value or "")
             self._points_note.object = sentence(f"Saved {path}", BLUE, "saved")
         except Speckle3DError as error:
             self._points_note.object = sentence(str(error), ORANGE, "saved")
 
-    def _write(self, name: str, points: PickedPoints) -> Path:
-        if not len(points):
+    def _write(self, name: str) -> Path:
+        if not self.picks:
             raise InvalidInputError("expected points to save, got none")
         name = name if name.endswith(".csv") else f"{name}.csv"
-        return save_new(self.folder, name, lambda path: write_points(path, points, self._phantom.names))
+        path = new_path(self.folder, name)
+        write_points(path, self.picks.points(), self._phantom.names)
+        return path

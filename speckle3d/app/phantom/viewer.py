@@ -88,6 +88,9 @@ class PhantomViewer:
         self._words = pn.pane.HTML("", sizing_mode="stretch_width")
         self._button = pn.widgets.Button(name="Run calibration", button_type="primary", width=150)
         self._verdict = pn.pane.HTML(sentence("Not calibrated yet.", "#555555"), width=600)
+        self._stale = pn.pane.HTML(
+            sentence("Settings changed since this run: run again.", ORANGE), visible=False
+        )
         self._table, self._note = pn.pane.HTML("", width=600), pn.pane.HTML("", width=600)
         self._name = pn.widgets.TextInput(
             name="file of the result", value=f"{images.stem}-calibration.h5", width=460
@@ -114,6 +117,7 @@ class PhantomViewer:
             pn.Row(self.widgets["region"], self.widgets["leave_out"]),
             *([self.widgets["reflector"]] if "reflector" in self.widgets else []),
             self._button,
+            self._stale,
             self._verdict,
             pn.Row(self._save, self._name),
             self._note,
@@ -154,11 +158,9 @@ class PhantomViewer:
         return settings
 
     def changed(self, *_: Any) -> None:
-        """Show the settings as they are now; a result of others cannot be saved."""
-        if not self._save.disabled:
-            self._save.disabled = True
-            words = "Settings changed since this result: run again."
-            self._verdict.object = sentence(words, ORANGE) + self._verdict.object
+        """Show the settings as they are now; a result of others, or a run's to come, cannot be saved."""
+        self._stale.visible = self._button.loading or self._result is not None
+        self._save.disabled = True
         self._show()
 
     def show(self, image: npt.NDArray[Any], settings: ScanSettings) -> str:
@@ -207,7 +209,8 @@ class PhantomViewer:
         self.widgets["region"].value = " ".join(f"{column:.1f},{row:.1f}" for column, row in corners)
 
     async def _calibrate(self, _: object) -> None:
-        points, self._note.object, self._save.disabled = None, "", True
+        points, self._result, self._note.object = None, None, ""
+        self._save.disabled, self._stale.visible = True, False
         try:
             if "reflector" in self.widgets and not self.widgets["reflector"].value:
                 raise InvalidInputError("say first what the plane is: a bare wall, or a thin bar")
@@ -221,7 +224,7 @@ class PhantomViewer:
             uses = {} if points is None else dict.fromkeys(map(int, points.frame), "found")
             self.mark_frames(uses, {} if points is None else dict(points.dropped))
             return
-        self._result, self._save.disabled = (settings, outcome), False
+        self._result, self._save.disabled = (settings, outcome), self._stale.visible
         calibration, lacking = outcome.calibration, outcome.solution.adequacy.missing
         self._verdict.object = sentence(calibration.verdict, _AMBER if lacking else BLUE)
         table = text_report(calibration, outcome.beam, remarks(outcome))

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable
 from html import escape
 from pathlib import Path
-
-from speckle3d.core.arrays import FloatArray
 
 _CODE = (
     "font-family:ui-monospace,'DejaVu Sans Mono',monospace;font-size:11px;white-space:pre-wrap;"
@@ -15,45 +13,19 @@ _CODE = (
 )
 
 
-def reslice_command(
-    source: Path, out: str, modes: Sequence[str], place: Mapping[str, float], sweep_file: Path | None = None
-) -> str:
-    """`speckle3d reslice` of a place at one mode, or at two against the first.
+def command(name: str, source: Path, options: Iterable[tuple[str, object]]) -> str:
+    """HTML of a command line about a reconstruction, which one click selects.
 
     Parameters
     ----------
+    name : str
+        Of the command.
     source : path
         The reconstruction.
-    out : str
-        Picture to write.
-    modes : sequence of str
-    place : mapping of str to float
-        Options of the command by name, as ``depth_mm``.
-    sweep_file : path, optional
-        The sweep, if it is not where the reconstruction says.
+    options : iterable of (str, object)
+        Names of options, as ``depth_mm``, and their values.
     """
-    words = [
-        "speckle3d",
-        "reslice",
-        source,
-        "-o",
-        out,
-        *(word for mode in modes for word in ("--mode", mode)),
-    ]
-    words += ["--difference-to", modes[0]] if len(modes) > 1 else []
-    for name, value in place.items():
-        words += ["--" + name.replace("_", "-"), f"{value:g}"]
-    return shlex.join([*map(str, words), *(["--sweep", str(sweep_file)] if sweep_file else [])])
-
-
-def measure_command(source: Path, mode: str, points_mm: Sequence[FloatArray]) -> str:
-    """`speckle3d measure` between points of a mode's world."""
-    words = ["speckle3d", "measure", str(source), "--mode", mode]
-    for point in points_mm:
-        words += ["--point", ",".join(repr(float(value)) for value in point)]
-    return shlex.join(words)
-
-
-def code(text: str) -> str:
-    """HTML of a command that one click selects."""
-    return f'<div style="{_CODE}">{escape(text)}</div>'
+    words = ["speckle3d", name, str(source)]
+    for option, value in options:
+        words += [f"--{option.replace('_', '-')}", f"{value:g}" if isinstance(value, float) else str(value)]
+    return f'<div style="{_CODE}">{escape(shlex.join(words))}</div>'

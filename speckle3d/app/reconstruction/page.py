@@ -11,10 +11,11 @@ import numpy as np
 import panel as pn
 import param
 from panel.viewable import Viewable
+from plotly import graph_objects as go
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.app.look import batch_changes
-from speckle3d.app.reconstruction.commands import code, measure_command, reslice_command
+from speckle3d.app.reconstruction.commands import command
 from speckle3d.app.reconstruction.cut_plot import CutPlot
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import Speckle3DError
@@ -144,7 +145,7 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
         self.param.watch(self._draw_points, [*_COLOURS, "mode", "overlay", "points_mm"], precedence=1)
         self.param.watch(lambda _: setattr(self, "points_mm", []), "mode")
         self.param.watch(self._measure, "points_mm")
-        self._space = pn.pane.Plotly(None)
+        self._space = pn.pane.Plotly(self._outlines(), sizing_mode="stretch_both")
         self._draw_points()
 
     def layout(self) -> Viewable:
@@ -177,12 +178,12 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
         third = pn.Column(depth, self._trajectories(), sizing_mode="stretch_both")
         return pn.Row(side, along, frame, third, sizing_mode="stretch_both")
 
-    def _trajectories(self) -> Viewable:
-        """Outlines of frames in space, and length and angles over the frames, of all modes."""
+    def _outlines(self) -> go.Figure:
+        """Outlines of the frames of all modes in space, with room for those of the cuts."""
         page = self._page
         poses = {mode: page.posed(mode, None).poses[mode] for mode in page.modes}
-        self._space = pn.pane.Plotly(plot_outlines(poses, self._grid), sizing_mode="stretch_both")
-        self._space.object.update_layout(
+        outlines = plot_outlines(poses, self._grid)
+        outlines.update_layout(
             height=None,
             margin={"l": 0, "r": 0, "t": 0, "b": 0},
             font_size=10,
@@ -192,7 +193,11 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
             scene_xaxis_nticks=3,
             scene_yaxis_nticks=3,
         )
-        self._space.object.add_scatter3d(mode="lines", line={"color": "#ff4fc3", "width": 6}, name="cuts")
+        return outlines.add_scatter3d(mode="lines", line={"color": "#ff4fc3", "width": 6}, name="cuts")
+
+    def _trajectories(self) -> Viewable:
+        """Outlines of frames in space, and length and angles over the frames, of all modes."""
+        page = self._page
         trust = page.reconstruction.trust
         covariance = None if trust is None else trust.covariance
         drift = plot_curves(
@@ -202,7 +207,6 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
             height=None, font_size=9, showlegend=False, updatemenus=[], margin={"t": 10, "r": 10}
         )
         over_frames = pn.pane.Plotly(drift, sizing_mode="stretch_both")
-        self._draw_planes()
         return pn.Tabs(
             ("in space", self._space),
             ("over the frames", over_frames),
@@ -277,20 +281,17 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
         points = np.array(self.points_mm).reshape(-1, 3)
         for plot in self._plots.values():
             plot.show_points(self._cross_mm, points)
+        options: list[tuple[str, object]]
+        options = [*(("mode", mode) for mode in self._pair if mode), ("reach_mm", page.reach_mm)]
+        options += [("difference_to", self.mode)] if self._pair[1] else []
+        options += [("sweep", page.sweep_file)] if page.sweep_file else []
         self._commands.object = "".join(
-            code(
-                reslice_command(
-                    page.source,
-                    f"{name}.png",
-                    [mode for mode in self._pair if mode],
-                    {**self._slider(name), "reach_mm": page.reach_mm},
-                    page.sweep_file,
-                )
+            command(
+                "reslice", page.source, [("output", f"{name}.png"), *self._slider(name).items(), *options]
             )
             for name in _CUTS
         )
-        if self._space.object is not None:
-            self._draw_planes()
+        self._draw_planes()
 
     def _add(self, *_: Any) -> None:
         """Measure from and to where the cross hair is."""
@@ -302,7 +303,7 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
         lines = [
             f"{k + 1}: {', '.join(f'{value:.2f}' for value in point)} mm" for k, point in enumerate(points)
         ]
-        command = ""
+        again = ""
         if len(points) > 1:
             try:
                 lines += [row.line for row in measure(page.reconstruction, points, self.mode)]
@@ -311,9 +312,10 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
                     f"mode {self.mode}; points are picked to +- {half_mm:.2g} mm per axis; every +- is 95 %"
                 )
                 lines += filter(None, [caution(page.reconstruction, self.mode)])
-                command = code(measure_command(page.source, self.mode, list(points)))
+                places = [("point", ",".join(map(repr, point))) for point in points.tolist()]
+                again = command("measure", page.source, [("mode", self.mode), *places])
             except Speckle3DError as error:
                 lines.append(str(error))
         self._words.object = (
-            "".join(f"<p style='margin:3px 0'>{escape(line)}</p>" for line in lines) + command or _HELP
+            "".join(f"<p style='margin:3px 0'>{escape(line)}</p>" for line in lines) + again or _HELP
         )

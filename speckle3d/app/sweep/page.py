@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator, Sequence
 from html import escape
 from typing import Any
@@ -14,22 +13,21 @@ from panel.viewable import Viewable
 
 from speckle3d.app.look import batch_changes
 from speckle3d.app.plots import greys
-from speckle3d.app.sweep.findings import FrameFindings
-from speckle3d.app.sweep.pairs import NEIGHBOURS, PatchValues, SweepPairs
-from speckle3d.app.sweep.plots import FLAG_COLOUR, PatchPlot, TimePlots
+from speckle3d.app.sweep.pairs import NEIGHBOURS, PatchValues, patch_values
+from speckle3d.app.sweep.plots import FLAG_COLOUR, REASONS, PatchPlot, TimePlots, name_of
 from speckle3d.config import Config, stored_config
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.doubts import Doubt
 from speckle3d.core.reconstruction import Reconstruction
 from speckle3d.core.sweep import OrientationSensor, Sweep, Tracker
+from speckle3d.examine.sensors import repair_readings
+from speckle3d.matching.quality import FrameFlag
 from speckle3d.study.images import GreyImages
 
 MOST_ROWS = 640
 """Rows that are sent to the browser: more than a screen shows, and a third of what echoes are sampled at."""
 _MOST_DB, _USUAL_DB = 90, 50
 """Dynamic range of the images that are sent, and of what is shown of it at first."""
-_JUDGING_S, _JUDGING_MS = 0.02, 40
-"""Time at once, and how often, for looking at frames that nobody has judged."""
 
 Stream = tuple[str, tuple[str, str, str], FloatArray, FloatArray]
 """Label, names of three parts, times on the images' clock, and values, shape (m, 3)."""
@@ -65,8 +63,11 @@ class SweepPage:
         row_mm = self._pooled * grid.sample_spacing_mm
         first_mm = grid.first_sample_depth_mm + (row_mm - grid.sample_spacing_mm) / 2
         self.place = (grid.first_vector_mm, first_mm), (grid.vector_pitch_mm, row_mm)
-        self.pairs = SweepPairs(sweep, config, None if reconstruction is None else reconstruction.pairs)
-        self.findings = FrameFindings(sweep, config, reconstruction, doubts)
+        self.patch_mm = config.patches.width_mm, config.patches.height_mm
+        self.pairs = None if reconstruction is None else reconstruction.pairs
+        trust = None if reconstruction is None else reconstruction.trust
+        self.flags = None if trust is None else trust.flags
+        self.doubts = repair_readings(sweep)[1] if doubts is None else doubts
 
     def view(self) -> Viewable:
         """Frames with a player."""
@@ -88,19 +89,16 @@ class _Player(param.Parameterized):  # type: ignore[misc]
     range_db = param.Integer(_USUAL_DB, bounds=(30, _MOST_DB), label="dynamic range / dB")
 
     def __init__(self, page: SweepPage) -> None:
-        self._page, self._findings = page, page.findings
-        last = len(page.sweep) - 1
-        quantities = ["distance", "sigma", "correlation"] if page.pairs.have_distances else ["correlation"]
-        self.param.frame.bounds = (0, max(last, 1))
-        self.param.colour.objects = ["none", *quantities]
-        super().__init__(colour=quantities[0] if page.pairs.have_distances else "none")
-        self._picture = PatchPlot(page.pairs.patch_mm)
-        self._times = TimePlots(page.sweep, self.go)
+        self._page = page
+        self.param.frame.bounds = (0, max(len(page.sweep) - 1, 1))
+        self.param.colour.objects = ["distance", "sigma", "none"]
+        super().__init__(colour="distance" if page.pairs is not None and len(page.pairs) else "none")
+        self._picture = PatchPlot(page.patch_mm)
+        self._times = TimePlots(page.sweep, lambda frame: setattr(self, "frame", frame))
+        self._times.mark(page.flags, page.doubts)
         self._text = pn.pane.HTML("", sizing_mode="stretch_width")
-        self._state = pn.pane.HTML("", sizing_mode="stretch_width")
         self.param.watch(self._draw, ["frame", "colour", "lag", "range_db"])
         self._draw()
-        self._draw_findings()
 
     def layout(self) -> Viewable:
         """The image on the left, as high as the window; all else on the right."""
@@ -116,18 +114,17 @@ class _Player(param.Parameterized):  # type: ignore[misc]
         )
         colour = pn.widgets.RadioButtonGroup.from_param(self.param.colour, button_style="outline")
         streams = [pn.pane.Bokeh(self._times.stream(*stream), **wide) for stream in streams_of(sweep)]
-        if self._findings.flags is None:
-            self._clock = pn.state.add_periodic_callback(self._judge, period=_JUDGING_MS)
+        lag, levels = (
+            pn.widgets.IntSlider.from_param(setting, width=215)
+            for setting in (self.param.lag, self.param.range_db)
+        )
+        patches = [pn.Row(pn.pane.HTML("<b>patches coloured by</b>", margin=(10, 5)), colour), lag]
         right = pn.Column(
             player,
-            pn.Row(pn.pane.HTML("<b>patches coloured by</b>", margin=(10, 5)), colour),
-            pn.Row(
-                pn.widgets.IntSlider.from_param(self.param.lag, width=215),
-                pn.widgets.IntSlider.from_param(self.param.range_db, width=215),
-            ),
+            *(patches if self.colour != "none" else []),
+            levels,
             self._text,
-            self._state,
-            *(pn.pane.HTML(f"&bull; {escape(doubt.consequence)}") for doubt in self._findings.doubts),
+            *(pn.pane.HTML(f"&bull; {escape(doubt.consequence)}") for doubt in self._page.doubts),
             pn.pane.Bokeh(self._times.marks, **wide),
             *(streams or [pn.pane.HTML("No sensor was recorded with this sweep.")]),
             sizing_mode="stretch_both",
@@ -136,60 +133,39 @@ class _Player(param.Parameterized):  # type: ignore[misc]
         left = pn.pane.Bokeh(self._picture.plot, sizing_mode="stretch_both", max_width=700)
         return pn.Row(left, right, sizing_mode="stretch_both")
 
-    def go(self, frame: int) -> None:
-        """Show a frame."""
-        self.frame = int(np.clip(frame, 0, len(self._page.sweep) - 1))
-
-    def _judge(self) -> None:
-        """Look at more frames, as long as some are not judged."""
-        until = time.monotonic() + _JUDGING_S
-        while self._findings.flags is None and time.monotonic() < until:
-            self._findings.judge_next()
-        if self._findings.flags is not None:
-            self._clock.stop()
-            self._draw()
-        self._draw_findings()
-
-    @batch_changes
-    def _draw_findings(self) -> None:
-        self._times.mark(self._findings.flags, self._findings.doubts)
-        self._state.object = escape(self._findings.state())
-
     @batch_changes
     def _draw(self, *_: Any) -> None:
-        frame, pairs = self.frame, self._page.pairs
+        page, frame, values, most = self._page, self.frame, None, 1.0
         # Where the sweep ends, the other way.
-        partner = frame + self.lag if 0 <= frame + self.lag < len(self._page.sweep) else frame - self.lag
-        values = None
-        if self.colour != "none" and self.lag and 0 <= partner < len(self._page.sweep):
-            values = pairs.values(frame, partner, self.colour == "correlation")
-        self._picture.show(greys(self._page.image(frame), -self.range_db, 0.0), *self._page.place)
-        self._picture.colour(values, self.colour, pairs.most(self.colour))
+        partner = frame + self.lag if 0 <= frame + self.lag < len(page.sweep) else frame - self.lag
+        if page.pairs is not None and self.colour != "none":
+            values = patch_values(page.pairs, page.sweep.grid, frame, partner)
+            # What all but a hundredth of the patches of all pairs stay below.
+            most = float(np.nanpercentile(getattr(page.pairs, f"{self.colour}_mm"), 99))
+        self._picture.show(greys(page.image(frame), -self.range_db, 0.0), *page.place)
+        self._picture.colour(values, self.colour, most)
         self._times.move(frame)
         self._text.object = "<br>".join(self._words(frame, partner, values))
 
     def _words(self, frame: int, partner: int, values: PatchValues | None) -> Iterator[str]:
         """What is shown, as HTML."""
-        time_s = self._page.sweep.frame_time_s
+        time_s, flags = self._page.sweep.frame_time_s, self._page.flags
         yield f"<b>Frame {frame}</b> of 0 to {len(time_s) - 1}, at {time_s[frame] - time_s[0]:.3f} s"
-        for reason in self._findings.reasons(frame):
-            yield f'<span style="color:{FLAG_COLOUR}">&#9873; {escape(reason)}</span>'
-        if values is None:
-            return
-        words = [f"<b>With frame {partner}</b>"]
-        if values.elevation_mm is not None:
+        if flags is not None:
+            yield f"{np.count_nonzero(flags) or 'None'} of {len(time_s)} frames flagged"
+            for flag in FrameFlag(int(flags[frame])):
+                words = f"{name_of(flag)}: {REASONS[flag]}"
+                yield f'<span style="color:{FLAG_COLOUR}">&#9873; {escape(words)}</span>'
+        if values is not None:
             elevation, sigma = values.elevation_mm
-            words.append(
-                f"the image's centre is {elevation:.3f} mm away, elevational (standard deviation {sigma:.3f})"
+            yield (
+                f"<b>With frame {partner}</b>: the image's centre is {elevation:.3f} mm away, elevational "
+                f"(standard deviation {sigma:.3f})"
             )
-        if np.isfinite(values.correlation).any():
-            words.append(f"median correlation {np.nanmedian(values.correlation):.3f}, computed anew")
-        yield "; ".join(words)
-        if values.inliers is not None:
             left_out = np.isfinite(values.distance_mm) & ~values.inliers
             yield f"{values.inliers.sum()} patches used, {left_out.sum()} left out (red crosses)"
-        elif self._page.pairs.have_distances:
-            yield "The reconstruction did not use this pair."
+        elif self.colour != "none":
+            yield f"The reconstruction did not use the pair with frame {partner}."
 
 
 def streams_of(sweep: Sweep) -> Iterator[Stream]:

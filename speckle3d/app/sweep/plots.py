@@ -12,19 +12,30 @@ from bokeh.palettes import Viridis256
 from bokeh.plotting import figure
 
 from speckle3d.app.plots import ImagePlot, time_plot
-from speckle3d.app.sweep.findings import REASONS, name_of
 from speckle3d.app.sweep.pairs import PatchValues
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.doubts import Doubt
 from speckle3d.core.sweep import Sweep
+from speckle3d.matching.quality import FrameFlag
 
+REASONS = {
+    FrameFlag.FROZEN: "bit for bit the frame before, which the recorder repeated",
+    FrameFlag.SATURATED: "so many samples are clipped that correlations cannot be trusted",
+    FrameFlag.LIFTED: "no contact: noise alone",
+    FrameFlag.NO_SPECKLE: "too few patches hold speckle",
+    FrameFlag.UNMATCHED: "no earlier frame correlates with it: too fast, or frames lost",
+}
 FLAG_COLOUR, _DOUBT_COLOUR, _OUTLIER_COLOUR = "#d55e00", "#7b3fa0", "#ff4d4d"
 _OPACITY = 0.5
 _LINES = ("#0072b2", "#d55e00", "#009e73")
 """Of three quantities, told apart by the colour-blind (Okabe and Ito)."""
-_UNITS = {"distance": "mm", "sigma": "mm", "correlation": ""}
-_PATCHES = "x", "y", "angle", "value", "line", "cross", "state", "distance", "sigma", "correlation"
+_PATCHES = "x", "y", "angle", "value", "line", "cross", "state", "distance", "sigma"
 _ROW_PX, _LEFT_PX = 16, 108
+
+
+def name_of(flag: FrameFlag) -> str:
+    """What a flag is called on the page."""
+    return str(flag.name).lower().replace("_", " ")
 
 
 class PatchPlot(ImagePlot):
@@ -58,7 +69,6 @@ class PatchPlot(ImagePlot):
         tips = [
             ("patch", "@state"),
             ("distance", "@distance{0.000} mm"),
-            ("correlation", "@correlation{0.000}"),
             ("standard deviation of the distance", "@sigma{0.000} mm"),
         ]
         self.plot.add_tools(HoverTool(renderers=[patches], tooltips=tips))
@@ -72,14 +82,9 @@ class PatchPlot(ImagePlot):
             self._patches.data = {name: [] for name in _PATCHES}
             return
         has_distance = np.isfinite(patches.distance_mm)
-        outlier = has_distance & np.logical_not(True if patches.inliers is None else patches.inliers)
-        without = "correlated" if patches.inliers is None else "without a distance"
-        columns = {
-            "distance": patches.distance_mm,
-            "sigma": patches.sigma_mm,
-            "correlation": patches.correlation,
-        }
-        self._colours.high, self._bar.title = most, " / ".join(filter(None, [by, _UNITS[by]]))
+        outlier = has_distance & ~patches.inliers
+        columns = {"distance": patches.distance_mm, "sigma": patches.sigma_mm}
+        self._colours.high, self._bar.title = most, f"{by} / mm"
         self._patches.data = columns | {
             "x": patches.centre_mm[:, 0],
             "y": patches.centre_mm[:, 1],
@@ -87,7 +92,7 @@ class PatchPlot(ImagePlot):
             "value": columns[by],
             "line": np.where(outlier, _OUTLIER_COLOUR, "#ffffff"),
             "cross": np.where(outlier, 16, 0),
-            "state": np.where(outlier, "left out", np.where(has_distance, "used", without)),
+            "state": np.where(outlier, "left out", np.where(has_distance, "used", "without a distance")),
         }
 
 

@@ -75,7 +75,7 @@ def view(
     """
     require_extra("app", "view", "panel")
     from speckle3d.app.opened import open_pages
-    from speckle3d.app.phantom.pages import PhantomPage
+    from speckle3d.app.phantom.pages import phantom_page
     from speckle3d.app.server import AppServer
     from speckle3d.calibrating.settings import model_of
     from speckle3d.io.import_settings import ImportSettings
@@ -95,8 +95,7 @@ def view(
             )
         else:
             values = scan.model_dump(exclude_unset=True) | plane.model_dump(exclude_unset=True)
-            page = PhantomPage(file, validated(values, f"--calibrate {calibrate}", model_of(calibrate)))
-            pages = [page]
+            pages = [phantom_page(file, validated(values, f"--calibrate {calibrate}", model_of(calibrate)))]
         server = AppServer(pages, file.name, port)
         note(server.address)
         if browser:

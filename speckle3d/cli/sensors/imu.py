@@ -181,6 +181,8 @@ def orient(
     --------
     $ speckle3d imu orient log.mtb --into sweep.h5 --calibration imu.h5
     """
+    import numpy as np
+
     from speckle3d.io.calibrations import read_calibration
     from speckle3d.io.load import load_sweep
     from speckle3d.sensor_logs import attach_log, ridden_along, with_orientation
@@ -198,23 +200,32 @@ def orient(
         rotations, orientation = orientation_of(log, method, magnetometer)
     if into is not None:
         # As options say, else the calibration, else the sweep that the log is from.
-        solution = None if calibration is None else read_calibration(calibration)
-        mounting = None if sensor is None else sensor.sensor_from_image
-        offsets = [
-            time_offset_s,
-            *(source.time_offset_s for source in (solution, sensor) if source is not None),
-        ]
-        offset_s = next((value for value in offsets if value is not None), 0.0)
-        mounting = mounting if solution is None else solution.rotation
+        offset_s, mounting = 0.0, None
+        if sensor is not None:
+            offset_s, mounting = sensor.time_offset_s, sensor.sensor_from_image
+        if calibration is not None:
+            solution = read_calibration(calibration)
+            offset_s = offset_s if solution.time_offset_s is None else solution.time_offset_s
+            mounting = solution.rotation
+        offset_s = offset_s if time_offset_s is None else time_offset_s
         coverage = attach_log(into, log, rotations, mounting, offset_s, replace_stream)
         note(f"orientation of {len(rotations)} samples in {into}{coverage}")
     if out is not None:
         write_csv(out, with_orientation(log, rotations))
     note_gaps(log)
+    rows: list[tuple[str, float, str]] = [("samples", len(rotations), ""), ("duration", log.duration_s, "s")]
+    if orientation is not None:
+        sigma = np.rad2deg(orientation.standard_deviation_rad)
+        inclination = np.linalg.norm(sigma[:, :2], axis=1) / np.sqrt(2.0)
+        heading = "heading" if orientation.magnetic else "heading relative to the start"
+        for name, values in (("inclination", inclination), (heading, sigma[:, 2])):
+            rows.append((f"{name}, standard deviation, median", float(np.median(values)), "deg"))
+        if orientation.magnetic:
+            disturbed = 100.0 * float(np.mean(orientation.disturbed))
+            rows.append(("magnetic field disturbed", disturbed, "% of samples"))
     name = "sensor" if orientation is None else method
-    rows = _orientation_rows(log, name, rotations, orientation)
-    lines = [(key, v if isinstance(v, str) else f"{v:.5g}", unit) for key, v, unit in rows]
-    return {key: value for key, value, _ in rows}, rows_of(lines)[1]
+    lines = [("method", name, ""), *((key, f"{value:.5g}", unit) for key, value, unit in rows)]
+    return {"method": name} | {key: value for key, value, _ in rows}, rows_of(lines)[1]
 
 
 def record(
@@ -267,27 +278,3 @@ def record(
         note(
             f"{state.samples} samples, {state.lost} lost, {state.interruptions} interruptions; bytes in {out}"
         )
-
-
-def _orientation_rows(
-    log: ImuLog, method: str, rotations: TimedRotations, orientation: Orientation | None
-) -> list[tuple[str, float | str, str]]:
-    import numpy as np
-
-    rows: list[tuple[str, float | str, str]] = [
-        ("method", method, ""),
-        ("samples", float(len(rotations)), ""),
-        ("duration", log.duration_s, "s"),
-    ]
-    if orientation is None:
-        return rows
-    sigma = np.rad2deg(orientation.standard_deviation_rad)
-    inclination = np.linalg.norm(sigma[:, :2], axis=1) / np.sqrt(2.0)
-    heading = "heading" if orientation.magnetic else "heading relative to the start"
-    for name, values in (("inclination", inclination), (heading, sigma[:, 2])):
-        rows.append((f"{name}, standard deviation, median", float(np.median(values)), "deg"))
-    if orientation.magnetic:
-        rows.append(
-            ("magnetic field disturbed", 100.0 * float(np.mean(orientation.disturbed)), "% of samples")
-        )
-    return rows

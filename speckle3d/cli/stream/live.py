@@ -37,7 +37,6 @@ if TYPE_CHECKING:
     from speckle3d.live.progress import Progress
     from speckle3d.live.session import Session
 
-_LOG_EVERY_S = 5.0
 _SILENT_S = 2.0
 """After which a connection on which nothing comes is told of."""
 _LEFT_S = 10.0
@@ -129,7 +128,7 @@ def live(
     require_extra("live", "live", "pyigtl", "fastcrc")
     if view:
         require_extra("app", "live --view", "panel")
-        from speckle3d.app.live import LivePage, watch
+        from speckle3d.app.live import watch
     from speckle3d.io.curves import read_curves
     from speckle3d.io.igtl.link import Connection, Server
     from speckle3d.io.load import load_sweep
@@ -163,8 +162,9 @@ def live(
         note(f"listening to {server}")
         session, ends = Session(connection, outlets, curves, settings, first), list[str]()
         if view:
-            page = LivePage(session, lambda: ends[-1] if ends else _trouble(connection.state, server))
-            address, address_for_once = pages.enter_context(watch(page))
+            address, address_for_once = pages.enter_context(
+                watch(session, lambda: ends[-1] if ends else _trouble(connection.state, server))
+            )
             note(address)
             webbrowser.open(address_for_once)
         _run(session, duration_s, connection, server)
@@ -211,26 +211,24 @@ def _run(session: Session, duration_s: float | None, connection: Connection, nam
     """Run until Ctrl-C, for so long, or until the server has left.
 
     Other signals that ask for the end are heard once all is recorded. How it goes is a line in place on a
-    terminal; a log has it now and then, and when there is something else to say.
+    terminal; a log has it when there is something else to say.
     """
     from rich.console import Console
     from rich.live import Live
     from rich.text import Text
 
-    signals, console, last_note = list[int](), Console(stderr=True), (-_LOG_EVERY_S, "")
+    signals, console, last_note = list[int](), Console(stderr=True), ""
 
     def show(progress: Progress) -> None:
         nonlocal last_note
-        state, now_s = connection.state, time.monotonic()
+        state = connection.state
         trouble = _trouble(state, name)
         text = " | ".join(filter(None, (progress.line, trouble)))
         # A status of rich's would wrap where the terminal is narrow.
         line.update(Text(printable(text), no_wrap=True, overflow="ellipsis"))
-        if not console.is_terminal and (
-            progress.words != last_note[1] or now_s - last_note[0] > _LOG_EVERY_S
-        ):
+        if not console.is_terminal and (words := f"{progress.words}{trouble}") != last_note:
             note(text)
-            last_note = now_s, progress.words
+            last_note = words
         if progress.frames and not state.peers and state.silent_s > _LEFT_S:
             note(f"{trouble}: taken for the end of the sweep")
             session.end()

@@ -105,7 +105,8 @@ def surfaces_of_labels(volume: Volume) -> dict[int, Surface]:
     labels = np.unique(voxels)
     if not np.array_equal(labels, np.rint(labels)) or len(labels) > MAX_LABELS:
         raise InvalidInputError(
-            f"labels: expected at most {MAX_LABELS} whole numbers, got {len(labels)} values: grey levels? (--level)"
+            f"labels: expected at most {MAX_LABELS} whole numbers, got {len(labels)} values: are these grey "
+            "levels?"
         )
     everywhere, surfaces = np.ones(volume.shape, dtype=bool), {}
     for label in labels[labels != 0].astype(int).tolist():
