@@ -22,8 +22,9 @@ from speckle3d.imaging.voxels.settings import Levels
 from speckle3d.io.calibrations import apply_calibrations, fitted_pixels, resized
 from speckle3d.io.hdf5 import PathLike
 from speckle3d.io.import_settings import ImportSettings, MissingSettingsError
-from speckle3d.io.load import kind_of, load_sweep
+from speckle3d.io.load import kind_of, open_recording
 from speckle3d.io.reconstructions import FORMAT
+from speckle3d.io.recordings import Recording
 from speckle3d.matching.quality import describe
 from speckle3d.scoring.modes import default_mode
 from speckle3d.scoring.references import REFERENCES, find_reference
@@ -54,8 +55,8 @@ class PosedSweep:
     has_range : bool
         Whether the dynamic range of its B-mode is known, from the recording or given; levels as stored need
         none.
-    chosen_for : str
-        Why this mode, where nobody chose it.
+    remarks : sequence of str
+        Why this mode, where nobody chose it; what was assumed of the recording.
     """
 
     sweep: Sweep
@@ -64,7 +65,7 @@ class PosedSweep:
     mode: str
     reconstruction: Reconstruction | None = None
     has_range: bool = True
-    chosen_for: str = ""
+    remarks: Sequence[str] = ()
 
     def images(self, dynamic_range_db: float = USUAL_RANGE_DB) -> tuple[Images, ImageGrid]:
         """Images of the frames that have a pose, in the order of their poses, and their grid, for cuts.
@@ -115,8 +116,8 @@ class PosedSweep:
         return 0.0 if tracker is None or self.mode != "tracker" else tracker.image_skew_rad
 
     def notes(self) -> list[str]:
-        """Tell why this mode was taken, which frames are left out, and which have poses that are guesses."""
-        lines, total = [self.chosen_for] if self.chosen_for else [], len(self.sweep)
+        """Tell what was assumed, which frames are left out, and which have poses that are guesses."""
+        lines, total = [*self.remarks], len(self.sweep)
         if missing := total - len(self.frames):
             lines.append(
                 f"{self.sweep.name}: {missing} of {total} frames have no valid pose and are left out"
@@ -190,7 +191,7 @@ def open_posed(
             )
         reconstruction, sweep = open_reconstruction(path, sweep_file)
         mode, why = default_mode(reconstruction) if mode is None else (mode, "")
-        return replace(posed_at(sweep, mode, reconstruction), chosen_for=why)
+        return replace(posed_at(sweep, mode, reconstruction), remarks=[why] if why else [])
     if sweep_file is not None:
         raise InvalidInputError(f"{path}: expected a reconstruction beside --sweep, got a recording")
     if mode not in (None, *REFERENCES):
@@ -200,21 +201,25 @@ def open_posed(
         )
     settings = settings or ImportSettings()
     sizes = {k: v for k, v in fitted_pixels(calibrations).items() if k not in settings.model_fields_set}
-    sweep, has_range = _load(path, settings.model_copy(update=sizes), dynamic_range_db)
-    sweep, _ = apply_calibrations(resized(sweep, sizes), calibrations)
-    return replace(posed_at(sweep, mode), has_range=has_range)
+    recording, has_range = _open(path, settings.model_copy(update=sizes), dynamic_range_db)
+    sweep, _ = apply_calibrations(resized(recording.sweep, sizes), calibrations)
+    # Grey levels as stored need no dynamic range.
+    remarks = [line for line in recording.notes if not line.startswith("dynamic range")]
+    return replace(posed_at(sweep, mode), has_range=has_range, remarks=remarks)
 
 
-def _load(path: Path, settings: ImportSettings, dynamic_range_db: float | None) -> tuple[Sweep, bool]:
-    """Read a sweep whose grey levels may do as they are, and tell whether their dynamic range is known."""
+def _open(path: Path, settings: ImportSettings, dynamic_range_db: float | None) -> tuple[Recording, bool]:
+    """Open a recording whose grey levels may do as they are; whether their dynamic range is known."""
     try:
-        return load_sweep(path, settings), True
+        recording = open_recording(path, settings)
+        _ = recording.sweep  # which asks for what is not said
+        return recording, True
     except MissingSettingsError as error:
         if error.settings != (_RANGE,):
             lacking = tuple(name for name in error.settings if name != _RANGE)
             raise MissingSettingsError(path, lacking) from None
     settings = settings.model_copy(update={_RANGE: dynamic_range_db or USUAL_RANGE_DB})
-    return load_sweep(path, settings), dynamic_range_db is not None
+    return open_recording(path, settings), dynamic_range_db is not None
 
 
 def posed_at(

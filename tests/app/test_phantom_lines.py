@@ -82,3 +82,10 @@ def test_the_calibration_is_the_commands_to_the_last_digit(page, recording, tmp_
     assert (tuned.parameters, tuned.frames) == (again.parameters, again.frames)
     assert not {0, 7} & {*tuned.frames.used}
     assert tuned.pixel_mm == pytest.approx(PIXEL_MM, rel=0.01)
+    # What changes while a calibration runs is not what it was made with.
+    page.get_by_role("button", name="Run calibration").click()
+    page.get_by_label("leave out").fill("0")
+    page.get_by_label("leave out").press("Enter")
+    page.get_by_text("Settings changed").wait_for()
+    page.wait_for_timeout(3000)
+    assert page.get_by_role("button", name="Save result").is_disabled()

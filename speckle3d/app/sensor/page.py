@@ -84,7 +84,7 @@ class SensorPage:
 class _Viewer(param.Parameterized):  # type: ignore[misc]
     """What one viewer sees of a sensor."""
 
-    step = param.Integer(0, label="step of 0.1 s")
+    step = param.Integer(0, label="time / 0.1 s")
 
     def __init__(self, source: Source, mounting: Rotation | None) -> None:
         super().__init__()
@@ -114,7 +114,11 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
             pn.state.add_periodic_callback(self._refresh, period=_REFRESH_MS)
         else:
             player = pn.widgets.Player.from_param(
-                self.param.step, interval=round(1000 * _STEP_S), show_loop_controls=False, width=_LEFT_PX - 20
+                self.param.step,
+                interval=round(1000 * _STEP_S),
+                show_loop_controls=False,
+                show_value=True,
+                width=_LEFT_PX - 20,
             )
             left.insert(1, player)
         right = pn.Column(

@@ -85,13 +85,13 @@ class _Player(param.Parameterized):  # type: ignore[misc]
 
     frame = param.Integer(0)
     colour = param.Selector(label="patches coloured by")
-    lag = param.Integer(-1, bounds=(-NEIGHBOURS, NEIGHBOURS), label="paired with the frame later by")
+    lag = param.Integer(-1, bounds=(-NEIGHBOURS, NEIGHBOURS), label="partner, frames from this one")
     range_db = param.Integer(_USUAL_DB, bounds=(30, _MOST_DB), label="dynamic range / dB")
 
     def __init__(self, page: SweepPage) -> None:
         self._page = page
         self.param.frame.bounds = (0, max(len(page.sweep) - 1, 1))
-        self.param.colour.objects = ["distance", "sigma", "none"]
+        self.param.colour.objects = {"distance": "distance", "standard deviation": "sigma", "none": "none"}
         super().__init__(colour="distance" if page.pairs is not None and len(page.pairs) else "none")
         self._picture = PatchPlot(page.patch_mm)
         self._times = TimePlots(page.sweep, lambda frame: setattr(self, "frame", frame))

@@ -84,7 +84,7 @@ class PatchPlot(ImagePlot):
         has_distance = np.isfinite(patches.distance_mm)
         outlier = has_distance & ~patches.inliers
         columns = {"distance": patches.distance_mm, "sigma": patches.sigma_mm}
-        self._colours.high, self._bar.title = most, f"{by} / mm"
+        self._colours.high, self._bar.title = most, "mm"
         self._patches.data = columns | {
             "x": patches.centre_mm[:, 0],
             "y": patches.centre_mm[:, 1],

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -69,28 +68,20 @@ def open_sweep_at(
     choice: SweepChoice,
     range_db: float | None,
 ) -> tuple[list[PosedSweep], Region | None]:
-    """Open a sweep at the poses of each mode (None: the best), and note on stderr which frames have none.
+    """Open a sweep at the poses of each mode (None: the best), and note on stderr what it says of itself.
 
-    Of a recording what was assumed of its images is noted, unless a calibration gives its pixels.
     The second result is the part of the images that counts: as asked for, else that to which a device set of
     PLUS clips volumes.
     """
     from speckle3d.calibrating.recordings import require_unsaid
     from speckle3d.core.region import Region
-    from speckle3d.io.import_settings import MissingSettingsError, settings_for
-    from speckle3d.io.load import open_recording
+    from speckle3d.io.import_settings import settings_for
     from speckle3d.study.posed import open_posed
 
     require_unsaid(source, settings)
     options = choice.sweep_file, settings, choice.calibration or (), range_db
     sweeps = [open_posed(source, mode, *options) for mode in modes]
     first = sweeps[0]
-    if first.reconstruction is None:
-        # Grey levels as stored need no dynamic range.
-        with_range = settings.model_copy(update={"dynamic_range_db": 60.0})
-        with suppress(MissingSettingsError):
-            recording = open_recording(source, with_range)
-            notes(line for line in recording.notes if not line.startswith("dynamic range"))
     notes(first.notes())
     clip = clip_of(settings_for(source, settings).plus_config, first.sweep.grid, first.skew_rad)
     region = choice.region or clip

@@ -85,7 +85,7 @@ def centre(player):
 
 def test_flags_and_doubts_are_marked_at_their_frames_and_a_click_goes_there(player, reconstruction):
     count = np.count_nonzero(reconstruction.trust.flags)
-    assert f"{count} of 48 frames flagged" in player._state.object
+    assert f"{count} of 48 frames flagged" in text(player)
     player.frame = NO_CONTACT.start
     assert "lifted: no contact" in text(player)
     marks = player._times._marks.data
