@@ -34,6 +34,8 @@ MaybePath = Path | None
 MaybeText = str | None
 MaybeNumber = float | None
 Paths = list[Path] | None
+Sweeps = Annotated[Paths, typer.Argument(metavar="SWEEP")]
+Port = Annotated[int, typer.Option(min=0, max=65535)]
 Out = Annotated[Path, typer.Option("-o", "--output", writable=True)]
 OptionalOut = Annotated[MaybePath, typer.Option("-o", "--output", writable=True)]
 OutArgument = Annotated[Path, typer.Argument(writable=True)]

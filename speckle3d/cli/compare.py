@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -16,6 +15,7 @@ from speckle3d.cli.common import (
     Paths,
     Reference,
     Result,
+    Sweeps,
     load_settings,
     note,
 )
@@ -26,7 +26,7 @@ from speckle3d.core.progress import progress_bar
 
 def compare(
     out: Out,
-    sweeps: Annotated[list[Path] | None, typer.Argument(metavar="SWEEP...")] = None,
+    sweeps: Sweeps = None,
     drift: list[Drift] | None = None,
     reference: Reference | None = None,
     curves_file: MaybePath = None,

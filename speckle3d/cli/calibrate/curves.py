@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
-
-import typer
 
 from speckle3d.cli.common import (
     MaybePath,
     MaybeText,
     Out,
     Result,
+    Sweeps,
     load_settings,
     note,
     part_of,
@@ -25,7 +23,7 @@ if TYPE_CHECKING:
 
 def curves(
     out: Annotated[Out, "curves"],
-    sweeps: Annotated[list[Path] | None, typer.Argument(metavar="SWEEP...")] = None,
+    sweeps: Sweeps = None,
     probe: MaybePath = None,
     like: MaybePath = None,
     start: MaybePath = None,

@@ -7,10 +7,8 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import typer
-
 from speckle3d.cli.commands import Fields
-from speckle3d.cli.common import MaybeNumber, MaybePath, WritablePath, note
+from speckle3d.cli.common import MaybeNumber, MaybePath, Port, WritablePath, note
 from speckle3d.core.extras import require_extra
 
 _SETTINGS = "speckle3d.calibrating.settings"
@@ -27,7 +25,7 @@ def view(
     scan: Annotated[Any, Fields(f"{_SETTINGS}:WireSettings", _SCAN)],
     plane: Annotated[Any, Fields(f"{_SETTINGS}:OrientationSettings", ("sensor", "level"))],
     dynamic_range_db: MaybeNumber = None,
-    port: Annotated[int, typer.Option(min=0, max=65535)] = 0,
+    port: Port = 0,
     browser: bool = True,
 ) -> None:
     """Look at a file in the browser, on this machine alone; ends ten minutes after the last viewer left.

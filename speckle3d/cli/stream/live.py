@@ -17,6 +17,7 @@ from speckle3d.cli.commands import Fields
 from speckle3d.cli.common import (
     Drift,
     MaybePath,
+    MaybePositive,
     MaybeText,
     Out,
     Paths,
@@ -76,7 +77,7 @@ def live(
     crossing_file: MaybePath = None,
     region: MaybeText = None,
     drift: list[Drift] | None = None,
-    duration_s: Annotated[float | None, typer.Option(min=0.0)] = None,
+    duration_s: MaybePositive = None,
     config_file: MaybePath = None,
 ) -> None:
     """Reconstruct a sweep while it is made: receive, record, place each frame, send its pose back.

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from speckle3d.cli.common import note
+from speckle3d.cli.common import Port, note
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.extras import require_extra
 from speckle3d.core.progress import progress_bar
@@ -28,7 +28,7 @@ _LAST_S = 5.0
 
 def play(
     images: Path,
-    port: Annotated[int, typer.Option(min=0, max=65535)] = 18944,
+    port: Port = 18944,
     address: str = "127.0.0.1",
     rate: Annotated[float, typer.Option(min=1e-3, max=1e3)] = 1.0,
     kind: Annotated[Kind | None, typer.Option("--as")] = None,
