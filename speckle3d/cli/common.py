@@ -102,9 +102,9 @@ def note(text: str) -> None:
     sys.stderr.write(f"{printable(text)}\n")
 
 
-def notes(lines: Iterable[str]) -> None:
-    """Print remarks on stderr, a line each."""
-    for line in lines:
+def notes(lines: Iterable[str | None]) -> None:
+    """Print remarks on stderr, a line each; where one is empty there is none."""
+    for line in filter(None, lines):
         note(line)
 
 

@@ -112,14 +112,11 @@ def convert(
     from speckle3d.io.plus.write import SUFFIXES, write_sequence
     from speckle3d.io.reconstructions import FORMAT
     from speckle3d.io.sweep_writer import COMPRESSIONS, write_sweep
-    from speckle3d.io.voxels.volume_writer import LABELS_ALONE
     from speckle3d.study.posed import USUAL_RANGE_DB, open_posed
     from speckle3d.study.scenes.sequences import slicer_sequence
 
     is_reconstruction = source.is_file() and kind_of(source) == FORMAT
     suffix = require_suffix(out, SUFFIXES if is_reconstruction else (".h5", ".hdf5", *SUFFIXES))
-    if out.name.lower().endswith(LABELS_ALONE):
-        raise InvalidInputError(f"{out}: expected a sequence's name, got one of labels alone")
     packs = compression != "none"
     if is_reconstruction:
         range_db = settings.dynamic_range_db or USUAL_RANGE_DB

@@ -22,7 +22,7 @@ def calls(bench, results, tmp_path):
     }
 
 
-def test_other_files_and_inputs_stay_as_they_are(refuse, calls, tmp_path):
+def test_other_files_and_inputs_stay_as_they_are(refuse, calls, bench, tmp_path):
     for name, call in calls.items():
         place = tmp_path / name
         place.write_text("precious, 1, 2\n", encoding="utf-8")
@@ -33,6 +33,11 @@ def test_other_files_and_inputs_stay_as_they_are(refuse, calls, tmp_path):
     assert (tmp_path / "in.h5").read_bytes() == before
     refuse(*calls["v.nrrd"](tmp_path / "w.nrrd"), "--state", tmp_path / "w.nrrd")
     refuse(*calls["r.png"](tmp_path / "cut.xyz"))
+    # Below a file there is no folder, and is none made.
+    out = tmp_path / "in.h5" / "out"
+    curves = bench / "curves.h5"
+    line = refuse("reconstruct", tmp_path / "in.h5", "-o", out, "--curves", curves)
+    assert "expected an existing folder" in line
 
 
 @pytest.mark.parametrize("name", ["v.nrrd", "r.png", "o.csv", "p.tum"])

@@ -38,6 +38,12 @@ def test_distances_have_the_errors_of_poses_and_picks(run, results):
     assert run(*measure)[1].startswith(f"distance 1 2: 2.00 +- {1.96 * first['standard_error']:.2f} mm (95 %")
 
 
+def test_grey_levels_are_no_labels(refuse, tmp_path):
+    path, grey = tmp_path / "grey.nrrd", np.arange(216, dtype=np.uint8).reshape(6, 6, 6)
+    write_volume(path, Volume(grey, (1.0, 1.0, 1.0), RigidTransform.identity()))
+    assert "got 216 values" in refuse("surface", path, "-o", tmp_path / "s.stl", "--labels")
+
+
 def test_a_ball_has_its_volume(run, ball, tmp_path):
     out = tmp_path / "ball.ply"
     code, text, err = run("surface", ball, "-o", out, "--level", "128", "--json")

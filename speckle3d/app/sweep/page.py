@@ -14,7 +14,7 @@ from panel.viewable import Viewable
 from speckle3d.app.look import batch_changes
 from speckle3d.app.plots import greys
 from speckle3d.app.sweep.pairs import NEIGHBOURS, PatchValues, patch_values
-from speckle3d.app.sweep.plots import FLAG_COLOUR, REASONS, PatchPlot, TimePlots, name_of
+from speckle3d.app.sweep.plots import FLAG_COLOUR, REASONS, PatchPlot, TimePlots
 from speckle3d.config import Config, stored_config
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.doubts import Doubt
@@ -154,8 +154,7 @@ class _Player(param.Parameterized):  # type: ignore[misc]
         if flags is not None:
             yield f"{np.count_nonzero(flags) or 'None'} of {len(time_s)} frames flagged"
             for flag in FrameFlag(int(flags[frame])):
-                words = f"{name_of(flag)}: {REASONS[flag]}"
-                yield f'<span style="color:{FLAG_COLOUR}">&#9873; {escape(words)}</span>'
+                yield f'<span style="color:{FLAG_COLOUR}">&#9873; {escape(REASONS[flag])}</span>'
         if values is not None:
             elevation, sigma = values.elevation_mm
             yield (

@@ -19,11 +19,11 @@ from speckle3d.core.sweep import Sweep
 from speckle3d.matching.quality import FrameFlag
 
 REASONS = {
-    FrameFlag.FROZEN: "bit for bit the frame before, which the recorder repeated",
-    FrameFlag.SATURATED: "so many samples are clipped that correlations cannot be trusted",
-    FrameFlag.LIFTED: "no contact: noise alone",
-    FrameFlag.NO_SPECKLE: "too few patches hold speckle",
-    FrameFlag.UNMATCHED: "no earlier frame correlates with it: too fast, or frames lost",
+    FrameFlag.FROZEN: "frozen: bit for bit the frame before, which the recorder repeated",
+    FrameFlag.SATURATED: "saturated: so many samples are clipped that correlations cannot be trusted",
+    FrameFlag.LIFTED: "lifted: no contact: noise alone",
+    FrameFlag.NO_SPECKLE: "no speckle: too few patches hold speckle",
+    FrameFlag.UNMATCHED: "unmatched: no earlier frame correlates with it: too fast, or frames lost",
 }
 FLAG_COLOUR, _DOUBT_COLOUR, _OUTLIER_COLOUR = "#d55e00", "#7b3fa0", "#ff4d4d"
 _OPACITY = 0.5
@@ -31,11 +31,6 @@ _LINES = ("#0072b2", "#d55e00", "#009e73")
 """Of three quantities, told apart by the colour-blind (Okabe and Ito)."""
 _PATCHES = "x", "y", "angle", "value", "line", "cross", "state", "distance", "sigma"
 _ROW_PX, _LEFT_PX = 16, 108
-
-
-def name_of(flag: FrameFlag) -> str:
-    """What a flag is called on the page."""
-    return str(flag.name).lower().replace("_", " ")
 
 
 class PatchPlot(ImagePlot):
@@ -128,7 +123,7 @@ class TimePlots:
     def mark(self, flags: IntArray | None, doubts: Sequence[Doubt]) -> None:
         """Mark flagged frames, a row for every kind of flag there is, and stretches in doubt."""
         marks = [
-            (name_of(flag), frame, frame, FLAG_COLOUR, reason)
+            (reason.partition(":")[0], frame, frame, FLAG_COLOUR, reason)
             for flag, reason in REASONS.items()
             for frame in ([] if flags is None else np.flatnonzero(flags & int(flag)).tolist())
         ]

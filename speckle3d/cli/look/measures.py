@@ -71,8 +71,8 @@ def measure(
     elif mode is None:
         mode, why = default_mode(reconstruction)
     pick_mm = PICKING * reconstruction.grid.vector_pitch_mm if pick_mm is None else pick_mm
-    notes(filter(None, (why, caution(reconstruction, mode))))
     measurements = measure_points(reconstruction, places, mode, pick_mm)
+    notes([why, caution(reconstruction, mode)])
     how = f"mode {mode}; points are picked to +- {1.96 * pick_mm:.2g} mm per axis; every +- is 95 %"
     numbers = {"mode": mode, "pick_mm": pick_mm, "measurements": [_record(m) for m in measurements]}
     return numbers, "\n".join([*(measurement.line for measurement in measurements), how])
@@ -191,7 +191,7 @@ def _errors(
     with naming(f"{where}: made at the poses of {volume_mode}"):
         poses = poses_of(reconstruction, volume_mode)
     require_made_at(volume.fields.get(MARK, ""), pose_mark(poses), str(where))
-    notes(filter(None, [caution(reconstruction, volume_mode)]))
+    notes([caution(reconstruction, volume_mode)])
     return errors_of(reconstruction, volume_mode), reconstruction.grid
 
 

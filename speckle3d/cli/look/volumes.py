@@ -158,7 +158,7 @@ def volume(
     with progress_bar(f"compounding {out.name}"):
         report = write_voxels(posed, request, out, state, deviation)
     if deviation is not None and posed.reconstruction is not None:
-        notes(filter(None, [caution(posed.reconstruction, posed.mode)]))
+        notes([caution(posed.reconstruction, posed.mode)])
     note(report.line)
     return report.summary(), ""
 

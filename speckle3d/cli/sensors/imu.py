@@ -50,7 +50,7 @@ def note_gaps(log: ImuLog) -> None:
     """Report on stderr what a log lacks, and what was assumed in its place."""
     from xsens.logs.contradictions import contradictions
 
-    notes([*log.notes, *filter(None, [contradictions(log).get("gravity")])])
+    notes([*log.notes, contradictions(log).get("gravity")])
     if log.gaps:
         longest = max(gap.duration_s for gap in log.gaps)
         text = f"{log.lost} samples lost in {len(log.gaps)} gaps" if log.lost else f"{len(log.gaps)} pauses"
