@@ -14,7 +14,6 @@ import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from copy import copy
-from dataclasses import fields, is_dataclass
 from importlib import import_module
 from pathlib import Path
 from types import UnionType
@@ -77,14 +76,11 @@ class Fields(NamedTuple):
 
     def options(self, words: Words) -> dict[str, inspect.Parameter]:
         """Options by the fields' names; the model is loaded."""
-        model = _load(self.model)
-        if is_dataclass(model):
-            from pydantic.fields import FieldInfo
+        from pydantic.dataclasses import dataclass
 
-            kinds, info = get_type_hints(model), FieldInfo.from_annotated_attribute
-            infos = {f.name: info(kinds[f.name], f.default) for f in fields(model)}
-        else:
-            infos = model.model_fields
+        model = _load(self.model)
+        is_model = hasattr(model, "model_fields")
+        infos = model.model_fields if is_model else dataclass(model, frozen=True).__pydantic_fields__
         names = [name for name in self.only or infos if name not in self.without]
         return {name: _field_option(name, infos[name], words) for name in names}
 
