@@ -138,10 +138,12 @@ class _Player(param.Parameterized):  # type: ignore[misc]
         page, frame, values, most = self._page, self.frame, None, 1.0
         # Where the sweep ends, the other way.
         partner = frame + self.lag if 0 <= frame + self.lag < len(page.sweep) else frame - self.lag
-        if page.pairs is not None and self.colour != "none":
-            values = patch_values(page.pairs, page.sweep.grid, frame, partner)
-            # What all but a hundredth of the patches of all pairs stay below.
-            most = float(np.nanpercentile(getattr(page.pairs, f"{self.colour}_mm"), 99))
+        if (pairs := page.pairs) is not None and self.colour != "none":
+            values = patch_values(pairs, page.sweep.grid, frame, partner)
+            # What all but a hundredth of the patches of pairs as far apart stay below.
+            alike = pairs.second - pairs.first == abs(self.lag)
+            if values is not None:
+                most = float(np.nanpercentile(getattr(pairs, f"{self.colour}_mm")[alike], 99))
         self._picture.show(greys(page.image(frame), -self.range_db, 0.0), *page.place)
         self._picture.colour(values, self.colour, most)
         self._times.move(frame)

@@ -26,7 +26,6 @@ REASONS = {
     FrameFlag.UNMATCHED: "unmatched: no earlier frame correlates with it: too fast, or frames lost",
 }
 FLAG_COLOUR, _DOUBT_COLOUR, _OUTLIER_COLOUR = "#d55e00", "#7b3fa0", "#ff4d4d"
-_OPACITY = 0.5
 _LINES = ("#0072b2", "#d55e00", "#009e73")
 """Of three quantities, told apart by the colour-blind (Okabe and Ito)."""
 _PATCHES = "x", "y", "angle", "value", "line", "cross", "state", "distance", "sigma"
@@ -56,7 +55,7 @@ class PatchPlot(ImagePlot):
             source=self._patches,
             line_color="line",
             fill_color={"field": "value", "transform": self._colours},
-            fill_alpha=_OPACITY,
+            fill_alpha=0.5,
         )
         self.plot.scatter(
             "x", "y", marker="x", size="cross", line_color=_OUTLIER_COLOUR, source=self._patches
@@ -67,7 +66,7 @@ class PatchPlot(ImagePlot):
             ("standard deviation of the distance", "@sigma{0.000} mm"),
         ]
         self.plot.add_tools(HoverTool(renderers=[patches], tooltips=tips))
-        self._bar = ColorBar(color_mapper=self._colours, width=10, padding=4, visible=False)
+        self._bar = ColorBar(color_mapper=self._colours, title="mm", width=10, padding=4, visible=False)
         self.plot.add_layout(self._bar, "right")
 
     def colour(self, patches: PatchValues | None, by: str, most: float) -> None:
@@ -79,7 +78,7 @@ class PatchPlot(ImagePlot):
         has_distance = np.isfinite(patches.distance_mm)
         outlier = has_distance & ~patches.inliers
         columns = {"distance": patches.distance_mm, "sigma": patches.sigma_mm}
-        self._colours.high, self._bar.title = most, "mm"
+        self._colours.high = most
         self._patches.data = columns | {
             "x": patches.centre_mm[:, 0],
             "y": patches.centre_mm[:, 1],
