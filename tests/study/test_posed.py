@@ -48,8 +48,8 @@ def test_notes_count_the_frames_without_a_valid_pose(tmp_path):
     source, _ = sweep.source()
     assert len(source) == 2
     np.testing.assert_array_equal(source.images[0], grey(4)[1].T)
-    assert sweep.notes() == ["a: 2 of 4 frames have no valid pose and are left out"]
-    assert open_posed(sequence(tmp_path)).notes() == []
+    assert sweep.notes()[-1] == "a: 2 of 4 frames have no valid pose and are left out"
+    assert "no valid pose" not in "".join(open_posed(sequence(tmp_path)).notes())
 
 
 def test_a_reconstruction_is_opened_with_the_calibrations_it_was_made_with(tmp_path):
