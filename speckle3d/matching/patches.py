@@ -139,8 +139,8 @@ def lay_patches(grid: ImageGrid, settings: PatchSettings | None = None) -> Patch
     rows_inside = inside.reshape(columns, rows).any(axis=0)
     if (count := rows_inside.sum()) < 2:
         raise InvalidInputError(f"region: expected two rows of patches in it, got {count}: {s.region}")
-    laid = np.tile(rows_inside, columns)
-    first, inside = first[laid], inside[laid]
+    selection = np.tile(rows_inside, columns)
+    first, inside = first[selection], inside[selection]
     vector, sample = (first + (size - 1) / 2).T
     depth, angle = grid.first_sample_depth_mm + sample * spacing[1], grid.angle_rad(vector)
     pitch, step = np.full(len(first), spacing[0]), 0.0
