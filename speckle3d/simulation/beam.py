@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import ClassVar
 
 import numpy as np
@@ -11,6 +11,7 @@ import numpy as np
 from speckle3d.core.arrays import Complex64Array, ComplexArray, FloatArray, IntArray
 from speckle3d.core.sweep import RFSettings
 from speckle3d.kernels.diffraction import lens_fields
+from speckle3d.kernels.scatter import BeamField
 
 _NEPER_PER_DB = np.log(10.0) / 20.0
 
@@ -19,7 +20,7 @@ _ELEVATION_MM = np.arange(0.0, 4.0 + 1e-9, 0.08)
 _LATERAL_REACH_MM = 2.7
 """Where the beam is tabulated."""
 
-PER_PITCH = 4
+_PER_PITCH = 4
 """Lateral steps of the table in a pitch of the elements."""
 
 _STRIPS = 64
@@ -114,6 +115,13 @@ class BeamTable:
     depth_mm: ClassVar[FloatArray] = _DEPTH_MM
     elevation_mm: ClassVar[FloatArray] = _ELEVATION_MM
 
+    @cached_property
+    def field(self) -> BeamField:
+        """The beam as `speckle3d.kernels.scatter` reads it."""
+        steps = np.array([_DEPTH_MM[0], np.ptp(_DEPTH_MM[:2]), self.lateral_mm[1], _ELEVATION_MM[1]])
+        field = np.ascontiguousarray(self.residual.swapaxes(1, 2)).view(np.float32)
+        return BeamField(field, self.reach, self.curvature_per_mm, steps)
+
     @property
     def lateral_extent_mm(self) -> float:
         """Largest lateral distance from a vector at which the field is above the floor."""
@@ -164,7 +172,7 @@ def tabulate_beam(probe: Probe = Probe(), attenuation_db_cm_mhz: float = 0.0) ->
     ----------
     .. [1] J. W. Goodman, "Introduction to Fourier Optics", first Rayleigh-Sommerfeld solution.
     """
-    step = probe.pitch_mm / PER_PITCH
+    step = probe.pitch_mm / _PER_PITCH
     lateral = np.arange(round(_LATERAL_REACH_MM / step) + 1, dtype=np.float64) * step
     wavenumbers = 2e-3 * np.pi * _NODES_HZ / probe.speed_of_sound_m_s
     field = _sum_sources(probe, lateral, wavenumbers)
@@ -186,10 +194,10 @@ def tabulate_beam(probe: Probe = Probe(), attenuation_db_cm_mhz: float = 0.0) ->
 
 def _sum_sources(probe: Probe, lateral: FloatArray, wavenumbers: FloatArray) -> ComplexArray:
     """Two-way field, shape (depth, lateral, elevation, node)."""
-    depth, step = _DEPTH_MM, probe.pitch_mm / PER_PITCH
+    depth, step = _DEPTH_MM, probe.pitch_mm / _PER_PITCH
     widest = int(max(probe.transmit_elements, probe.receive_elements)) | 1
     element = (np.arange(widest) - widest // 2) * probe.pitch_mm
-    across = np.repeat(element, PER_PITCH)
+    across = np.repeat(element, _PER_PITCH)
     half = np.full(depth.size, probe.transmit_elements * probe.pitch_mm / 2.0)
     transmit = _focused(probe, across, half, np.full(depth.size, probe.transmit_focus_mm), wavenumbers)
     # The dynamic receive aperture has at least four elements.

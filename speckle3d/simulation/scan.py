@@ -13,15 +13,8 @@ from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import Complex64Array, Float32Array, FloatArray, IntArray
 from speckle3d.core.grid import ImageGrid
-from speckle3d.kernels.scatter import (
-    EchoGrid,
-    Fan,
-    FieldTable,
-    field_table,
-    scatter_echoes,
-    scatter_fan_echoes,
-)
-from speckle3d.simulation.beam import PER_PITCH, BeamTable
+from speckle3d.kernels.scatter import EchoGrid, scatter_echoes
+from speckle3d.simulation.beam import BeamTable
 from speckle3d.simulation.medium import Box, Medium
 
 _FULL_SCALE = 8191
@@ -95,23 +88,13 @@ class SimulatedFrames:
         out = np.zeros((image.vectors, self._length, len(self.beam.components)), np.complex64)
         carrier = 2e-3 * float(self._frequency_hz[self._carrier_bin]) / probe.speed_of_sound_m_s
         grid = EchoGrid(image.first_sample_depth_mm, image.sample_spacing_mm, carrier)
-        medium_from_image, fan = self.medium_from_image[index], image.fan
-        angle = image.angle_rad(np.arange(image.vectors))
-        arguments = medium_from_image.inv().as_matrix(), self._field, grid, out.view(np.float32)
-        for position, strength in self.medium.scatterers(medium_from_image, self._box):
-            if fan is None:
-                scatter_echoes(position, strength, image.vector_pitch_mm, *arguments)
-            else:
-                vectors = Fan(fan.apex_mm, fan.radius_mm, np.sin(angle), np.cos(angle))
-                scatter_fan_echoes(position, strength, vectors, *arguments)
+        number = np.arange(image.vectors)
+        face, angle = image.mm(number, -grid.first_depth_mm / grid.sample_mm), image.angle_rad(number)
+        vectors = np.column_stack([face, np.sin(angle), np.cos(angle)])
+        image_from_medium = self.medium_from_image[index].inv().as_matrix()
+        for block in self.medium.scatterers(self.medium_from_image[index], self._box):
+            scatter_echoes(*block, vectors, image_from_medium, self.beam.field, grid, out.view(np.float32))
         return out
-
-    @cached_property
-    def _field(self) -> FieldTable:
-        beam = self.beam
-        depth, lateral, elevation = beam.depth_mm, beam.lateral_mm, beam.elevation_mm
-        steps = np.array([depth[0], depth[1] - depth[0], lateral[1], elevation[1]])
-        return field_table(beam.residual, beam.reach, beam.curvature_per_mm, steps, PER_PITCH)
 
     @cached_property
     def _box(self) -> Box:
