@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from speckle3d.core.arrays import FloatArray
+from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.errors import InvalidInputError
 
-LARGEST_SKEW_RAD = 0.2
-"""Of an image's axes: those of published calibrations lean by 0.05."""
+_ROUNDING = 1e-6
+"""Of a pitch, by which a place may miss the first or the last sample and be in the image."""
 
 
 @dataclass(frozen=True)
@@ -74,12 +74,8 @@ class ImageGrid:
         require_positive(self, ("vectors", "samples", "vector_pitch_mm", "sample_spacing_mm"))
         if not np.isfinite([self.first_sample_depth_mm, self.first_vector_mm]).all():
             raise InvalidInputError("first_sample_depth_mm, first_vector_mm: expected finite values")
-        if not abs(self.skew_rad) <= LARGEST_SKEW_RAD:
-            raise InvalidInputError(
-                f"skew_rad: expected at most {LARGEST_SKEW_RAD:g} either way, got {self.skew_rad}"
-            )
         if self.fan is not None and (
-            abs(self.angle_rad([0, self.vectors - 1])).max() >= np.pi / 2
+            abs(self.angle_rad([0, self.vectors - 1])).max() > np.pi / 2
             or self.fan.radius_mm + self.first_sample_depth_mm < 0
         ):
             raise InvalidInputError(
@@ -138,12 +134,17 @@ class ImageGrid:
         """Fractional vector and sample at places in P, shape (..., 2); the inverse of `mm`."""
         place = np.asarray(place_mm, dtype=float)
         if self.fan is None:
-            affine = self.image_from_sample[:2]
-            return np.asarray(np.linalg.solve(affine[:, :2], (place - affine[:, 2])[..., None])[..., 0])
+            axes, first = np.split(self.image_from_sample[:2], [2], axis=1)
+            return np.asarray((place - first.T[0]) @ np.linalg.inv(axes).T)
         x, y = np.moveaxis(place - self.fan.apex_mm, -1, 0)
         depth = np.hypot(x, y) - self.fan.radius_mm - self.first_sample_depth_mm
         vector = (np.arctan2(x, y) - self.fan.first_rad) / self.fan.step_rad
         return np.stack([vector, depth / self.sample_spacing_mm], axis=-1)
+
+    def holds(self, place_mm: npt.ArrayLike) -> BoolArray:
+        """Which places in P, shape (..., 2), lie among the samples, the outermost included."""
+        sample, last = self.sample_at(place_mm), [self.vectors - 1, self.samples - 1]
+        return np.asarray((np.abs(sample - np.clip(sample, 0, last)) < _ROUNDING).all(axis=-1))
 
     @property
     def extent_mm(self) -> FloatArray:
@@ -192,11 +193,9 @@ class ImageGrid:
             raise InvalidInputError("expected parallel vectors, got a fan's: take its images scan-converted")
         along, beside = np.cos(self.skew_rad / 2), np.sin(self.skew_rad / 2)
         across, down = self.vector_pitch_mm, self.sample_spacing_mm
-        affine = np.zeros((4, 3))
-        affine[0] = along * across, beside * down, self.first_vector_mm
-        affine[1] = beside * across, along * down, self.first_sample_depth_mm
-        affine[3, 2] = 1.0
-        return affine
+        x = [along * across, beside * down, self.first_vector_mm]
+        y = [beside * across, along * down, self.first_sample_depth_mm]
+        return np.array([x, y, [0.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
 
 def require_positive(settings: object, names: tuple[str, ...]) -> None:

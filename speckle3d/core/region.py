@@ -15,15 +15,14 @@ from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.extras import extra_module
 from speckle3d.core.geometry import require_finite
-from speckle3d.core.grid import ImageGrid
+from speckle3d.core.grid import FanLines, ImageGrid
 
 REGION_HELP = "'rectangle x0,y0 x1,y1', 'fan x,y angle,angle radius,radius' or 'polygon x,y x,y x,y ...'"
 """How a region is written: mm in the image, degrees from straight down, several joined by ' and '."""
 
-_HAIR = 1e-6
-"""Fraction of a pixel by which a sample may miss a side and count: rounding of sizes in mm."""
-
 Pair = tuple[float, float]
+Shape = Callable[[FloatArray], BoolArray]
+"""Which places, mm, shape (..., 2), are in it."""
 
 
 @dataclass(frozen=True)
@@ -87,20 +86,17 @@ class Region:
         return replace(grid, vectors=wide, samples=high, first_vector_mm=left, first_sample_depth_mm=top)
 
     def _inside(self, grid: ImageGrid) -> BoolArray:
-        pixel = np.array([grid.vector_pitch_mm, grid.sample_spacing_mm])
         places = grid.mm(np.arange(grid.vectors)[:, None], np.arange(grid.samples))
         inside = np.ones(places.shape[:2], dtype=bool)
         for part in self.text.split(" and "):
-            kind, *words = part.split() or [""]
             try:
-                corners = [(float(x), float(y)) for x, y in (word.split(",") for word in words)]
-                inside &= _SHAPES[kind](places, pixel, *corners)
-            except InvalidInputError:
-                raise
+                kind, *words = part.split()
+                shape = _SHAPES[kind](*((float(x), float(y)) for x, y in (word.split(",") for word in words)))
             except (KeyError, TypeError, ValueError):
                 raise InvalidInputError(
                     f"region: expected {REGION_HELP}, joined by ' and ', got {self.text!r}"
                 ) from None
+            inside &= shape(places)
         return inside
 
 
@@ -110,7 +106,7 @@ def polygon_mask(places: FloatArray, corners: npt.ArrayLike, name: str = "polygo
     Parameters
     ----------
     places : ndarray, shape (n, m, 2)
-        In pixels, whose millionth part is rounding.
+        In pixels or mm, whose millionth part is rounding.
     corners : array_like, shape (k, 2)
         Three or more corners of any simple polygon, in the same unit.
     name : str
@@ -134,26 +130,19 @@ def polygon_mask(places: FloatArray, corners: npt.ArrayLike, name: str = "polygo
     return np.asarray(inside.reshape(places.shape[:2]))
 
 
-def _rectangle(places: FloatArray, pixel: FloatArray, low: Pair, high: Pair) -> BoolArray:
-    if not np.less(low, high).all():
-        raise ValueError
-    hair = _HAIR * pixel
-    return np.asarray(((places >= low - hair) & (places <= high + hair)).all(axis=-1))
+def _rectangle(low: Pair, high: Pair) -> Shape:
+    width, height = high[0] - low[0], high[1] - low[1]
+    return ImageGrid(2, 2, width, height, low[1], first_vector_mm=low[0]).holds
 
 
-def _fan(places: FloatArray, pixel: FloatArray, apex: Pair, angles_deg: Pair, radii: Pair) -> BoolArray:
-    (left, right), (near, far) = angles_deg, radii
-    if not (-90 <= left < right <= 90 and 0 <= near < far):
-        raise ValueError
-    x, y = np.moveaxis(places - apex, -1, 0)
-    radius, angle, hair = np.hypot(x, y), np.arctan2(x, y), _HAIR * pixel.min()
-    # Distances along the arc from the two sides, positive inside.
-    between = radius * np.minimum(angle - np.radians(left), np.radians(right) - angle) >= -hair
-    return np.asarray(between & (radius >= near - hair) & (radius <= far + hair))
+def _fan(apex: Pair, angles_deg: Pair, radii: Pair) -> Shape:
+    first, last = np.radians(angles_deg).tolist()
+    fan = FanLines(apex, radii[0], first, last - first)
+    return ImageGrid(2, 2, 1.0, radii[1] - radii[0], fan=fan).holds
 
 
-def _polygon(places: FloatArray, pixel: FloatArray, *corners: Pair) -> BoolArray:
-    return polygon_mask(places / pixel, np.reshape(corners, (-1, 2)) / pixel)
+def _polygon(*corners: Pair) -> Shape:
+    return lambda places: polygon_mask(places, corners)
 
 
-_SHAPES: dict[str, Callable[..., BoolArray]] = {"rectangle": _rectangle, "fan": _fan, "polygon": _polygon}
+_SHAPES: dict[str, Callable[..., Shape]] = {"rectangle": _rectangle, "fan": _fan, "polygon": _polygon}

@@ -59,8 +59,5 @@ class ScanConversion:
     def _sample(self) -> FloatArray:
         """Vector and sample of each pixel, shape (2, column, row)."""
         column, row = np.arange(self.grid.vectors)[:, None], np.arange(self.grid.samples)
-        sample = np.moveaxis(self._fan.sample_at(self.grid.mm(column, row)), -1, 0)
         # Places on the fan's edge are inside it whatever rounding does.
-        last = np.array([self._fan.vectors - 1, self._fan.samples - 1])[:, None, None]
-        near = (sample > -1e-6) & (sample < last + 1e-6)
-        return np.where(near, np.clip(sample, 0, last), sample)
+        return np.moveaxis(self._fan.sample_at(self.grid.mm(column, row)).round(6), -1, 0)
