@@ -54,9 +54,8 @@ def _columns(
     columns = dict(zip(_NAMES, values, strict=True))
     columns["length_mm"] = np.append(0.0, np.cumsum(elevational_steps(world_from_image, centre_mm)))
     if covariance is not None:
-        sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2).clip(min=0.0)) * (
-            [1] * 3 + [180 / np.pi] * 3
-        )
+        variance = np.diagonal(covariance, axis1=1, axis2=2).clip(min=0.0)
+        sigma = np.sqrt(variance) * np.repeat([1.0, np.rad2deg(1.0)], 3)
         columns |= {f"sigma_{name}": column for name, column in zip(_NAMES, sigma.T, strict=True)}
     return columns
 
@@ -86,8 +85,8 @@ def plot_poses(
             panel.set(xlabel="frame", ylabel=name.replace("_deg", " / degrees").replace("_mm", " / mm"))
             sigma = columns.get(f"sigma_{name}".replace("length", "z"))
             if sigma is not None:
-                ends = (columns[name] + side * _WITHIN * sigma for side in (-1, 1))
-                look = {"label": f"95 % interval of mode {mode}", "color": line.get_color(), "alpha": 0.15}
-                panel.fill_between(range(sigma.size), *ends, lw=0, **look)
+                half, look = _WITHIN * sigma, {"color": line.get_color(), "alpha": 0.15, "lw": 0}
+                low, high = columns[name] - half, columns[name] + half
+                panel.fill_between(range(half.size), low, high, label=f"95 % interval of mode {mode}", **look)
     axes[0].legend(fontsize="small", frameon=False)
     return figure

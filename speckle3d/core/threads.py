@@ -11,7 +11,7 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
-from contextvars import ContextVar, copy_context
+from contextvars import ContextVar
 from functools import cache
 from typing import TypeVar
 
@@ -48,13 +48,13 @@ def processors() -> int:
     allowed = len(affinity(0)) if affinity else os.cpu_count() or 1
     # OpenMP's may be a list, by depth of nesting.
     limits = (os.environ.get(name, "").partition(",")[0].strip() for name in _LIMITS)
-    return max(1, min([allowed, *(int(value) for value in limits if value.isascii() and value.isdecimal())]))
+    return max(1, min([allowed, *(int(value) for value in limits if value.isdecimal())]))
 
 
 @cache
 def _pool() -> ThreadPoolExecutor:
-    """Return the threads that all of the process shares."""
-    return ThreadPoolExecutor(processors(), "speckle3d")
+    """Return the threads that all of the process shares, each of which works alone."""
+    return ThreadPoolExecutor(processors(), "speckle3d", _ALONE.set, (True,))
 
 
 def end_threads() -> None:
@@ -99,15 +99,10 @@ def ahead(function: Callable[[Item], Result], items: Iterable[Item], most: int =
     waiting: deque[Future[Result]] = deque()
     try:
         for item in items:
-            waiting.append(_pool().submit(copy_context().run, _alone, function, item))
+            waiting.append(_pool().submit(function, item))
             if len(waiting) > most:
                 yield waiting.popleft().result()
         while waiting:
             yield waiting.popleft().result()
     finally:
         wait([future for future in waiting if not future.cancel()])
-
-
-def _alone(function: Callable[[Item], Result], item: Item) -> Result:
-    with on_one_thread():
-        return function(item)

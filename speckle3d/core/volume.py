@@ -53,10 +53,10 @@ class Volume:
                 f"voxels: expected shape (n_i, n_j, n_k) of {', '.join(VOXEL_TYPES)}, got "
                 f"{self.voxels.shape} of {self.voxels.dtype}"
             )
-        across, down, along = (float(step) for step in self.spacing_mm)
-        if not (np.isfinite(self.spacing_mm).all() and min(self.spacing_mm) > 0):
+        spacing_mm = tuple(map(float, self.spacing_mm))
+        if len(spacing_mm) != 3 or not all(0 < step < np.inf for step in spacing_mm):
             raise InvalidInputError(f"spacing_mm: expected three values above zero, got {self.spacing_mm}")
-        object.__setattr__(self, "spacing_mm", (across, down, along))
+        object.__setattr__(self, "spacing_mm", spacing_mm)
 
     @property
     def shape(self) -> tuple[int, int, int]:

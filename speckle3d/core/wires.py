@@ -77,14 +77,13 @@ class WirePhantom:
 
     def crossings_mm(self) -> FloatArray:
         """Where the middle wire of each N meets the first and the last wire, shape (n_shapes, 2, 3)."""
-        meets = [[self._nearest(n[1], outer) for outer in (n[0], n[2])] for n in self.n_shapes]
-        return np.reshape(meets, (len(self.n_shapes), 2, 3))
-
-    def _nearest(self, wire: int, crossed: int) -> FloatArray:
-        """Point of a wire that is nearest to another."""
-        axes = np.column_stack([self.directions[wire], -self.directions[crossed]])
-        along = np.linalg.lstsq(axes, self.points_mm[crossed] - self.points_mm[wire], rcond=None)[0]
-        return np.asarray(self.points_mm[wire] + along[0] * self.directions[wire])
+        n = np.reshape(self.n_shapes, (-1, 3))
+        point, along = self.points_mm[n[:, 1], None], self.directions[n[:, 1], None]
+        rows, offsets = self.equations(n[:, ::2])
+        # Nearest to the outer wire: its distance is linear along the middle one.
+        distance, slope = ((rows @ axis[..., None])[..., 0] for axis in (point, along))
+        step = ((offsets - distance) * slope).sum(axis=-1) / (slope**2).sum(axis=-1)
+        return np.asarray(point + step[..., None] * along)
 
     @cached_property
     def _normals(self) -> FloatArray:
