@@ -73,20 +73,11 @@ class Config(ImageSettings):
     fused: FusedSettings = FusedSettings()
     volume: CompoundingSettings = CompoundingSettings()
 
-    def with_choices(
-        self,
-        consistent_subset: bool | None = None,
-        drift_curves: str | None = None,
-        region: str | None = None,
-    ) -> Config:
+    def with_choices(self, drift_curves: str | None = None, region: str | None = None) -> Config:
         """Return a configuration with command-line choices in place of its own; None leaves one as it is."""
         values = self.model_dump()
-        if consistent_subset is not None:
-            values["sensors"]["consistent_subset"] = consistent_subset
-        if drift_curves is not None:
-            values["drift"]["curves"] = drift_curves
-        if region is not None:
-            values["patches"]["region"] = region
+        values["drift"]["curves"] = drift_curves or self.drift.curves
+        values["patches"]["region"] = self.patches.region if region is None else region
         return validated(values, "configuration", Config)
 
     def to_toml(self, comments: bool = False) -> str:
@@ -136,20 +127,15 @@ def stored_config(text: str) -> Config:
     """Parse the configuration that a file was made with, whose removed settings no longer matter."""
     values = parsed(text, "configuration")
     for name in _obsolete_names(values):
-        stage, _, setting = name.partition(".")
-        if setting:
-            del values[stage][setting]
-        else:
-            del values[stage]
+        *stage, setting = name.split(".")
+        del (values[stage[0]] if stage else values)[setting]
     return validated(values, "configuration", Config)
 
 
 def _obsolete_names(values: dict[str, Any]) -> list[str]:
     """Names of stages and settings that older versions had."""
-    names = [
-        *values,
-        *(f"{stage}.{name}" for stage, group in values.items() if isinstance(group, dict) for name in group),
-    ]
+    groups = ((stage, group) for stage, group in values.items() if isinstance(group, dict))
+    names = [*values, *(f"{stage}.{name}" for stage, group in groups for name in group)]
     return [name for name in names if name in REMOVED_SETTINGS]
 
 

@@ -104,7 +104,7 @@ def _fuse(tracked: Tracked, sweep: Sweep, config: Config, pair: CrossedPair | No
             tracked.image,
             float(tracked.coherence.share.mean()),
             tracked.scale_sigma,
-            tracked.curves_sigma,
+            tracked.shared.curves_sigma,
             tracked.shared.turn_sigma_per_mm,
             sweep.grid.centre_mm,
             sweep.frame_time_s,

@@ -58,9 +58,9 @@ class Tracked:
         What `covariance` has all frames have wrong together.
     doubts : tuple of Doubt
         What of the recording contradicts the images or itself; what rests on refuted parts was not used.
-    grid : ImageGrid or None
+    grid : ImageGrid
         Of the sweep.
-    frame_time_s : ndarray, shape (n,), or None
+    frame_time_s : ndarray, shape (n,)
         Of the sweep.
     """
 
@@ -76,9 +76,9 @@ class Tracked:
     coherence: Coherence
     curves: DecorrelationCurves
     shared: SharedErrors
-    doubts: tuple[Doubt, ...] = ()
-    grid: ImageGrid | None = None
-    frame_time_s: FloatArray | None = None
+    doubts: tuple[Doubt, ...]
+    grid: ImageGrid
+    frame_time_s: FloatArray
 
     def plot(self, sweep: Sweep | None = None) -> Figure:
         """Draw length, tilt, yaw and roll against the frame, with their 95 % intervals.
@@ -97,16 +97,12 @@ class Tracked:
                 poses["tracker"] = tracker.world_from_image(times)
             if sweep.truth is not None:
                 poses["truth"] = sweep.truth
-        return plot_poses(poses, self._centre_mm, self.covariance)
+        return plot_poses(poses, self.grid.centre_mm, self.covariance)
 
     def to_dataframe(self) -> Any:
         """Poses in mode `image` as a `pandas.DataFrame`, a row for each frame; see `pose_table`."""
-        columns = {"time_s": self.frame_time_s, "flags": self.flags}
-        return pose_table(self.image, self._centre_mm, self.covariance, **columns)
-
-    @property
-    def _centre_mm(self) -> FloatArray:
-        return np.zeros(3) if self.grid is None else self.grid.centre_mm
+        centre_mm, time_s = self.grid.centre_mm, self.frame_time_s
+        return pose_table(self.image, centre_mm, self.covariance, time_s=time_s, flags=self.flags)
 
     def facts(self) -> list[tuple[str, object]]:
         """What the tracked sweep shows of itself."""
@@ -128,11 +124,6 @@ class Tracked:
     def scale_sigma(self) -> float:
         """Relative standard deviation of the scale of distances, which all pairs share."""
         return self.shared.length_sigma
-
-    @property
-    def curves_sigma(self) -> float:
-        """The part of it that is the curves' mismatch with this probe and tissue."""
-        return self.shared.curves_sigma
 
     @property
     def pairs(self) -> int:

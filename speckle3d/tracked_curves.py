@@ -137,8 +137,7 @@ def tracker_scale(sweep: Sweep, result: Tracked) -> Length:
     residuals = z - np.sign(z @ x) * scale * x
     variance = float(residuals @ residuals) / (z.size - 2)
     alike = float(np.clip(ALIKE_MM * z.size / np.ptp(z), 1.0, min(ALIKE_FRAMES, z.size)))
-    sigma = float(np.sqrt(alike * variance / (x @ x))) / scale
-    sigma = float(np.hypot(sigma, LENGTH_SIGMA))
+    sigma = float(np.hypot(np.sqrt(alike * variance / (x @ x)) / scale, LENGTH_SIGMA))
     if not sigma < LEAST_SURE:
         raise InsufficientDataError(
             f"{sweep.name}: expected a length that the tracker knows to {100 * LEAST_SURE:g} %, got "
@@ -176,20 +175,8 @@ def corrected_curves(
     DecorrelationCurves
         Of origin "crossing"; their `scale_sigma` is that of the lengths and of tissue that attenuates
         otherwise.
-
-    Raises
-    ------
-    InsufficientDataError
-        If there is no sweep, or none whose length is known.
     """
-    scale, sigma = (
-        np.array([getattr(length, name) for length in lengths]) for name in ("log_scale", "sigma")
-    )
-    if not read_with or scale.size != len(read_with) or not (np.isfinite(scale) & (sigma > 0)).all():
-        raise InsufficientDataError(
-            "corrected curves: expected for every sweep a finite log scale with a deviation above zero, got "
-            f"{scale.tolist()} and {sigma.tolist()} for {len(read_with)} sweeps"
-        )
+    scale, sigma = np.array([(length.log_scale, length.sigma) for length in lengths]).T
     information = sigma**-2.0
     weight = information / information.sum()
     widths = [np.log(curve_widths(c.distance_mm, c.correlation)) for c in (curves, *read_with)]

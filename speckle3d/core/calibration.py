@@ -19,8 +19,6 @@ SENSORS = ("tracker", "orientation")
 
 _ANGLES = {"alpha": "roll (alpha)", "beta": "yaw (beta)", "gamma": "tilt (gamma)"}
 _PIXELS = {"s_x": ", columns", "s_y": ", rows"}
-_LONGEST_REASONS = 6
-"""How many reasons for dropped frames rows tell."""
 
 
 def readable(value: float, unit: str) -> tuple[str, str]:
@@ -161,8 +159,10 @@ class Calibration:
             ("condition number", f"{self.condition_number:.1f}", ""),
             ("frames used", f"{len(self.frames.used)} of {self.frames.given}", ""),
         ]
-        reasons = list(self.frames.reasons().items())[:_LONGEST_REASONS]
-        rows += [(f"dropped: {reason}", str(count), "frame" + "s" * (count > 1)) for reason, count in reasons]
+        rows += [
+            (f"dropped: {reason}", str(count), "frame" + "s" * (count > 1))
+            for reason, count in self.frames.reasons().items()
+        ]
         if self.time_offset_s is not None:
             rows.append(("sensor clock offset", f"{self.time_offset_s:+.4f}", "s"))
         return [*rows, ("verdict", self.verdict, "")]

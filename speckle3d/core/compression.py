@@ -13,11 +13,9 @@ References
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-
-from speckle3d.core.arrays import FloatArray
 
 if TYPE_CHECKING:
     from speckle3d.core.sweep import Frames
@@ -59,13 +57,10 @@ def estimate_dynamic_range(
     across, down = vectors // wide, samples // high
     if not across or not down:
         return None
-
-    def percentiles(frame: Any) -> FloatArray:
-        tiles = frame[: across * wide, : down * high].reshape(across, wide, down, high).swapaxes(1, 2)
-        return np.asarray(np.percentile(tiles.reshape(across * down, -1), (10, 50, 90), axis=1))
-
     chosen = np.unique(np.linspace(0, count - 1, FRAMES).round().astype(int)).tolist()
-    low, middle, high_level = np.concatenate([percentiles(frames[k]) for k in chosen], axis=1)
+    images = np.stack([frames[k][: across * wide, : down * high] for k in chosen])
+    tiles = images.reshape(-1, across, wide, down, high)
+    low, middle, high_level = np.percentile(tiles, (10, 50, 90), axis=(2, 4)).reshape(3, -1)
     fair = (low > 0) & (high_level < full_scale)
     fair &= middle >= np.quantile(middle[fair], BRIGHT) if fair.any() else fair
     below, above = (middle - low)[fair], (high_level - middle)[fair]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from dataclasses import fields
+from dataclasses import fields, is_dataclass
 from typing import Any, TypeVar
 
 import numpy as np
@@ -31,6 +31,10 @@ def brief(value: Any) -> str:
         text = f"{value.dtype} {value.shape}"
     elif isinstance(value, Rotation | RigidTransform):
         text = type(value).__name__ + ("" if value.single else f" ({len(value)},)")
+    elif is_dataclass(value):
+        text = f"{type(value).__name__}: " + ", ".join(
+            f"{k} {brief(part)}" for k, part in vars(value).items()
+        )
     elif isinstance(value, dict | tuple):
         text = ", ".join(map(brief, value)) if len(value) <= 4 else f"{len(value)}"
     else:

@@ -109,15 +109,13 @@ class RFSettings:
         require_positive(self, ("sampling_rate_hz", "speed_of_sound_m_s", "centre_frequency_hz"))
         low, high = self.bandwidth_hz
         middle, half = self.demodulation_frequency_hz, self.sampling_rate_hz / 2
-        if middle is not None and not 0 <= middle < np.inf:
-            raise InvalidInputError(f"demodulation_frequency_hz: expected zero or above, got {middle}")
         # I/Q hold as much on either side of the frequency they were shifted down by, the analytic signal
         # all up to the sampling rate.
         least, most = (middle - half, middle + half) if middle else (0, 2 * half if middle == 0 else half)
-        if not (0 < low < high and least <= low and high <= most):
+        if not (0 < low < high and least <= low and high <= most and (middle or 0) >= 0):
             raise InvalidInputError(
-                f"bandwidth_hz: expected 0 < low < high from {least:g} to {most:g}, as sampled, "
-                f"got ({low:g}, {high:g})"
+                f"bandwidth_hz: expected 0 < low < high from {least:g} to {most:g}, as sampled, and a "
+                f"demodulation_frequency_hz of zero or above, got ({low:g}, {high:g}) and {middle}"
             )
 
     @property
@@ -368,7 +366,7 @@ class Sweep:
         """
         xarray = extra_module("xarray", "notebook", "a labelled array")
         grid, vector = self.grid, np.arange(self.grid.vectors)
-        lateral, places = "lateral_mm", vector * grid.vector_pitch_mm
+        lateral, places = "lateral_mm", grid.first_vector_mm + vector * grid.vector_pitch_mm
         if grid.fan is not None:
             lateral, places = "angle_rad", grid.angle_rad(vector)
         depth_mm = grid.first_sample_depth_mm + np.arange(grid.samples) * grid.sample_spacing_mm

@@ -42,13 +42,12 @@ def lens_fields(
     strip_mm: FloatArray,
     delay_mm: FloatArray,
     wavenumber_per_mm: FloatArray,
-    weight: FloatArray,
     order: int,
     first: int,
     stop: int,
     out: FloatArray,
 ) -> None:
-    """Sum ``weight exp(-i k (path + delay)) / path**order`` over a lens' strips, at some of the distances.
+    """Sum ``exp(-i k (path + delay)) / path**order`` over a lens' strips, at some of the distances.
 
     Parameters
     ----------
@@ -59,7 +58,6 @@ def lens_fields(
         Elevation of the lens' strips, and what their delays are worth.
     wavenumber_per_mm : float64, shape (f,)
         Evenly spaced.
-    weight : float64, shape (y,)
     order : int
         1, or 2.
     first, stop : int
@@ -77,7 +75,7 @@ def lens_fields(
                 across = elevation_mm[z] - strip_mm[s]
                 path = np.sqrt(distance_mm[y] * distance_mm[y] + across * across)
                 c, sine = _cosine_and_sine(lowest * (path + delay_mm[s]))
-                size = weight[y] / (path if order == 1 else path * path)
+                size = 1.0 / (path if order == 1 else path * path)
                 real[s], imaginary[s] = size * c, -size * sine
                 c, sine = _cosine_and_sine(step * (path + delay_mm[s]))
                 turn_real[s], turn_imaginary[s] = c, -sine

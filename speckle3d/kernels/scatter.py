@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import njit
 
-from speckle3d.core.arrays import Float32Array, FloatArray, IntArray
+from speckle3d.core.arrays import Complex64Array, Float32Array, FloatArray, IntArray
 
 _SUMS = {"reassoc", "contract", "arcp"}
 _TURNS = 8192
@@ -15,23 +15,29 @@ _TWO_PI = 2.0 * np.pi
 _PHASORS = np.exp(-1j * _TWO_PI * np.arange(_TURNS) / _TURNS).astype(np.complex64)
 
 
-class BeamField(NamedTuple):
-    """The two-way beam of a vector, symmetric to either side and in elevation.
+class FieldTable(NamedTuple):
+    """The two-way beam, laid out so that one loop serves all vectors on one side of a scatterer.
+
+    The lateral steps divide the vectors' pitch: a scatterer that lies `r` steps and a fraction from the
+    nearest vector on one side lies ``r + m * steps per pitch`` steps and the same fraction from the m-th.
 
     Attributes
     ----------
-    field : float32, shape (y, z, x, nodes * 2)
-        Residual amplitude, real and imaginary parts in turn.
-    reach : int64, shape (y, x)
+    rows : float32, shape (y, z, steps per pitch + 1, m * nodes * 2)
+        Two-way residual amplitude, real and imaginary parts in turn.
+    reach : int64, shape (y, steps per pitch, m)
         How many elevational steps the beam reaches; beyond that the field is left out.
+    vectors : int64, shape (y, z, steps per pitch)
+        How many vectors on one side may be in reach.
     curvature_per_mm : float64, shape (y, 2)
         Path curvature, lateral and elevational: the echo comes from depth ``y + kx x^2 + kz z^2``.
     grid : float64, shape (4,)
         First depth, depth step, lateral step, elevational step, mm.
     """
 
-    field: Float32Array
+    rows: Float32Array
     reach: IntArray
+    vectors: IntArray
     curvature_per_mm: FloatArray
     grid: FloatArray
 
@@ -44,6 +50,25 @@ class EchoGrid(NamedTuple):
     cycles_per_mm: float
 
 
+def field_table(
+    field: Complex64Array, reach: IntArray, curvature_per_mm: FloatArray, grid: FloatArray, per_pitch: int
+) -> FieldTable:
+    """Lay out a beam, shape (y, x, z, nodes), with its reach, shape (y, x), as `FieldTable` says."""
+    ny, nx, nz, nodes = field.shape
+    most = -(-nx // per_pitch)
+    steps = np.zeros((ny, most * per_pitch + per_pitch, nz, nodes), np.complex64)
+    steps[:, :nx] = field
+    rows = np.stack([steps[:, r : r + most * per_pitch : per_pitch] for r in range(per_pitch + 1)], axis=2)
+    rows = np.ascontiguousarray(rows.transpose(0, 3, 2, 1, 4)).view(np.float32)
+    # Between the last lateral step and the one after it, there is nothing to interpolate.
+    steps_z = np.zeros((ny, most * per_pitch), np.int64)
+    steps_z[:, : nx - 1] = reach[:, : nx - 1]
+    steps_z = np.ascontiguousarray(steps_z.reshape(ny, most, per_pitch).transpose(0, 2, 1))
+    inside = np.arange(nz)[:, None, None] < steps_z[:, None]
+    vectors = np.where(inside.any(axis=-1), most - np.argmax(inside[..., ::-1], axis=-1), 0)
+    return FieldTable(rows.reshape(ny, nz, per_pitch + 1, -1), steps_z, vectors, curvature_per_mm, grid)
+
+
 @njit(cache=True, inline="always", fastmath=_SUMS)
 def _unit_phasor(cycles: float) -> Any:
     """``exp(-2 pi i cycles)`` to 1e-7: the nearest tabulated phasor, turned by the small angle to it."""
@@ -54,12 +79,29 @@ def _unit_phasor(cycles: float) -> Any:
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=_SUMS)
+def _interpolate(table: Float32Array, row: int, corners: Any, weights: Any, out: Float32Array) -> None:
+    """Fill `out` with a weighted sum of eight pieces of a table.
+
+    Two lie a `row` apart from each of the corners, of two depths and two elevations: two lateral steps.
+    """
+    w0, w1, w2, w3, w4, w5, w6, w7 = weights
+    c0, c1, c2, c3 = corners
+    n = out.shape[0]
+    # Slices, not offsets: an index that may be negative keeps the compiler from using vector instructions.
+    a0, a1, a2, a3 = table[c0:][:n], table[c0 + row :][:n], table[c1:][:n], table[c1 + row :][:n]
+    a4, a5, a6, a7 = table[c2:][:n], table[c2 + row :][:n], table[c3:][:n], table[c3 + row :][:n]
+    for q in range(n):
+        near = w0 * a0[q] + w1 * a1[q] + w2 * a2[q] + w3 * a3[q]
+        out[q] = near + (w4 * a4[q] + w5 * a5[q] + w6 * a6[q] + w7 * a7[q])
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_SUMS)
 def scatter_echoes(
     position_mm: FloatArray,
     strength: Float32Array,
-    vectors: FloatArray,
+    pitch_mm: float,
     image_from_medium: FloatArray,
-    beam: BeamField,
+    table: FieldTable,
     echoes: EchoGrid,
     out: Float32Array,
 ) -> None:
@@ -71,74 +113,84 @@ def scatter_echoes(
     ----------
     position_mm, strength : ndarray, shape (n, 3) and (n,)
         Scatterers in the medium.
-    vectors : float64, shape (v, 4)
-        Where each begins, x and y, and its direction, towards growing x from one to the next.
+    pitch_mm : float
+        Of the vectors, of which the first is at zero.
     image_from_medium : float64, shape (4, 4)
-    out : float32, shape (v, sample, nodes * 2)
+    out : float32, shape (vector, sample, nodes * 2)
         Real and imaginary parts in turn.
     """
-    field, reach, curvature_per_mm, grid = beam
+    rows, reach, reached_vectors, curvature_per_mm, grid = table
     first_depth_mm, sample_mm, cycles_per_mm = echoes
-    ny, nz, nx, parts = field.shape
-    row, plane = nx * parts, nz * nx * parts
-    flat, value = field.reshape(field.size), np.empty(2 * parts, np.float32)
-    t, one = image_from_medium, np.float32(1.0)
+    m = image_from_medium
+    ny, nz = reached_vectors.shape[0], reached_vectors.shape[1]
+    per_pitch = reach.shape[1]
+    vectors, samples, width = out.shape
+    far_mm = reach.shape[2] * pitch_mm
+    row = rows.shape[3]
+    cell = (per_pitch + 1) * row
+    plane = nz * cell
+    flat = rows.reshape(rows.size)
+    one = np.float32(1.0)
+    value = np.empty(rows.shape[3], dtype=np.float32)
     for j in range(position_mm.shape[0]):
         a, b, c = position_mm[j, 0], position_mm[j, 1], position_mm[j, 2]
-        z = t[2, 0] * a + t[2, 1] * b + t[2, 2] * c + t[2, 3]
+        z = m[2, 0] * a + m[2, 1] * b + m[2, 2] * c + m[2, 3]
         fz = abs(z) / grid[3]
         iz = int(fz)
-        if iz >= nz - 1:
+        y = m[1, 0] * a + m[1, 1] * b + m[1, 2] * c + m[1, 3]
+        fy = (y - grid[0]) / grid[1]
+        iy = int(np.floor(fy))
+        x = m[0, 0] * a + m[0, 1] * b + m[0, 2] * c + m[0, 3]
+        if iz >= nz - 1 or iy < 0 or iy >= ny - 1 or x <= -far_mm or x >= vectors * pitch_mm + far_mm:
             continue
-        x = t[0, 0] * a + t[0, 1] * b + t[0, 2] * c + t[0, 3]
-        y = t[1, 0] * a + t[1, 1] * b + t[1, 2] * c + t[1, 3]
-        wz = np.float32(fz - iz)
-        # The first vector that passes the scatterer on its right, by bisection.
-        left, right = 0, out.shape[0]
-        while left < right:
-            n = (left + right) // 2
-            if (x - vectors[n, 0]) * vectors[n, 3] > (y - vectors[n, 1]) * vectors[n, 2]:
-                left = n + 1
+        wy, wz = np.float32(fy - iy), np.float32(fz - iz)
+        part = fy - iy
+        kx = (1.0 - part) * curvature_per_mm[iy, 0] + part * curvature_per_mm[iy + 1, 0]
+        kz = (1.0 - part) * curvature_per_mm[iy, 1] + part * curvature_per_mm[iy + 1, 1]
+        axis_mm = y + kz * z * z
+        w00 = strength[j] * (one - wy) * (one - wz)
+        w01 = strength[j] * (one - wy) * wz
+        w10 = strength[j] * wy * (one - wz)
+        w11 = strength[j] * wy * wz
+        right = int(np.ceil(x / pitch_mm))
+        for side in range(2):
+            # From the scatterer to the right, its nearest vector included, then to the left.
+            nearest = right - side
+            turn = 1 - 2 * side
+            steps = turn * (nearest * pitch_mm - x) / grid[2]
+            r = min(int(steps), per_pitch - 1)
+            if side == 0:
+                first, last = max(0, -nearest), vectors - nearest
             else:
-                right = n
-        for turn in (-1, 1):
-            n = left - (turn < 0)
-            while 0 <= n < out.shape[0]:
-                dx, dy, sine, cosine = x - vectors[n, 0], y - vectors[n, 1], vectors[n, 2], vectors[n, 3]
-                line = out[n]
-                n += turn
-                depth_mm, across_mm = dx * sine + dy * cosine, abs(dx * cosine - dy * sine)
-                fy, fx = (depth_mm - grid[0]) / grid[1], across_mm / grid[2]
-                iy, ix = int(np.floor(fy)), int(fx)
-                if ix >= nx - 1:
-                    break
-                if iy < 0 or iy >= ny - 1 or iz >= reach[iy, ix]:
+                first, last = max(0, nearest - vectors + 1), nearest + 1
+            last = min(last, reached_vectors[iy, iz, r])
+            if first >= last:
+                continue
+            wx = np.float32(steps - r)
+            wl = one - wx
+            weights = (w00 * wl, w00 * wx, w01 * wl, w01 * wx, w10 * wl, w10 * wx, w11 * wl, w11 * wx)
+            b = ((iy * nz + iz) * (per_pitch + 1) + r) * row + first * width
+            corners = (b, b + cell, b + plane, b + plane + cell)
+            _interpolate(flat, row, corners, weights, value[first * width : last * width])
+            for n in range(first, last):
+                if iz >= reach[iy, r, n]:
                     continue
-                part = fy - iy
-                kx = (1.0 - part) * curvature_per_mm[iy, 0] + part * curvature_per_mm[iy + 1, 0]
-                kz = (1.0 - part) * curvature_per_mm[iy, 1] + part * curvature_per_mm[iy + 1, 1]
-                echo_mm = depth_mm + kz * z * z + kx * across_mm * across_mm
+                across_mm = (steps + n * per_pitch) * grid[2]
+                echo_mm = axis_mm + kx * across_mm * across_mm
                 at = (echo_mm - first_depth_mm) / sample_mm
                 sample = int(np.floor(at))
-                if sample < 0 or sample >= out.shape[1] - 1:
+                if sample < 0 or sample >= samples - 1:
                     continue
-                wy, wx, late = np.float32(part), np.float32(fx - ix), np.float32(at - sample)
-                w00, w01, w10, w11 = (one - wy) * (one - wz), (one - wy) * wz, wy * (one - wz), wy * wz
-                # Slices, not offsets: an index that may be negative keeps the compiler from using vector
-                # instructions.
-                corner = ((iy * nz + iz) * nx + ix) * parts
-                f00, f01 = flat[corner:][: 2 * parts], flat[corner + row :][: 2 * parts]
-                f10, f11 = flat[corner + plane :][: 2 * parts], flat[corner + plane + row :][: 2 * parts]
-                for q in range(2 * parts):
-                    value[q] = w00 * f00[q] + w01 * f01[q] + w10 * f10[q] + w11 * f11[q]
                 # The carrier's phase is exact; only the slow baseband is split between two samples.
-                carrier = strength[j] * _unit_phasor(cycles_per_mm * echo_mm)
-                for k in range(0, parts, 2):
-                    real = (one - wx) * value[k] + wx * value[parts + k]
-                    imaginary = (one - wx) * value[k + 1] + wx * value[parts + k + 1]
-                    re = carrier.real * real - carrier.imag * imaginary
-                    im = carrier.real * imaginary + carrier.imag * real
-                    line[sample, k] += (one - late) * re
-                    line[sample, k + 1] += (one - late) * im
-                    line[sample + 1, k] += late * re
-                    line[sample + 1, k + 1] += late * im
+                late = np.float32(at - sample)
+                early = one - late
+                carrier = _unit_phasor(cycles_per_mm * echo_mm)
+                line = out[nearest + turn * n]
+                for k in range(width // 2):
+                    q = n * width + 2 * k
+                    re = carrier.real * value[q] - carrier.imag * value[q + 1]
+                    im = carrier.real * value[q + 1] + carrier.imag * value[q]
+                    line[sample, 2 * k] += early * re
+                    line[sample, 2 * k + 1] += early * im
+                    line[sample + 1, 2 * k] += late * re
+                    line[sample + 1, 2 * k + 1] += late * im

@@ -149,7 +149,7 @@ def _two_way_fields(
     off_mm = np.sqrt(_OFF_AXIS) * probe.transmit_mm / 2.0
     distance = np.append(depth_mm, np.hypot(depth_mm, off_mm)) if off_mm else depth_mm
     parts = np.empty((distance.size, frequency_hz.size, z.size, 2))
-    spread = z, strip, delay, wavenumber, np.ones(distance.size), 1
+    spread = z, strip, delay, wavenumber, 1
     in_parallel(lambda first, stop: lens_fields(distance, *spread, first, stop, parts), distance.size)
     one_way = parts.view(complex)[..., 0]
     half = one_way[: depth_mm.size] * one_way[-depth_mm.size :]

@@ -11,7 +11,7 @@ import numpy as np
 from speckle3d.core.arrays import Complex64Array, ComplexArray, FloatArray, IntArray
 from speckle3d.core.sweep import RFSettings
 from speckle3d.kernels.diffraction import lens_fields
-from speckle3d.kernels.scatter import BeamField
+from speckle3d.kernels.scatter import FieldTable, field_table
 
 _NEPER_PER_DB = np.log(10.0) / 20.0
 
@@ -113,14 +113,12 @@ class BeamTable:
     curvature_per_mm: FloatArray
 
     depth_mm: ClassVar[FloatArray] = _DEPTH_MM
-    elevation_mm: ClassVar[FloatArray] = _ELEVATION_MM
 
     @cached_property
-    def field(self) -> BeamField:
+    def field(self) -> FieldTable:
         """The beam as `speckle3d.kernels.scatter` reads it."""
         steps = np.array([_DEPTH_MM[0], np.ptp(_DEPTH_MM[:2]), self.lateral_mm[1], _ELEVATION_MM[1]])
-        field = np.ascontiguousarray(self.residual.swapaxes(1, 2)).view(np.float32)
-        return BeamField(field, self.reach, self.curvature_per_mm, steps)
+        return field_table(self.residual, self.reach, self.curvature_per_mm, steps, _PER_PITCH)
 
     @property
     def lateral_extent_mm(self) -> float:
@@ -130,12 +128,12 @@ class BeamTable:
     @property
     def elevation_extent_mm(self) -> FloatArray:
         """Largest distance from the image plane at which the field is above the floor, at each depth."""
-        return np.asarray(self.reach.max(axis=1) * self.elevation_mm[1])
+        return np.asarray(self.reach.max(axis=1) * _ELEVATION_MM[1])
 
     def spectra(self, frequency_hz: FloatArray) -> ComplexArray:
         """Two-way pulse spectrum of each component, shape (component, frequency)."""
-        hats = np.stack([np.interp(frequency_hz, _NODES_HZ, row) for row in np.eye(_NODES_HZ.size)])
-        return np.asarray(self.components @ hats * self.probe.spectrum(frequency_hz))
+        rows = np.stack([np.interp(frequency_hz, _NODES_HZ, row) for row in self.components])
+        return np.asarray(rows * self.probe.spectrum(frequency_hz))
 
     def echo_power(self, frequency_hz: FloatArray) -> FloatArray:
         """Mean square RF at each depth from unit strength at one scatterer per mm^3.
@@ -146,11 +144,10 @@ class BeamTable:
         spectra = self.spectra(frequency_hz)
         df = frequency_hz[1] - frequency_hz[0]
         gram = 2.0 * spectra @ spectra.conj().T * df / self.probe.sampling_rate_hz
-        inside = np.arange(self.elevation_mm.size) < self.reach[:, :, None]
-        field = self.residual * inside[..., None]
+        field = self.residual * (np.arange(_ELEVATION_MM.size) < self.reach[:, :, None])[..., None]
         # Both mirror halves count, the axis once.
-        sides = np.outer(*(np.where(at > 0.0, 2.0, 1.0) for at in (self.lateral_mm, self.elevation_mm)))
-        cell_mm2 = self.lateral_mm[1] * self.elevation_mm[1]
+        sides = np.outer(*(np.where(at > 0.0, 2.0, 1.0) for at in (self.lateral_mm, _ELEVATION_MM)))
+        cell_mm2 = self.lateral_mm[1] * _ELEVATION_MM[1]
         power = np.einsum("yxzk,kl,yxzl,xz->y", field, gram, field.conj(), sides, optimize=True).real
         return np.asarray(power * cell_mm2 * self.probe.signal.sample_spacing_mm)
 
@@ -173,7 +170,7 @@ def tabulate_beam(probe: Probe = Probe(), attenuation_db_cm_mhz: float = 0.0) ->
     .. [1] J. W. Goodman, "Introduction to Fourier Optics", first Rayleigh-Sommerfeld solution.
     """
     step = probe.pitch_mm / _PER_PITCH
-    lateral = np.arange(round(_LATERAL_REACH_MM / step) + 1, dtype=np.float64) * step
+    lateral = step * np.arange(round(_LATERAL_REACH_MM / step) + 1, dtype=float)
     wavenumbers = 2e-3 * np.pi * _NODES_HZ / probe.speed_of_sound_m_s
     field = _sum_sources(probe, lateral, wavenumbers)
     neper = attenuation_db_cm_mhz * _NEPER_PER_DB * 1e-7 * _NODES_HZ
@@ -183,27 +180,25 @@ def tabulate_beam(probe: Probe = Probe(), attenuation_db_cm_mhz: float = 0.0) ->
     middle, double = field[..., _NODES_HZ.size // 2], 2.0 * wavenumbers[_NODES_HZ.size // 2]
     kx = np.array([_parabola(row, lateral, double) for row in middle[:, :, 0]])
     kz = np.array([_parabola(row, _ELEVATION_MM, double) for row in middle[:, 0, :]])
-    echo = _DEPTH_MM[:, None, None] + kx[:, None, None] * lateral[:, None] ** 2
-    echo = echo + kz[:, None, None] * _ELEVATION_MM**2
+    depth, bend_x, bend_z = (values[:, None, None] for values in (_DEPTH_MM, kx, kz))
+    echo = depth + bend_x * lateral[:, None] ** 2 + bend_z * _ELEVATION_MM**2
     reach = _reach(np.abs(field).max(axis=-1), 10.0 ** (_FLOOR_DB / 20.0))
     field *= np.exp(2j * echo[..., None] * wavenumbers)
     residual, components = _compress(field, probe.spectrum(_NODES_HZ))
-    curvature = np.stack([kx, kz], axis=1)
-    return BeamTable(probe, lateral, residual, components, reach, curvature)
+    return BeamTable(probe, lateral, residual, components, reach, np.stack([kx, kz], axis=1))
 
 
 def _sum_sources(probe: Probe, lateral: FloatArray, wavenumbers: FloatArray) -> ComplexArray:
     """Two-way field, shape (depth, lateral, elevation, node)."""
     depth, step = _DEPTH_MM, probe.pitch_mm / _PER_PITCH
     widest = int(max(probe.transmit_elements, probe.receive_elements)) | 1
-    element = (np.arange(widest) - widest // 2) * probe.pitch_mm
-    across = np.repeat(element, _PER_PITCH)
-    half = np.full(depth.size, probe.transmit_elements * probe.pitch_mm / 2.0)
-    transmit = _focused(probe, across, half, np.full(depth.size, probe.transmit_focus_mm), wavenumbers)
+    across = np.repeat((np.arange(widest) - widest // 2) * probe.pitch_mm, _PER_PITCH)
+    sent_mm, most_mm = probe.transmit_elements * probe.pitch_mm, probe.receive_elements * probe.pitch_mm
+    still = np.ones(depth.size)
+    transmit = _focused(probe, across, sent_mm * still, probe.transmit_focus_mm * still, wavenumbers)
     # The dynamic receive aperture has at least four elements.
-    widest_mm = probe.receive_elements * probe.pitch_mm
-    half = np.clip(depth / probe.receive_f_number, 4 * probe.pitch_mm, widest_mm) / 2.0
-    receive = _focused(probe, across, half, depth, wavenumbers)
+    width = np.clip(depth / probe.receive_f_number, 4 * probe.pitch_mm, most_mm)
+    receive = _focused(probe, across, width, depth, wavenumbers)
     # Sources lie half a step off the lateral grid: from each of its places two are each distance away.
     place, away = np.arange(lateral.size)[:, None], np.arange(lateral.size + across.size // 2)
     sources = place + across.size // 2 + away.size + np.stack([away, -1 - away])[:, None]
@@ -217,21 +212,20 @@ def _sum_sources(probe: Probe, lateral: FloatArray, wavenumbers: FloatArray) -> 
     for iy in range(depth.size):
         distance = np.hypot(depth[iy], (away + 0.5) * step)
         # Obliquity depth / r and spreading 1 / r of a source in a pressure-release plane.
-        weight = np.full(away.size, depth[iy])
-        lens_fields(distance, _ELEVATION_MM, strip, lens, wavenumbers, weight, 2, 0, away.size, line)
-        field = line.view(complex)[..., 0].swapaxes(0, 1)
+        lens_fields(distance, _ELEVATION_MM, strip, lens, wavenumbers, 2, 0, away.size, line)
+        field = depth[iy] * line.view(complex)[..., 0].swapaxes(0, 1)
         transmission, reception = (way[iy][:, sources].sum(axis=1) @ field for way in ways)
         out[iy] = np.moveaxis(transmission * reception, 0, -1)
     return out
 
 
 def _focused(
-    probe: Probe, element: FloatArray, half_width: FloatArray, focus: FloatArray, wavenumbers: FloatArray
+    probe: Probe, element: FloatArray, width: FloatArray, focus: FloatArray, wavenumbers: FloatArray
 ) -> ComplexArray:
     """Weights and focusing phases of the sources, shape (depth, node, source)."""
-    across = element / half_width[:, None]
-    cosine = probe.edge_weight + (1.0 - probe.edge_weight) * np.cos(np.pi / 2.0 * across) ** 2
-    weight = np.where(np.abs(across) <= 1.0, cosine, 0.0)
+    across = element / width[:, None]
+    cosine = probe.edge_weight + (1.0 - probe.edge_weight) * np.cos(np.pi * across) ** 2
+    weight = np.where(np.abs(across) <= 0.5, cosine, 0.0)
     path = focus[:, None] - np.hypot(focus[:, None], element)
     return np.asarray(weight[:, None] * np.exp(-1j * path[:, None] * wavenumbers[:, None]))
 

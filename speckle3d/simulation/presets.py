@@ -155,7 +155,7 @@ def _sweep(
     sweep = Sweep(rf, image, probe.signal, times, orientation, tracker, world * poses, name=name)
     if settings.signal != "rf":
         range_db = settings.dynamic_range_db if settings.signal == "bmode" else None
-        sweep = received(sweep, range_db, settings.demodulation_frequency_hz, settings.decimation)
+        sweep = received(sweep, range_db, decimation=settings.decimation)
     return SimulatedSweep(sweep, settings)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar
@@ -9,7 +10,7 @@ from typing import Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 from scipy.fft import fft, irfft, next_fast_len
-from scipy.spatial.transform import RigidTransform
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import Complex64Array, Float32Array, FloatArray, IntArray
 from speckle3d.core.grid import ImageGrid
@@ -88,24 +89,30 @@ class SimulatedFrames:
         out = np.zeros((image.vectors, self._length, len(self.beam.components)), np.complex64)
         carrier = 2e-3 * float(self._frequency_hz[self._carrier_bin]) / probe.speed_of_sound_m_s
         grid = EchoGrid(image.first_sample_depth_mm, image.sample_spacing_mm, carrier)
-        number = np.arange(image.vectors)
-        face, angle = image.mm(number, -grid.first_depth_mm / grid.sample_mm), image.angle_rad(number)
-        vectors = np.column_stack([face, np.sin(angle), np.cos(angle)])
-        image_from_medium = self.medium_from_image[index].inv().as_matrix()
-        for block in self.medium.scatterers(self.medium_from_image[index], self._box):
-            scatter_echoes(*block, vectors, image_from_medium, self.beam.field, grid, out.view(np.float32))
+        for medium_from_array, array in self._arrays(index, out.view(np.float32)):
+            pose = medium_from_array.inv().as_matrix()
+            for block in self.medium.scatterers(medium_from_array, self._box):
+                scatter_echoes(*block, probe.pitch_mm, pose, self.beam.field, grid, array)
         return out
+
+    def _arrays(self, index: int, echoes: Float32Array) -> Iterator[tuple[RigidTransform, Float32Array]]:
+        """Place in the medium, and echoes, of parallel vectors; of a fan's, each of which is an array."""
+        image, medium_from_image = self.image, self.medium_from_image[index]
+        if image.fan is None:
+            yield medium_from_image, echoes
+            return
+        number, depth_zero = np.arange(image.vectors), -image.first_sample_depth_mm / image.sample_spacing_mm
+        faces = np.pad(image.mm(number, depth_zero), ((0, 0), (0, 1)))
+        for n, (face, angle) in enumerate(zip(faces, image.angle_rad(number), strict=True)):
+            turn = Rotation.from_rotvec([0.0, 0.0, -angle])
+            yield medium_from_image * RigidTransform.from_components(face, turn), echoes[n : n + 1]
 
     @cached_property
     def _box(self) -> Box:
-        """Opposite corners of what the beam reaches, in the image."""
+        """Opposite corners of what the beam reaches, in the frame of an array."""
         margin, thick = self.beam.lateral_extent_mm, self.beam.elevation_extent_mm.max()
-        depth, fan = self.beam.depth_mm, self.image.fan
-        low = np.array([-margin, depth[0], -thick])
-        high = np.array([self.image.width_mm + margin, depth[-1], thick])
-        if fan is not None:
-            low[1], high[1] = -margin, fan.apex_mm[1] + fan.radius_mm + depth[-1]
-        return low, high
+        depth, width_mm = self.beam.depth_mm, self.image.width_mm if self.image.fan is None else 0.0
+        return np.array([-margin, depth[0], -thick]), np.array([width_mm + margin, depth[-1], thick])
 
     @cached_property
     def _length(self) -> int:

@@ -68,9 +68,6 @@ class SimulationSettings(BaseModel):
         1.0, ge=0, le=10, description="plane, wires: factor on the noise of both sensors; 0: exact ones."
     )
     signal: Signal = Field("rf", description="Echoes as they come, their I/Q, or 8-bit grey levels.")
-    demodulation_frequency_hz: float | None = Field(
-        None, gt=0, description="iq: what the echoes are shifted down by; by default their centre frequency."
-    )
     decimation: int | None = Field(
         None,
         ge=1,

@@ -69,7 +69,7 @@ def without_curves(tracking):
     """Claims without what the curves' common error adds to the distance."""
     covariance = tracking.covariance.copy()
     z = tracking.image.apply(tracking.grid.centre_mm)[:, 2]
-    covariance[:, 2, 2] -= (tracking.curves_sigma * (z - z[0])) ** 2
+    covariance[:, 2, 2] -= (tracking.shared.curves_sigma * (z - z[0])) ** 2
     return replace(tracking, covariance=covariance)
 
 

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from speckle3d.kernels.scatter import BeamField, EchoGrid, scatter_echoes
+from speckle3d.kernels.scatter import EchoGrid, field_table, scatter_echoes
 
 
 def random_beam(rng):
@@ -20,7 +20,7 @@ def random_beam(rng):
 @given(seed=st.integers(0, 2**32 - 1))
 def test_echoes_match_every_scatterer_for_every_vector(seed):
     rng = np.random.default_rng(seed)
-    (residual, *rest), vector_mm = random_beam(rng), np.array([0.0, 0.3, 0.6])
+    beam, vector_mm = random_beam(rng), np.array([0.0, 0.3, 0.6])
     position = rng.uniform([-1.0, 0.5, -1.0], [1.6, 4.0, 1.0], (60, 3))
     # All but on a vector, left and right of it, and beyond the first and the last.
     position[:4, 0] = 0.3 - 1e-9, 0.3 + 1e-9, -0.41, 1.01
@@ -29,13 +29,16 @@ def test_echoes_match_every_scatterer_for_every_vector(seed):
     image_from_medium = RigidTransform.from_components(rng.uniform(-9.0, 9.0, 3), turn)
     medium_mm = image_from_medium.inv().apply(position)
     out = np.zeros((3, 400, 6), np.float32)
-    # Of parallel vectors: where they begin, and straight down.
-    vectors = np.pad(vector_mm[:, None], ((0, 0), (0, 3)))
-    vectors[:, 3] = 1.0
-    field = np.ascontiguousarray(residual.swapaxes(1, 2)).view(np.float32)
-    echoes, pose = EchoGrid(0.0, 0.0115, 9.7), image_from_medium.as_matrix()
-    scatter_echoes(medium_mm, strength, vectors, pose, BeamField(field, *rest), echoes, out)
-    twin = oracles.scatter_echoes(position, strength, vector_mm, residual, *rest, 0.0115, 9.7, (3, 400, 3))
+    scatter_echoes(
+        medium_mm,
+        strength,
+        0.3,
+        image_from_medium.as_matrix(),
+        field_table(*beam, 3),
+        EchoGrid(0.0, 0.0115, 9.7),
+        out,
+    )
+    twin = oracles.scatter_echoes(position, strength, vector_mm, *beam, 0.0115, 9.7, (3, 400, 3))
     np.testing.assert_allclose(
         out.view(np.complex64), twin, atol=2e-5
     )  # single precision, values of order one

@@ -85,7 +85,7 @@ def test_a_second_start_does_nothing_again_but_what_is_missing(study, sweeps, tm
     again = compare_sweeps(sweeps, tmp_path / "again")
     assert [outcome.is_old for outcome in again.outcomes] == [False, False, True]
     assert numbers(again.directory) == before
-    settings = Config().with_choices(consistent_subset=False, drift_curves=None)
+    settings = Config(sensors={"consistent_subset": False})
     third = compare_sweeps(sweeps[:1], tmp_path / "again", config=settings)
     assert not third.outcomes[0].is_old
     assert read_study(tmp_path / "again")["modes"] == ["image", "orientation", "pose", "fused", "tracker"]
