@@ -10,7 +10,7 @@ from typing import Any
 
 import h5py
 
-from speckle3d.core.errors import FileError, InvalidInputError, Speckle3DError, naming
+from speckle3d.core.errors import FileError, InvalidInputError, naming
 from speckle3d.core.files import PathLike
 from speckle3d.core.printable import written_path
 from speckle3d.core.reconstruction import ImportRecord
@@ -18,7 +18,7 @@ from speckle3d.core.sweep import Sweep
 from speckle3d.io import sweeps
 from speckle3d.io.formats import challenge
 from speckle3d.io.formats.challenge import Landmarks
-from speckle3d.io.hdf5 import file_format, one_line, sha256_of
+from speckle3d.io.hdf5 import file_format, reading, sha256_of
 from speckle3d.io.images.metaimage import READER as _IMAGES
 from speckle3d.io.import_settings import ImportSettings, settings_file, settings_for
 from speckle3d.io.readers import Reader, claim, find_reader, first_bytes, readers
@@ -88,13 +88,8 @@ def recording_of(reader: Reader, source: Any, settings: ImportSettings, path: Pa
         raise InvalidInputError(
             f"{file}: expected none beside a {reader.format}, which says all itself: it would not be read"
         )
-    try:
-        with naming(str(path)):
-            recording = _read(reader, source, settings, path)
-    except Speckle3DError:
-        raise
-    except (OSError, RuntimeError, MemoryError) as error:  # of damage where nothing else is asked for
-        raise FileError(f"{path}: cannot be read: {one_line(error)}") from error
+    with reading(path), naming(str(path)):
+        recording = _read(reader, source, settings, path)
     return recording if isinstance(recording, Recording) else Recording(path, settings, ready=recording)
 
 

@@ -156,7 +156,7 @@ class Recording:
         assumptions = [
             " ".join(number_row(name, value.value))
             for name, value in self.numbers.items()
-            if value.is_assumption and getattr(self.settings, name) is None
+            if value.is_assumption and name not in self._options
         ]
         assumptions += self.assumptions
         words = [f"assumed, as the file does not say: {', '.join(assumptions)}"] if assumptions else []
@@ -178,7 +178,7 @@ class Recording:
 
     def _number(self, name: str) -> tuple[Row, str]:
         """Row of a number; and a line where it is given and the recording says another, by more than 1 %."""
-        value, setting = self.numbers[name], getattr(self.settings, name)
+        value, setting = self.numbers[name], self._options.get(name)
         words, number, unit = number_row(name, () if value.value is None else value.value)
         source = f" ({value.source})" if value.source else ""
         if setting is None:
@@ -199,15 +199,14 @@ class Recording:
         if self.frames is None:
             return {}
         dtype = np.dtype(self.frames.dtype)
-        names_given = {*self.values, *(name for name, value in self.settings if value is not None)}
-        is_grey, is_fan = dtype == np.uint8, not names_given.isdisjoint(_SPREADING)
+        is_grey, is_fan = dtype == np.uint8, not {*self.values, *self._options}.isdisjoint(_SPREADING)
         pitch = "column_pitch_mm" if is_grey else "vector_pitch_mm"
         names = ["first_sample_depth_mm", *(_SPREADING if is_fan else [pitch])]
         names += ["row_spacing_mm", "dynamic_range_db"] if is_grey else ["speed_of_sound_m_s", *_RATES]
         if dtype.kind == "c":
             names.append("demodulation_frequency_hz")
         values, times = self._file_values, self._frame_times[0]
-        if self.settings.frame_rate_hz is not None or (times is None and self.frames.shape[0] > 1):
+        if "frame_rate_hz" in self._options or (times is None and self.frames.shape[0] > 1):
             names.append("frame_rate_hz")
         if times is not None:
             values.setdefault("frame_rate_hz", Value(rate_of(times), "of its times"))
@@ -215,6 +214,11 @@ class Recording:
             source = f"{_ASSUMPTION}, +- {self._range[1]:.1f} by its speckle"
             values["dynamic_range_db"] = Value(round(self._range[0], 1), source)
         return {name: values[name] for name in names}
+
+    @cached_property
+    def _options(self) -> dict[str, Any]:
+        """Settings that are given."""
+        return {name: value for name, value in self.settings if value is not None}
 
     @cached_property
     def _file_values(self) -> defaultdict[str, Value]:
@@ -228,10 +232,10 @@ class Recording:
     @cached_property
     def _range(self) -> tuple[float, float] | None:
         """Dynamic range by the images' speckle where nobody gives it, and its standard deviation, dB."""
-        if self.settings.dynamic_range_db is not None:
+        if "dynamic_range_db" in self._options:
             return None
         pitch_mm, spacing_mm = (
-            getattr(self.settings, name) or self._file_values[name].value or USUAL_PIXEL_MM
+            self._options.get(name) or self._file_values[name].value or USUAL_PIXEL_MM
             for name in ("column_pitch_mm", "row_spacing_mm")
         )
         return estimate_dynamic_range(self._images, pitch_mm, spacing_mm, self.full_scale)
@@ -273,8 +277,7 @@ class Recording:
             shape = None if self.frames is None else (rows.size, *self.frames.shape[1:])
             raise InvalidInputError(f"{self.path}: expected frames, got shape {shape}")
         frames = self._images
-        values = {name: value.value for name, value in self.numbers.items()}
-        values |= {name: number for name, number in self.settings if name in values and number is not None}
+        values = {name: self._options.get(name, value.value) for name, value in self.numbers.items()}
         lacks = {self.substitutes.get(name, name): None for name, number in values.items() if number is None}
         if lacks:
             raise MissingSettingsError(self.path, tuple(lacks))

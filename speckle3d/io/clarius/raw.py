@@ -52,8 +52,7 @@ def open_raw(member: Member, yml: Description) -> AnyArray:
             f"{member.where}: header: expected frames, lines, samples and bytes of a sample of {yml.kind} "
             f"as in the yml, {expected}, got {header}"
         )
-    with reading(member.where):  # of more samples than memory has places for
-        record = np.dtype([("time", "<u8"), ("samples", dtype, (*size, parts))])
+    record = np.dtype([("time", "<u8"), ("samples", dtype, (*size, parts))])
     whole = (len(content) - HEADER.size) // record.itemsize
     if whole < yml.frames:
         raise FileError(f"{member.where}: ends early: {whole} of {yml.frames} frames")

@@ -277,8 +277,8 @@ class _Sequence:
             values |= {f"{'vector' if layout.is_rf else 'column'}_pitch_mm": across, "row_spacing_mm": down}
         elif width_mm is not None:
             values["vector_pitch_mm"] = scan(width_mm[0] / vectors)
-        own = {name: number for name, number in self.own_values.items() if "_" in name}
-        return values | {name: Value(number, "as this package wrote it") for name, number in own.items()}
+        own = {name: Value(number, "as this package wrote it") for name, number in self.own_values.items()}
+        return values | own
 
     @cached_property
     def frame_layout(self) -> Layout:
