@@ -100,16 +100,16 @@ def timed_poses(
 
 def rigid(matrices: FloatArray) -> tuple[FloatArray, list[str]]:
     """Make rounded rotations exact; a matrix farther off becomes the identity, with the reason."""
-    r, is_finite = matrices[:, :3, :3], np.isfinite(matrices).all(axis=(1, 2))
+    r, is_near = matrices[:, :3, :3], (np.abs(matrices) < _FARTHEST_MM).all(axis=(1, 2))
     with np.errstate(over="ignore", invalid="ignore"):
         gram = np.abs(r.transpose(0, 2, 1) @ r - np.eye(3)).max(axis=(1, 2))
         bottom = np.abs(matrices[:, 3] - [0.0, 0.0, 0.0, 1.0]).max(axis=1)
         is_proper = np.linalg.det(r) > 0
-    near = is_finite & is_proper & (np.maximum(gram, bottom) < ROUNDING_TOLERANCE)
+    near = is_near & is_proper & (np.maximum(gram, bottom) < ROUNDING_TOLERANCE)
     exact = np.tile(np.eye(4), (len(r), 1, 1))
     exact[near, :3, 3] = matrices[near, :3, 3]
     exact[near, :3, :3] = nearest_rotation(r[near])
-    reasons = np.where(is_finite, np.where(near, "", "whose pose is not rigid"), "whose pose is not finite")
+    reasons = np.where(near, "", np.where(is_near, "whose pose is not rigid", "whose pose is not within 100 m"))
     return exact, reasons.tolist()
 
 
@@ -174,9 +174,8 @@ def _without_jumps(readings: TimedPoses) -> tuple[TimedPoses, list[str]]:
     jumps = numbers[1:][is_jump(numbers[:-1], numbers[1:])]
     if not jumps.size:
         return readings, []
-    # Places of a lost tool count for nothing: the identity, one far away, one again and again.
+    # Places of a lost tool count for nothing: the identity, one again and again.
     is_lost = (poses.as_matrix() == np.eye(4)).all(axis=(1, 2))
-    is_lost |= np.abs(poses.translation).max(axis=1) > _FARTHEST_MM
     places = np.unique(poses.as_matrix(), axis=0, return_inverse=True)[1].ravel()
     pieces = np.split(numbers, jumps)
     constants = Counter(places[piece[0]] for piece in pieces if np.ptp(places[piece]) == 0)
