@@ -60,12 +60,6 @@ class CurveKey:
     array_radius_mm: float = 0.0
     line_step_rad: float = 0.0
 
-    def __post_init__(self) -> None:
-        if self.correlation_of not in ("echo", "intensity"):
-            raise InvalidInputError(
-                f"correlation_of: expected 'echo' or 'intensity', got {self.correlation_of!r}"
-            )
-
     def require_same(self, other: CurveKey, what: str = "the curves do not match the sweep") -> None:
         """Raise `MismatchError` naming the first setting in which `other` (a sweep's key) differs."""
         mine, others = _settings(self), _settings(other)

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import signal as filters
 
-from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.errors import naming
 from speckle3d.core.sweep import BModeSettings, Frames, RFSettings, Sweep
 from speckle3d.simulation.scan import SPECKLE_RMS_COUNTS
 
@@ -19,8 +19,8 @@ _GUARD = 0.1
 _WHITE_DB = 20.0
 """Full white over the mean of fully developed speckle."""
 
-_ROOM, _LEAST_ROOM = 1.25, 1.05
-"""Sampling rate of I/Q over the width that they keep: by default at least, and the least."""
+_ROOM = 1.25
+"""Sampling rate of I/Q over the width that they keep, by default at least."""
 
 _WINDOW = ("kaiser", 8.0)
 """Of the low-pass before decimation: what folds into the band is 80 dB down."""
@@ -107,14 +107,10 @@ def received(
     (low, high), rate_hz = rf.bandwidth_hz, rf.sampling_rate_hz
     frequency_hz = frequency_hz or rf.centre_frequency_hz
     width_hz = 2 * (max(high - frequency_hz, frequency_hz - low) + _GUARD * (high - low))
-    most = int(rate_hz / (_LEAST_ROOM * width_hz))
     usual = max(1, int(rate_hz / (_ROOM * width_hz))) if dynamic_range_db is None else _GREY_DECIMATION
     every = decimation or usual
-    if not 1 <= every <= most:
-        raise InvalidInputError(
-            f"decimation: expected 1 to {most} for the band about {frequency_hz:g} Hz, got {every}"
-        )
-    signal = replace(rf, sampling_rate_hz=rate_hz / every, demodulation_frequency_hz=frequency_hz)
+    with naming(f"decimation by {every}"):
+        signal = replace(rf, sampling_rate_hz=rate_hz / every, demodulation_frequency_hz=frequency_hz)
     frames = ReceivedFrames(sweep.frames, frequency_hz / rate_hz, every, dynamic_range_db)
     return replace(
         sweep,
