@@ -33,14 +33,6 @@ class FanLines:
     first_rad: float
     step_rad: float
 
-    def __post_init__(self) -> None:
-        numbers = (*self.apex_mm, self.radius_mm, self.first_rad, self.step_rad)
-        if not (np.isfinite(numbers).all() and self.radius_mm >= 0 and self.step_rad > 0):
-            raise InvalidInputError(
-                "fan: expected a finite apex, a radius of zero or more and a step above zero, got "
-                f"{self.apex_mm}, {self.radius_mm}, {self.step_rad}"
-            )
-
 
 @dataclass(frozen=True)
 class ImageGrid:
@@ -74,14 +66,16 @@ class ImageGrid:
         require_positive(self, ("vectors", "samples", "vector_pitch_mm", "sample_spacing_mm"))
         if not np.isfinite([self.first_sample_depth_mm, self.first_vector_mm]).all():
             raise InvalidInputError("first_sample_depth_mm, first_vector_mm: expected finite values")
-        if self.fan is not None and (
-            abs(self.angle_rad([0, self.vectors - 1])).max() > np.pi / 2
-            or self.fan.radius_mm + self.first_sample_depth_mm < 0
+        fan = self.fan
+        if fan is not None and not (
+            np.isfinite([*fan.apex_mm, fan.radius_mm]).all()
+            and fan.radius_mm >= max(0.0, -self.first_sample_depth_mm)
+            and fan.step_rad > 0
+            and np.abs(self.angle_rad([0, self.vectors - 1])).max() <= np.pi / 2
         ):
             raise InvalidInputError(
-                "fan: expected lines within 90 degrees of straight down and samples beyond the apex, got "
-                f"{self.vectors} lines from {np.rad2deg(self.fan.first_rad):.1f} degrees, "
-                f"{np.rad2deg(self.fan.step_rad):.3g} apart"
+                "fan: expected a finite apex, samples beyond it, and lines apart from each other within 90 "
+                f"degrees of straight down, got {self.vectors} lines of {fan}"
             )
 
     @classmethod
