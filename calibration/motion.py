@@ -142,8 +142,8 @@ def judge(solution: Solution) -> Adequacy:
     # Dots of wires tell the image's place from a few frames; what they lack is in their errors.
     limit = _LIMIT_LACKING if lacking and not dots else 1.0
     # Of a plane always equally deep, errors in the poses shrink free pixels, more than any error claimed.
-    no_size = solution.phantom.seen_as == "line" and solution.prior is None and "s_x" in solution.free
-    no_size &= UP_AND_DOWN in lacking
+    no_size = not dots and UP_AND_DOWN in lacking and "s_x" in solution.free
+    no_size &= solution.prior.known_pixel_mm is None
     inadequate = bool(excess > limit or not condition <= MAX_CONDITION or ambiguous or no_size)
     noisy = rms > usual and not lacking
     missing = tuple(lacking) if weak or inadequate else ()
@@ -201,7 +201,7 @@ def extents(solution: Solution) -> dict[str, float]:
     up = points.turns.transpose(0, 2, 1) @ solution.chain.target[2, :3]
     middle = up.mean(axis=0) / np.linalg.norm(up.mean(axis=0))
     swing = float(np.sum((up - np.outer(up @ middle, middle)).var(axis=0)))
-    if solution.prior is not None:
+    if solution.prior.known_pixel_mm is not None:
         size = solution.prior.pixel_mm
     elif "s_x" in solution.free and not 1.0 / OBLONG < size[0] / size[1] < OBLONG:
         size = np.full(2, size[1])
@@ -228,14 +228,11 @@ def extents(solution: Solution) -> dict[str, float]:
 
 def _independent_covariance(solution: Solution) -> FloatArray:
     """Covariance of `CHAIN` if errors are independent, as large as detection's, and answers plausible."""
-    size = solution.chain.pixel_mm * _UNKNOWN
-    if solution.prior is not None:
-        size = solution.prior.pixel_mm * solution.prior.error
-    widths = dict(zip(("s_x", "s_y"), size, strict=True))
-    before = [widths.get(name, _UNKNOWN_MM if name[0] in "xyz" else _UNKNOWN_RAD) for name in solution.free]
-    sigma = max(solution.sigma, _LEAST_SIGMA[int(solution.angular)])
-    information = solution.jacobian.T @ solution.jacobian / sigma**2 + np.diag(np.array(before) ** -2.0)
-    columns = columns_of(solution.free)
+    widths = dict(zip(SCALES, solution.chain.pixel_mm * _UNKNOWN, strict=True))
+    before = np.array([widths.get(name, _UNKNOWN_MM if name[0] in "xyz" else _UNKNOWN_RAD) for name in CHAIN])
+    before = np.minimum(before, solution.prior.sigma)
+    sigma, columns = max(solution.sigma, _LEAST_SIGMA[int(solution.angular)]), columns_of(solution.free)
+    information = solution.jacobian.T @ solution.jacobian / sigma**2 + np.diag(before[columns] ** -2.0)
     full = np.zeros((len(CHAIN), len(CHAIN)))
     full[np.ix_(columns, columns)] = np.linalg.inv(information)
     return full

@@ -31,7 +31,8 @@ from speckle3d.core.threads import ahead
 from speckle3d.kernels.wander import innovations
 
 if TYPE_CHECKING:
-    from calibration.plane import Chain, Equations, PixelPrior
+    from calibration.plane import Chain, Equations
+    from calibration.solution import Prior
 
 WANDER = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
 """Sizes tried: root mean square effect of the wandering error over the white noise of a residual."""
@@ -209,7 +210,7 @@ def fit_noise(
     chain: Chain,
     free: Sequence[str],
     seen_as: SeenAs,
-    prior: PixelPrior | None = None,
+    prior: Prior,
     slopes: FloatArray | None = None,
 ) -> tuple[Chain, FloatArray, FloatArray]:
     """Go from a least-squares solution to the one that knows that the sensor's errors wander.
@@ -219,7 +220,7 @@ def fit_noise(
     equations : Equations
         Without outliers, frames ascending.
     free : sequence of str, length p
-        The parameters estimated; `SCALES` first where the prior says something of them.
+        The parameters estimated.
     slopes : ndarray, shape (n r, k), optional
         Derivatives of the residuals by further parameters, which are zero so far.
 
@@ -250,10 +251,8 @@ def fit_noise(
         residuals = values.ravel() + expected + further_slopes @ further
         jacobian = np.hstack([derivatives.reshape(len(further_slopes), -1)[:, columns], further_slopes])
         effects = sensor_effects(exact, chain).reshape(len(further_slopes), 6) @ axes.T
-        certainty, excess = np.zeros((2, count + len(further)))
-        if prior is not None:
-            certainty[:2] = (prior.pixel_mm * prior.error) ** -2.0
-            excess[:2] = chain.pixel_mm - prior.pixel_mm
+        known = prior.sigma[columns] ** -2.0, prior.displacement(chain)[columns]
+        certainty, excess = (np.append(values, 0.0 * further) for values in known)
         frames = starts, frame_time_s
         noise, grid = fit_wandering(jacobian, residuals, effects, *frames, grid, certainty, excess)
         residuals += jacobian @ noise.step

@@ -27,7 +27,7 @@ from calibration.motion import OBLONG, require_adequate
 from calibration.points import ANGLES, CHAIN, SOME_FRAMES, ImagePoints, SeenAs, as_directions, columns_of
 from calibration.robust import absolute_weights, robust_linear
 from calibration.settings import PlaneFit
-from calibration.solution import Problem, Solution, are_distinct
+from calibration.solution import UNKNOWN, Prior, Problem, Solution, are_distinct
 from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.geometry import nearest_rotation, roll_yaw_tilt
@@ -44,8 +44,6 @@ _HOPELESS = 3.0
 """Ends whose mean absolute residual is as many times the least are not looked at again."""
 _TINY = 1e-12
 """Of a normal matrix's diagonal, where residuals do not depend on a parameter at all."""
-_CONTRADICTS = 3.0
-"""Standard errors by which lines must move a pixel size given for it to be doubted."""
 _HALF_TURN_Z, _HALF_TURN_X = np.diag([-1.0, -1.0, 1.0, 1.0]), np.diag([1.0, -1.0, -1.0, 1.0])
 """Half a turn about the z axis, and about the x axis."""
 
@@ -164,18 +162,6 @@ def line_directions(level: bool = False) -> Plane:
 
 
 @dataclass(frozen=True)
-class PixelPrior:
-    """What is known of the pixel size before anything is measured: `error` is a share of `pixel_mm`."""
-
-    pixel_mm: FloatArray
-    error: float
-
-    def deviation(self, pixel_mm: FloatArray) -> FloatArray:
-        """Deviation of other sizes, in standard errors, shape (2,)."""
-        return np.asarray((pixel_mm / self.pixel_mm - 1.0) / self.error)
-
-
-@dataclass(frozen=True)
 class Equations:
     """What must vanish for each point of a phantom.
 
@@ -231,7 +217,7 @@ class Equations:
         self,
         start: Chain,
         free: Sequence[str],
-        prior: PixelPrior | None = None,
+        prior: Prior = UNKNOWN,
         sigma: float = 1.0,
         tolerance: float = _TOLERANCE,
     ) -> Chain:
@@ -239,8 +225,8 @@ class Equations:
 
         Parameters
         ----------
-        prior : PixelPrior, optional
-            Counts as two further residuals of standard deviation `sigma`.
+        prior : Prior, optional
+            Counts as further residuals of standard deviation `sigma`.
         tolerance : float
             Relative decrease of the sum of squares below which a step is the last.
 
@@ -250,18 +236,16 @@ class Equations:
             If there are fewer residuals than parameters, or some are not finite.
         """
         columns = columns_of(free)
+        weight = sigma / prior.sigma[columns]
 
         def at(chain: Chain) -> tuple[FloatArray, FloatArray, float]:
             values, slopes = self.at(chain)
             r, j = values.ravel(), slopes.reshape(values.size, -1)[:, columns]
-            if prior is not None:
-                slope = sigma / (prior.error * prior.pixel_mm[:, None])
-                of_prior = (np.array(columns) == np.arange(2)[:, None]) * slope
-                r, j = np.append(r, sigma * prior.deviation(chain.pixel_mm)), np.vstack([j, of_prior])
-            return j.T @ j, j.T @ r, float(r @ r)
+            away = weight * prior.displacement(chain)[columns]
+            return j.T @ j + np.diag(weight**2), j.T @ r + weight * away, float(r @ r + away @ away)
 
         chain, (normal, pull, cost) = start, at(start)
-        count = self.offsets.size + (2 if prior else 0)
+        count = self.offsets.size + np.count_nonzero(weight)
         if count < len(columns):
             raise InsufficientDataError(
                 f"expected at least {len(columns)} residuals, got {count}: the phantom in more frames"
@@ -322,20 +306,17 @@ def calibrate_plane(
         determine the answer; then the missing motions are named.
     """
     s = settings or PlaneFit()
-    problem, prior = Problem.of(Plane(), pixel_mm, s), None
-    if problem.held_mm is None and pixel_mm is not None and np.isfinite(s.pixel_error):
-        prior = PixelPrior(np.asarray(pixel_mm, dtype=float), s.pixel_error)
-    solution = _from_stages(lines, replace(problem, prior=prior))
-    if prior is not None and np.abs(prior.deviation(solution.chain.pixel_mm)).max() > _CONTRADICTS:
+    problem = Problem.of(Plane(), pixel_mm, s, s.pixel_error)
+    solution = _from_stages(lines, problem)
+    if solution.contradicts_prior:
         # Lines that contradict the pixel size given are believed if they determine it by themselves.
-        solution = _from_stages(lines, problem)
+        solution = _from_stages(lines, replace(problem, prior=UNKNOWN))
     return _facing_up(require_adequate(solution))
 
 
 def _from_stages(lines: ImagePoints, problem: Problem) -> Solution:
     """Angles from line directions, then distances, then all."""
-    few = lines.of_some_frames(SOME_FRAMES)
-    pixel_mm = problem.held_mm if problem.prior is None else problem.prior.pixel_mm
+    few, pixel_mm = lines.of_some_frames(SOME_FRAMES), problem.prior.known_pixel_mm
     directions = as_directions(few, np.ones(2) if pixel_mm is None else pixel_mm)
     angles = angle_starts(directions, pixel_mm, hemisphere())
     return problem.best(lines, [_with_distances(few, start, pixel_mm) for start in angles])

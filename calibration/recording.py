@@ -53,7 +53,6 @@ def calibrate_recording(
     method: str,
     calibrate: Callable[[ImagePoints], Solution],
     time_offset_s: float | Literal["estimate"] | None = None,
-    with_clock: Callable[[ImagePoints], Solution] | None = None,
 ) -> Outcome:
     """Calibrate with what was detected in a recording.
 
@@ -63,8 +62,6 @@ def calibrate_recording(
         Calibrates with points; called again and again where the clock's offset is estimated.
     time_offset_s : float or "estimate", optional
         In place of the recording's own; or the one that explains the images best, near the recording's.
-    with_clock : callable, optional
-        Calibrates once the offset is known; by default `calibrate`.
 
     Raises
     ------
@@ -80,7 +77,7 @@ def calibrate_recording(
         offset = estimate_offset(calibrate, points, recording.readings, offset_s, SEARCH_S)
         offset_s = offset.seconds
         points, reasons = with_poses(recording, detections, offset_s)
-    solution = (with_clock or calibrate)(points)
+    solution = calibrate(points)
     if offset is not None:
         solution = with_uncertain_offset(solution, points, recording.readings, offset_s)
     frames = FramesUsed(recording.images.shape[0], (), reasons)

@@ -59,7 +59,7 @@ class WireFit(PixelSettings):
     registration: Literal["auto", "held", "turned", "free"] = Field(
         "auto",
         description="The place a configuration says: hold it, its middle only, or estimate it; auto: "
-        "whichever explains frames best that were left out.",
+        "it counts as known to 0.5 mm and 1 degree, unless the dots contradict it.",
     )
     beside_mm: float = Field(
         BESIDE_MM,

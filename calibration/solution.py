@@ -14,7 +14,7 @@ from scipy.special import ndtr, stdtrit
 
 from calibration.motion import Adequacy, judge
 from calibration.noise import fit_noise
-from calibration.points import CHAIN, POSE, PROBE, SCALES, SOME_FRAMES, ImagePoints, columns_of
+from calibration.points import CHAIN, POSE, PROBE, SOME_FRAMES, ImagePoints, columns_of
 from calibration.robust import autocorrelation_time
 from calibration.settings import OUTLIER_SIGMA, PixelSettings
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
@@ -24,7 +24,7 @@ from speckle3d.core.leastsquares import condition_number, robust_sigma
 from speckle3d.core.shown import shown
 
 if TYPE_CHECKING:
-    from calibration.plane import Chain, Phantom, PixelPrior
+    from calibration.plane import Chain, Phantom
 
 _SMALLEST_SIGMA = 1e-7
 """Residuals of exact data are rounding; nothing in them is an outlier."""
@@ -32,13 +32,63 @@ _ROUNDS = 12
 """Most rounds of leaving out frames: they may come and go without an end."""
 _FEWEST_FRAMES = 6
 """Of lines, two equations each: the fewest for eleven unknowns."""
-_RUNAWAY, _SIZE_CHANGE = 2.0, 0.1
-"""A fit with wandering errors that doubles the residuals or changes pixel sizes by a tenth has run away along
-what the motion leaves open."""
+_SIZE_CHANGE = 0.1
+"""A fit with wandering errors that changes pixel sizes by a tenth has run away along what the motion leaves
+open."""
+_CONTRADICTS = 3.0
+"""Standard errors by which points must move what was known for it to be doubted."""
+_STATED = 0.5, np.deg2rad(1.0)
+"""Standard errors of a phantom's stated place: of styluses, half a millimetre, and a degree over 50 mm."""
 _CUT = 3.0
 """Residuals count up to so many standard deviations where answers are compared."""
 _APART_RAD, _APART = np.deg2rad(5.0), 0.1
 """Two answers differ by this angle, or by this share of the image's size."""
+
+
+@dataclass(frozen=True)
+class Prior:
+    """What is known of the pixel size and of the phantom's place before anything is measured.
+
+    Attributes
+    ----------
+    pixel_mm : ndarray, shape (2,)
+    target : ndarray, shape (4, 4)
+    sigma : ndarray, shape (14,)
+        Standard errors of both, as displacements in the order of `CHAIN`; infinite where nothing is known.
+    """
+
+    pixel_mm: FloatArray
+    target: FloatArray
+    sigma: FloatArray
+
+    @classmethod
+    def of(cls, pixel_mm: FloatArray | None = None, pixel_error: float = np.inf) -> Prior:
+        """Of a pixel size, with its error as a share of it."""
+        size = np.ones(2) if pixel_mm is None else np.asarray(pixel_mm, dtype=float)
+        return cls(size, np.eye(4), np.append(pixel_error * size, np.full(len(CHAIN) - 2, np.inf)))
+
+    def with_place(self, target: FloatArray) -> Prior:
+        """And of a phantom's stated place, target from world."""
+        return replace(self, target=target, sigma=np.append(self.sigma[:8], np.repeat(_STATED, 3)))
+
+    @property
+    def known_pixel_mm(self) -> FloatArray | None:
+        """The pixel size, if anything is known of it."""
+        return self.pixel_mm if np.isfinite(self.sigma[0]) else None
+
+    def displacement(self, chain: Chain) -> FloatArray:
+        """By how much a chain differs from what is known, in the order of `CHAIN`, shape (14,)."""
+        away, moved = np.zeros(len(CHAIN)), chain.target @ np.linalg.inv(self.target)
+        away[:2], away[8:11] = chain.pixel_mm - self.pixel_mm, moved[:3, 3]
+        away[11:] = 0.5 * (moved - moved.T)[[1, 0, 2], [0, 2, 1]]
+        return away
+
+    def deviation(self, chain: Chain) -> FloatArray:
+        """The same in standard errors; zero where nothing is known."""
+        return self.displacement(chain) / self.sigma
+
+
+UNKNOWN = Prior.of()
 
 
 @shown
@@ -74,7 +124,7 @@ class Solution:
     used: BoolArray
     residuals: FloatArray
     sigma: float
-    prior: PixelPrior | None = None
+    prior: Prior
     evidence: float = np.inf
     assumed: str = ""
 
@@ -88,6 +138,11 @@ class Solution:
         """Derivatives of the residuals used by small displacements, shape (n r, p)."""
         _, slopes = self.phantom.equations(self.points_used).at(self.chain)
         return slopes.reshape(-1, len(CHAIN))[:, columns_of(self.free)]
+
+    @property
+    def contradicts_prior(self) -> bool:
+        """Whether something is far from what was known of it."""
+        return bool(np.abs(self.prior.deviation(self.chain)).max() > _CONTRADICTS)
 
     @property
     def condition_number(self) -> float:
@@ -143,20 +198,23 @@ class Problem:
         Which of `PROBE` to estimate, besides all that the phantom determines.
     outlier_sigma : float
         Frames whose largest residual exceeds so many robust standard deviations are left out.
-    prior : PixelPrior, optional
-        Counts where the pixel size is estimated.
-    held_mm : ndarray, shape (2,), optional
-        The pixel size where it is not.
+    prior : Prior
+        What is known of them, and the pixel size where it is not estimated.
     """
 
     phantom: Phantom
     probe: tuple[str, ...] = PROBE
     outlier_sigma: float = OUTLIER_SIGMA
-    prior: PixelPrior | None = None
-    held_mm: FloatArray | None = None
+    prior: Prior = UNKNOWN
 
     @classmethod
-    def of(cls, phantom: Phantom, pixel_mm: FloatArray | None, settings: PixelSettings) -> Problem:
+    def of(
+        cls,
+        phantom: Phantom,
+        pixel_mm: FloatArray | None,
+        settings: PixelSettings,
+        pixel_error: float = np.inf,
+    ) -> Problem:
         """The problem of a phantom as settings say, with the scanner's pixel size if that is known.
 
         Raises
@@ -165,12 +223,12 @@ class Problem:
             If the pixel size is neither fitted nor given.
         """
         if not settings.fixed_pixels:
-            return cls(phantom, PROBE, settings.outlier_sigma)
+            return cls(phantom, PROBE, settings.outlier_sigma, Prior.of(pixel_mm, pixel_error))
         if pixel_mm is None:
             raise InvalidInputError(
                 "pixel_mm: expected the scanner's pixel size unless it is fitted, got none"
             )
-        return cls(phantom, POSE, settings.outlier_sigma, held_mm=np.asarray(pixel_mm, dtype=float))
+        return cls(phantom, POSE, settings.outlier_sigma, Prior.of(pixel_mm, 1.0))
 
     @property
     def free(self) -> tuple[str, ...]:
@@ -191,8 +249,7 @@ class Problem:
         agreeing = equations[inliers]
         refit, _, covariance = fit_noise(agreeing, chain, free, phantom.seen_as, self.prior)
         size_change = np.abs(np.log(refit.pixel_mm / chain.pixel_mm)).max()
-        growth = sigma_of(agreeing.residuals(refit)) / sigma_of(agreeing.residuals(chain))
-        if growth < _RUNAWAY and size_change < _SIZE_CHANGE:
+        if size_change < _SIZE_CHANGE:
             chain = refit
         if phantom.unknowns:
             # Where the phantom is, as the readings say on average: what wanders is not in its place.
@@ -204,8 +261,8 @@ class Problem:
     def fit(self, points: ImagePoints, start: Chain) -> tuple[Chain, BoolArray]:
         """Least squares of the frames that do not contradict the others, and which points those are."""
         equations = self.phantom.equations(points)
-        # Pixel sizes that are known somewhat are held while wrong frames still pull.
-        first = [name for name in self.free if self.prior is None or name not in SCALES]
+        # What is known somewhat is held while wrong frames still pull.
+        first = [name for name in self.free if np.isinf(self.prior.sigma[CHAIN.index(name)])]
         chain = equations.least_absolute(start, first)
         residuals = equations.residuals(chain)
         inliers = _within(residuals, points.frame, self._limit(residuals))
@@ -283,9 +340,7 @@ class Problem:
         best = np.clip(residuals[int(np.argmin(sums))], -cut, cut)
         independent = best.size / together(best, points.frame)
         sums *= independent / max(float(sums.min()), _SMALLEST_SIGMA**2)
-        if self.prior is not None:
-            sums += [np.sum(self.prior.deviation(chain.pixel_mm) ** 2) for chain in chains]
-        return sums
+        return sums + [float(np.sum(self.prior.deviation(chain) ** 2)) for chain in chains]
 
 
 def sigma_of(residuals: FloatArray) -> float:

@@ -1,18 +1,13 @@
 """Calibration with wires: a crossing, three orthogonal wires, or N-shapes; solved as planes are.
 
-A place that is stated of a phantom is best held if it is good, for what is not estimated cannot be wrong; if
-wrong it spoils the calibration. Frames that were left out tell: a calibration that explains them better is
-nearer the truth, and one that follows the errors of its own frames is not.
+A place that is stated of a phantom counts as known to what a stylus achieves: where the motion tells little
+it holds the answer, and dots that contradict it by more are believed instead.
 
 References
 ----------
 .. [1] Prager et al., CUED/F-INFENG/TR 303, 1997, sections 3.1 and 3.2.
 .. [2] P. R. Detmer et al., "3D ultrasonic image feature localization based on magnetic scanhead tracking",
    Ultrasound in Medicine and Biology, 1994 (the crossing).
-.. [3] P. Burman, E. Chow and D. Nolan, "A cross-validatory method for dependent data", Biometrika 81, 1994
-   (blocks in time).
-.. [4] L. Breiman, J. Friedman, C. J. Stone and R. A. Olshen, "Classification and regression trees", 1984,
-   section 3.4.3 (the simplest within one standard error of the best).
 """
 
 from __future__ import annotations
@@ -31,19 +26,12 @@ from calibration.robust import robust_linear
 from calibration.settings import WireFit
 from calibration.solution import Problem, Solution
 from speckle3d.core.arrays import FloatArray
-from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.geometry import nearest_rotation
 from speckle3d.core.wires import WirePhantom
 
-_REGISTRATIONS: dict[str, tuple[tuple[str, ...], str]] = {
-    "held": ((), "held"),
-    "turned": (TARGET[3:], "held at the wires' middle and turned about it"),
-    "free": (TARGET, "estimated anew"),
-}
-"""What is estimated of a stated place, simplest first, and its words in messages."""
-_FOLDS = 8
-"""Blocks of successive frames, each left out once: a tracker's error wanders over seconds, and frames beside
-each other would vouch for each other."""
+_REGISTRATIONS = {"held": (), "turned": TARGET[3:], "free": TARGET, "auto": TARGET}
+"""What is estimated of a stated place."""
 _STARTS = 6
 _TINY, _LEAST_PIXEL_MM = np.finfo(float).tiny, 1e-6
 _AS_IT_IS = Rotation.identity()
@@ -109,10 +97,10 @@ def calibrate_cross_wire(
     consensus = find_consensus(points, pixel_mm)
     if not consensus.is_significant and len(points) == len(points.frames):
         # Poor motion, too, can leave no consensus; then that is said.
-        require_adequate(problem.best(points, [wire_start(points, phantom, _AS_IT_IS, problem.held_mm)[0]]))
+        require_adequate(problem.best(points, [wire_start(points, problem, _AS_IT_IS)[0]]))
     consensus.require()
     agreeing = points[consensus.nearest[consensus.inliers]]
-    first = problem.solve(agreeing, wire_start(agreeing, phantom, _AS_IT_IS, problem.held_mm)[0])
+    first = problem.solve(agreeing, wire_start(agreeing, problem, _AS_IT_IS)[0])
     # The rigid chain, from all that agree, tells candidates better than the sample did.
     away_mm = np.linalg.norm(phantom.equations(points).residuals(first.chain), axis=1)
     nearest = nearest_of_frames(points.frame, away_mm)
@@ -156,43 +144,16 @@ def calibrate_wires(
         the three-wire phantom.
     settings : WireFit, optional
         `registration` says what to do with a place that is stated: hold it; hold the wires' middle and
-        estimate how the phantom is turned about it; or estimate all. Stylus registrations find a place to
-        half a millimetre, and, over 50 mm, a turn only to a degree. By default the simplest counts that
-        explains frames left out as well as any; the solution says which.
+        estimate how the phantom is turned about it; or estimate all. By default all is estimated, and the
+        place counts as known to 0.5 mm and a degree, unless the dots move it by three times as much; the
+        solution says by how much they do.
 
     Raises
     ------
     InsufficientDataError
         If there are too few points, they contradict each other, or the motion does not determine the answer.
     """
-    s = settings or WireFit()
-    if geometry.world_from_phantom is None or s.registration != "auto":
-        return require_adequate(solve_wires(points, geometry, pixel_mm, s))
-    solutions, misses_mm = dict[str, Solution](), dict[str, FloatArray]()
-    for name in _REGISTRATIONS:
-        registration = s.model_copy(update={"registration": name})
-        try:
-            solutions[name] = require_adequate(solve_wires(points, geometry, pixel_mm, registration))
-            misses_mm[name] = _cross_validate(solutions[name])
-        except InsufficientDataError:
-            if name == "free" and not solutions:
-                raise
-    least_mm = min(misses_mm.values(), key=lambda miss: float(miss.mean()))
-    excess_mm = {name: miss - least_mm for name, miss in misses_mm.items()}
-    simplest = next(n for n, e in excess_mm.items() if e.mean() <= np.std(e, ddof=1) / np.sqrt(len(e)))
-    sizes = ", ".join(f"{miss.mean():.3f} mm if {name}" for name, miss in misses_mm.items())
-    choice = f"the phantom's stated place is {_REGISTRATIONS[simplest][1]}: left-out frames miss their wires"
-    return replace(solutions[simplest], assumed=f"{choice} by {sizes}")
-
-
-def _cross_validate(solution: Solution) -> FloatArray:
-    """Mean distance from the wires, mm, of the dots of each block of frames, by a fit to the other blocks."""
-    equations, misses_mm = solution.phantom.equations(solution.points), []
-    for frames in np.array_split(solution.points.frames, _FOLDS):
-        test = np.isin(solution.points.frame, frames)
-        chain = equations[solution.used & ~test].least_squares(solution.chain, solution.free)
-        misses_mm.append(float(np.linalg.norm(equations[test].residuals(chain), axis=1).mean()))
-    return np.array(misses_mm)
+    return require_adequate(solve_wires(points, geometry, pixel_mm, settings))
 
 
 def solve_wires(
@@ -201,28 +162,37 @@ def solve_wires(
     pixel_mm: FloatArray | None = None,
     settings: WireFit | None = None,
 ) -> Solution:
-    """As `calibrate_wires`, whether or not the motion determines the answer; ``auto`` is ``turned``."""
+    """As `calibrate_wires`, whether or not the motion determines the answer."""
     s, middle, place = settings or WireFit(), geometry.points_mm.mean(axis=0), geometry.world_from_phantom
-    registration = "turned" if s.registration == "auto" else s.registration
     if place is not None:
         place = place * RigidTransform.from_translation(middle)
     # In a frame whose origin is the wires' middle, about which the phantom may be turned.
     about_middle = replace(geometry, ends_mm=geometry.ends_mm - middle, world_from_phantom=place)
-    phantom = Wires(about_middle, TARGET if place is None else _REGISTRATIONS[registration][0])
+    phantom = Wires(about_middle, TARGET if place is None else _REGISTRATIONS[s.registration])
     problem = Problem.of(phantom, pixel_mm, s)
     few = points.of_some_frames(SOME_FRAMES)
     # Without a place, the rotations of an icosahedron, 36 degrees apart.
     poses = Rotation.create_group("I") if place is None else [place.inv()]
-    starts = [wire_start(few, phantom, pose, problem.held_mm) for pose in poses]
+    starts = [wire_start(few, problem, pose) for pose in poses]
     starts.sort(key=lambda start: start[1])
-    return problem.best(points, [chain for chain, _ in starts[:_STARTS]])
+    chains = [chain for chain, _ in starts[:_STARTS]]
+    if place is None or s.registration != "auto":
+        return problem.best(points, chains)
+    prior = problem.prior.with_place(place.inv().as_matrix())
+    solution = replace(problem, prior=prior).best(points, chains)
+    use = "counts as known to 0.5 mm and 1 degree"
+    if solution.contradicts_prior:
+        solution, use = problem.best(points, [solution.chain]), "does not count"
+    moved = prior.displacement(solution.chain)
+    shift_mm, turn_deg = np.linalg.norm(moved[8:11]), np.rad2deg(np.linalg.norm(moved[11:]))
+    assumption = (
+        f"the phantom's stated place {use}; the dots put it {shift_mm:.2f} mm and {turn_deg:.1f} degrees off"
+    )
+    return replace(solution, assumed=assumption)
 
 
 def wire_start(
-    points: ImagePoints,
-    phantom: Phantom,
-    target_from_world: RigidTransform | Rotation,
-    pixel_mm: FloatArray | None = None,
+    points: ImagePoints, problem: Problem, target_from_world: RigidTransform | Rotation
 ) -> tuple[Chain, float]:
     """Find the image among wires from all frames of a recording, by robust linear least squares.
 
@@ -232,8 +202,6 @@ def wire_start(
     ----------
     target_from_world : RigidTransform or Rotation
         If a rotation, the translation is found too.
-    pixel_mm : ndarray, shape (2,), optional
-        In place of the axes' lengths.
 
     Returns
     -------
@@ -241,7 +209,7 @@ def wire_start(
     median_mm : float
         Of the residuals' magnitudes, before the axes are squared.
     """
-    rows, offsets = phantom.vanishing(points)
+    rows, offsets = problem.phantom.vanishing(points)
     target = np.eye(4)
     if isinstance(target_from_world, Rotation):
         target[:3, :3] = target_from_world.as_matrix()
@@ -258,5 +226,5 @@ def wire_start(
     size = np.maximum(np.linalg.norm(axes, axis=1), _LEAST_PIXEL_MM)
     probe[:3, :3], probe[:3, 3] = nearest_rotation((axes / size[:, None]).T), answer[:3] - centre @ axes
     target[:3, 3] += answer[9:] if len(answer) > 9 else 0.0
-    chain = Chain(size if pixel_mm is None else pixel_mm, probe, target)
-    return chain, float(np.median(np.abs(left)))
+    known_mm = problem.prior.known_pixel_mm
+    return Chain(size if known_mm is None else known_mm, probe, target), float(np.median(np.abs(left)))

@@ -16,7 +16,6 @@ from calibration.detection.crossings import crossings_in_frames
 from calibration.detection.dots import dots_in_frames
 from calibration.detection.labelling import label_dots
 from calibration.detection.lines import detect_lines
-from calibration.motion import require_adequate
 from calibration.nwires import label_by_wires, nwire_errors_mm, trimmed_mean_mm
 from calibration.orientation import calibrate_orientation
 from calibration.plane import calibrate_plane
@@ -31,7 +30,7 @@ from calibration.recording import (
 )
 from calibration.repeatability import validate
 from calibration.report import figure_report
-from calibration.wires import CrossWire, Wires, calibrate_cross_wire, calibrate_wires, solve_wires
+from calibration.wires import CrossWire, Wires, calibrate_cross_wire, calibrate_wires
 from speckle3d.calibrating.recordings import open_recording
 from speckle3d.calibrating.settings import (
     OrientationSettings,
@@ -174,13 +173,11 @@ def solve_phantom(recording: Recording, detections: Detections, settings: ScanSe
         return solve(
             detections, "cross-wire", lambda points: calibrate_cross_wire(points, size, settings), clock
         )
-    # The clock is sought with what depends least on the phantom's place and yet is determined.
     return solve(
         detections,
         "n-wire" if phantom.n_shapes else "three-wire",
-        lambda points: require_adequate(solve_wires(points, phantom, size, settings)),
-        clock,
         lambda points: calibrate_wires(points, phantom, size, settings),
+        clock,
     )
 
 
