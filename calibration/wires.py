@@ -178,7 +178,7 @@ def solve_wires(
     chains = [chain for chain, _ in starts[:_STARTS]]
     if place is None or s.registration != "auto":
         return problem.best(points, chains)
-    prior = problem.prior.with_place(place.inv().as_matrix())
+    prior = problem.prior.with_place(place.as_matrix())
     solution = replace(problem, prior=prior).best(points, chains)
     use = "counts as known to 0.5 mm and 1 degree"
     if solution.contradicts_prior:
