@@ -61,4 +61,5 @@ def from_coefficients(first, second, coefficients, covariance):
         coefficients,
         np.array(np.broadcast_to(covariance, (pairs, 3, 3)), float),
         np.ones((pairs, 1), bool),
+        np.zeros(pairs),
     )

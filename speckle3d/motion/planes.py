@@ -43,6 +43,8 @@ SENSED_SLOPE = 5e-4
 """Standard deviation of slopes between near frames from a smoothed orientation sensor: 0.03 degrees."""
 LEAST_SIGMA_MM = 1e-3
 """Of a patch's distance where the curve is flat: a hundredth of what it is known to elsewhere."""
+UNEVENNESS = 0.4
+"""Variation of the error of distances over the image against its mean; measured on simulated sweeps."""
 ROUNDS = 12
 NEAR_MM = 0.15
 """Least distance at which fits start: correlation is flat at zero, and a fit from there takes distance for
@@ -154,6 +156,10 @@ class PairPlanes:
         Of (a, b, c).
     used : ndarray of bool, shape (e, p)
         Patches that took part.
+    feigned_yaw : ndarray, shape (e,)
+        Standard deviation of b by the bias of distances, where frames are near: it is several times that of
+        `covariance` and decides on which side of each other near frames lie. A trajectory does not take it:
+        near pairs would then no longer hold neighbouring frames' tilt together.
     """
 
     row: IntArray
@@ -162,6 +168,7 @@ class PairPlanes:
     coefficients: FloatArray
     covariance: FloatArray
     used: BoolArray
+    feigned_yaw: FloatArray
 
     def __len__(self) -> int:
         return int(self.row.size)
@@ -174,6 +181,13 @@ class PairPlanes:
     def offset_mm(self) -> FloatArray:
         """Offset a of each pair, shape (e,)."""
         return self.coefficients[:, 0]
+
+    @property
+    def sign_covariance(self) -> FloatArray:
+        """Covariance of (a, b) by which signs are told, shape (e, 2, 2)."""
+        covariance = self.covariance[:, :2, :2].copy()
+        covariance[:, 1, 1] += self.feigned_yaw**2
+        return covariance
 
     def scaled(self, factor: float) -> PairPlanes:
         """Return the same planes with all distances multiplied by a factor."""
@@ -265,12 +279,24 @@ def pair_planes(
     scatter = np.maximum(1.0, cost / np.maximum(members.sum(axis=1) - 3, 1))
     covariance = np.linalg.inv(information) * scatter[:, None, None]
     covariance[:, 0, 0] += settings.bias_mm**2
+    # Uneven over the image, the bias feigns yaw. What is added to a square of distance fades as that grows.
+    uneven_mm = (
+        UNEVENNESS * settings.bias_mm**2 / (2.0 * np.maximum(np.abs(coefficients[:, 0]), settings.bias_mm))
+    )
     # Where next to nothing of the echo is left, any distance fits as well: tens of metres have been seen.
     reach = float(problem.curves.distance_mm[-1])
     determined = (np.abs(coefficients[:, 0]) <= reach) & (covariance[:, 0, 0] <= reach**2)
     if not from_sensor:
         coefficients *= np.where(coefficients[:, :1] < 0, -1.0, 1.0)
-    planes = PairPlanes(rows, table.first[rows], table.second[rows], coefficients, covariance, members)
+    planes = PairPlanes(
+        rows,
+        table.first[rows],
+        table.second[rows],
+        coefficients,
+        covariance,
+        members,
+        uneven_mm / max(float(np.std(problem.levers.lateral_mm)), 1e-6),
+    )
     return planes, determined
 
 

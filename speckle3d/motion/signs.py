@@ -96,7 +96,7 @@ def likeliest_path(
         np.searchsorted(planes.second, every),
         np.ascontiguousarray(planes.first),
         np.ascontiguousarray(planes.coefficients[:, :2]),
-        np.ascontiguousarray(planes.covariance[:, :2, :2]),
+        planes.sign_covariance,
         np.searchsorted(strangers.second, every),
         np.ascontiguousarray(strangers.first),
         rules,
@@ -109,7 +109,7 @@ def likeliest_path(
 def on_path(planes: PairPlanes, path: FloatArray) -> PairPlanes:
     """Planes on the sides of their first frames that agree best with a path of shape (n, 2)."""
     relative, moved = path[planes.second] - path[planes.first], planes.coefficients[:, :2]
-    weight = np.linalg.inv(planes.covariance[:, :2, :2])
+    weight = np.linalg.inv(planes.sign_covariance)
     plus, minus = (
         np.einsum("ei,eij,ej->e", off, weight, off) for off in (relative - moved, relative + moved)
     )

@@ -11,7 +11,7 @@ from speckle3d.core.arrays import FloatArray
 from speckle3d.core.pose_errors import PoseErrors
 from speckle3d.core.reconstruction import SharedErrors
 from speckle3d.core.relative import SCALE_CHANGE_MM, SHARED, STRUCTURE, TURN_CHANGE_MM
-from speckle3d.motion.planes import PairPlanes, PlaneSettings
+from speckle3d.motion.planes import UNEVENNESS, PairPlanes, PlaneSettings
 
 TREMBLING_MM = 0.1
 """Frames nearer than this may turn as if they were this far apart: a hand trembles in place. At 0.15 B-mode
@@ -114,8 +114,6 @@ def joint_errors(
     return PoseErrors(factors[np.abs(factors).max(axis=(1, 2)) > 1e-12], world_from_image, centre_mm)
 
 
-UNEVENNESS = 0.4
-"""Variation of the error of distances over the image against its mean; measured on simulated sweeps."""
 BEYOND_DOUBT = 2.0
 """Deviations at which a turn is taken for deliberate, however large it is."""
 

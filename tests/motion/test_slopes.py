@@ -8,8 +8,8 @@ import speckle
 from pair_planes import AT, TILT, fit_many, from_coefficients, problem_of
 
 from speckle3d.kernels.statistics import correlation_variance
-from speckle3d.motion.planes import PlaneSettings
-from speckle3d.motion.uncertainty import UNEVENNESS, weigh_slopes
+from speckle3d.motion.planes import UNEVENNESS, PlaneSettings
+from speckle3d.motion.uncertainty import weigh_slopes
 
 SIGMA_MM, CELLS = 0.45, 60.0
 SETTINGS = PlaneSettings()
