@@ -6,8 +6,6 @@ import ctypes
 import hashlib
 import os
 import struct
-import tarfile
-import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
@@ -42,8 +40,6 @@ _DAMAGE: tuple[type[BaseException], ...] = (
     ArithmeticError,
     EOFError,
     struct.error,
-    tarfile.TarError,
-    zlib.error,
 )
 """What h5py, NumPy and Python's own libraries raise when the bytes of a file do not make sense."""
 

@@ -119,7 +119,6 @@ def open_scan(file: h5py.File, _: ImportSettings) -> Recording:
         values=values,
         tracker=tracker,
         chain="tforms",
-        name=scan.stem,
         rows=(("landmarks", "none" if _landmark_file(scan) is None else "yes", ""),),
         remarks=tuple(remarks),
     )

@@ -190,8 +190,9 @@ class _Sequence:
 
     def _image_pose_remarks(self) -> Iterator[str]:
         """Tell where the file's own transform of the image contradicts the chain that is used."""
-        name, poses, place = self.image_pose, self.poses, self.image_to_probe
-        direct = tracked_poses(self.header, name, "none", self.device.names) if name else None
+        name, poses, place, direct = self.image_pose, self.poses, self.image_to_probe, None
+        with suppress(InvalidInputError):  # of a transform that is not used
+            direct = tracked_poses(self.header, name or "none", "none", self.device.names)
         if poses is None or direct is None or direct.pixels is None:
             return
         if place is None:

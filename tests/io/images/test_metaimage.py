@@ -138,11 +138,14 @@ def test_poses_of_a_lost_tool_are_no_readings_wherever_they_lie(tmp_path, rows, 
 
 def test_the_tool_is_what_the_image_is_on(tmp_path):
     true, frames = path_of(12)
-    for frame in frames:
+    pixels = np.diag([0.1, 0.2, 0.2, 1.0])
+    for frame, pose in zip(frames, true.as_matrix(), strict=True):
         frame["ArmToTrackerTransform"] = frame.pop("ProbeToTrackerTransform")
-        frame["ImageToArmTransform"] = text_of(np.diag([0.1, 0.2, 0.2, 1.0]))
+        frame["ImageToArmTransform"] = text_of(pixels)
+        frame["ImageToTrackerTransform"] = text_of(matrix_at(7) @ pose @ pixels)
     recording = recording_of(tmp_path, frames)
     assert recording.chain == "ImageToArm * ArmToTracker"
+    assert "up to 7 mm away" in "".join(recording.notes)
     np.testing.assert_allclose(pose_matrices(recording.sweep), true.as_matrix(), atol=1e-9)
 
 
