@@ -176,25 +176,26 @@ class _Sequence:
             chain=self._chain(),
             probe=settings.probe or own.get("probe") or self.device.text("TransducerName"),
             full_scale=own.get("full_scale", 255.0),
-            substitutes=dict.fromkeys(_PIXELS, "tracker_transform") if self.image_pose else {},
+            substitutes=dict.fromkeys(_PIXELS, "tracker_transform") if self.image_poses else {},
             assumptions=("parallel lines",) if self.layout.is_rf and not own else (),
             remarks=tuple(self._remarks()),
         )
 
     @cached_property
-    def image_pose(self) -> str:
-        """Name of the file's own transform of the image in the world of the tool's poses; empty if none."""
-        poses, image = self.poses, self.device.names.image
-        name = "" if poses is None else f"{image}To{ends(poses.chain[-1])[1]}"
-        return name if poses is not None and poses.tool != image and name in names_of(self.header) else ""
+    def image_poses(self) -> Poses | None:
+        """Poses by the file's own transform of the image in the world of the tool's."""
+        poses, names = self.poses, self.device.names
+        name = "none" if poses is None else f"{names.image}To{ends(poses.chain[-1])[1]}"
+        with suppress(InvalidInputError):  # where there is none that makes sense
+            return tracked_poses(self.header, name, "none", names)
+        return None
 
     def _image_pose_remarks(self) -> Iterator[str]:
         """Tell where the file's own transform of the image contradicts the chain that is used."""
-        name, poses, place, direct = self.image_pose, self.poses, self.image_to_probe, None
-        with suppress(InvalidInputError):  # of a transform that is not used
-            direct = tracked_poses(self.header, name or "none", "none", self.device.names)
+        poses, place, direct = self.poses, self.image_to_probe, self.image_poses
         if poses is None or direct is None or direct.pixels is None:
             return
+        name = f"{direct.tool}To{ends(direct.chain[-1])[1]}"
         if place is None:
             yield f"no place of the image on {poses.tool}: --transform {name} takes the file's own"
             return
