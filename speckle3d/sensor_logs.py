@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.streams import TimedRotations
 from speckle3d.core.sweep import INERTIAL, OrientationSensor
@@ -20,20 +21,24 @@ from speckle3d.io.readers import find_reader
 from speckle3d.io.sweep_writer import attach_orientation
 from xsens.logs.clocks import Stamps, timeline
 from xsens.logs.faults import without_faults
-from xsens.logs.samples import Gap, ImuLog
+from xsens.logs.samples import ImuLog
 
 
 def held_log(path: Path) -> ImuLog | None:
     """Log of the sensor that a recording holds; None of what is a log itself."""
-    inside = _inside_probe(path)
-    if inside is None and (sensor := ridden_along(path)) is not None:
-        return log_of(sensor, path.name)
-    return inside
+    if find_reader(path) is not READER:
+        sensor = ridden_along(path)
+        return None if sensor is None else log_of(sensor, path.name)
+    # The sensor inside a handheld scanner, whatever its images are.
+    samples = sensor_of(path)
+    rotations = samples.world_from_sensor
+    meaning = () if rotations is None else (f"the sensor's quaternion is {MEANING}",)
+    return _log(samples, samples.time_s, rotations, path.name, (*meaning, *samples.remarks))
 
 
 def ridden_along(path: Path) -> OrientationSensor | None:
-    """The orientation sensor that a sweep was recorded with, as one inside a probe; None of what is a log."""
-    if find_reader(path) is None or _inside_probe(path) is not None:
+    """The orientation sensor of a sweep; None of what is a log or a handheld scanner's recording."""
+    if find_reader(path) in (None, READER):
         return None
     sensor = load_sweep(path).orientation
     if sensor is None:
@@ -41,35 +46,27 @@ def ridden_along(path: Path) -> OrientationSensor | None:
     return sensor
 
 
-def _inside_probe(path: Path) -> ImuLog | None:
-    """Log of the sensor inside a handheld scanner, whatever its images are; None of other recordings."""
-    if find_reader(path) is not READER:
-        return None
-    samples = sensor_of(path)
-    clock, rotations = timeline(Stamps(time_s=samples.time_s)), samples.world_from_sensor
-    meaning = () if rotations is None else (f"the sensor's quaternion is {MEANING}",)
-    log = ImuLog(
-        clock.time_s,
-        samples.accelerometer_m_s2,
-        samples.gyroscope_rad_s,
-        samples.magnetometer_au,
-        world_from_sensor=rotations,
-        gaps=_pauses(clock.gaps),
-        notes=(*clock.notes, *meaning, *samples.remarks),
-        source=path.name,
-    )
-    return without_faults(log)
-
-
 def log_of(sensor: OrientationSensor, source: str) -> ImuLog:
     """Log of a sweep's orientation sensor, on its own clock."""
-    clock = timeline(Stamps(time_s=sensor.readings.time_s))
+    readings = sensor.readings
+    return _log(sensor, readings.time_s, readings.world_from_sensor, source)
+
+
+def _log(
+    vectors: object,
+    time_s: FloatArray,
+    rotations: Rotation | None,
+    source: str,
+    notes: Sequence[str] = (),
+) -> ImuLog:
+    clock = timeline(Stamps(time_s=time_s))
     log = ImuLog(
         clock.time_s,
-        **{name: getattr(sensor, name) for name in INERTIAL},
-        world_from_sensor=sensor.readings.world_from_sensor,
-        gaps=_pauses(clock.gaps),
-        notes=clock.notes,
+        **{name: getattr(vectors, name) for name in INERTIAL},
+        world_from_sensor=rotations,
+        # A sensor without a counter may send in bursts: how many samples a pause lost is not known.
+        gaps=tuple(replace(gap, lost=0) for gap in clock.gaps),
+        notes=(*clock.notes, *notes),
         source=source,
     )
     return without_faults(log)
@@ -110,20 +107,16 @@ def attach_log(
         whole = values is not None and bool(np.isfinite(values[rows]).all())
         vectors[name] = values[rows] if whole and rows.sum() == len(rotations) else None
     sensor = OrientationSensor(rotations, mounting, time_offset_s, **vectors)
-    words = ""
+    covered = None
     with suppress(InvalidInputError) if replaces else nullcontext():
         times_s = load_sweep(sweep_file).frame_time_s
-        words = f": covers {int(sensor.covers(times_s).sum())} of {times_s.size} frames"
-    if words.startswith(": covers 0 "):
-        first, last = sensor.readings.time_s[[0, -1]] + sensor.time_offset_s
+        covered = int(sensor.covers(times_s).sum())
+    if covered == 0:
+        first, last = rotations.time_s[[0, -1]] + time_offset_s
         raise InvalidInputError(
             f"{sweep_file}: expected a stream that covers frames of the sweep, {times_s[0]:.3f} to "
-            f"{times_s[-1]:.3f} s, got one from {first:.3f} to {last:.3f} s{words}"
+            f"{times_s[-1]:.3f} s, got one from {first:.3f} to {last:.3f} s: covers 0 of {times_s.size} "
+            "frames"
         )
     attach_orientation(sweep_file, sensor)
-    return words
-
-
-def _pauses(gaps: Sequence[Gap]) -> tuple[Gap, ...]:
-    """Gaps of a sensor without a counter that may send in bursts: how many were lost is not known."""
-    return tuple(replace(gap, lost=0) for gap in gaps)
+    return "" if covered is None else f": covers {covered} of {times_s.size} frames"
