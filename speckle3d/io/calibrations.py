@@ -116,7 +116,6 @@ def read_calibration(path: Source) -> Calibration:
             Calibration,
             rotation=rotation,
             translation_mm=translation,
-            pixel_mm=read_array(file, "pixel_mm", (2,)) if has_member(file, "pixel_mm") else None,
             parameters=_read_parameters(require_group(file, "parameters")),
             frames=_read_frames(require_group(file, "frames")),
         )
