@@ -161,15 +161,15 @@ class Recording:
         assumptions += self.assumptions
         words = [f"assumed, as the file does not say: {', '.join(assumptions)}"] if assumptions else []
         contradictions = filter(None, (self._number(name)[1] for name in self.numbers))
-        return [*contradictions, *self._told, *words]
+        return [*contradictions, *self._oddities, *words]
 
     def describe(self) -> list[Row]:
         """Rows of what the file says, where each number is from, and what is odd."""
         numbers = (self._number(name)[0] for name in self.numbers)
-        return [*self.rows, *numbers, *(("note", text, "") for text in self._told)]
+        return [*self.rows, *numbers, *(("note", text, "") for text in self._oddities)]
 
     @cached_property
-    def _told(self) -> list[str]:
+    def _oddities(self) -> list[str]:
         """What is odd of frames, file and path."""
         remarks = [*self._frame_times[2], *self.remarks]
         with suppress(InvalidInputError, FileError):  # which is told by who asks for the sweep
