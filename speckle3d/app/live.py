@@ -65,7 +65,7 @@ class _Viewer:
 
     def __init__(self, session: Session, status: Callable[[], str]) -> None:
         self._session, self._status, self._counts = session, status, (-1, -1)
-        self._words = pn.pane.HTML("", sizing_mode="stretch_width", margin=(6, 12))
+        self._words = pn.pane.HTML("", sizing_mode="stretch_width", height=60, margin=(6, 12))
         self._picture, self._cut = ImagePlot("lateral / mm"), ImagePlot("along the sweep / mm")
         self._path = ColumnDataSource({name: [] for name in ("t", "length", "low", "high", *_LINES)})
         self._refresh()
