@@ -260,7 +260,7 @@ class _Sequence:
         """Numbers that a sweep of this kind needs, with their sources."""
         header, device, layout = self.header, self.device, self.layout
         # The sampling rate of RF is known better than by a calibration.
-        sizes = [Value(self.spacing_mm, "ElementSpacing" if self.spacing_mm else "")]
+        sizes = [Value(self.spacing_mm, "ElementSpacing")]
         if not layout.is_rf:
             sizes = [self.calibration, *sizes, Value(device.pixel_mm(header.size), "device set", _DEVICE)]
         pixel = next((size for size in sizes if size.value is not None), Value())

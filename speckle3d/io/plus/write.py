@@ -116,7 +116,10 @@ def write_sequence(
     if is_nrrd:
         fields = {_NRRD_NAMES.get(name, name): value for name, value in fields.items()}
         x, y, _ = fields.pop("ElementSpacing").split()
-        axes = f"space dimension: 2\nspace directions: ({x},0) (0,{y}) none\nkinds: domain domain list"
+        axes = f"""space dimension: 2
+space directions: ({x},0) (0,{y}) none
+kinds: domain domain list
+space origin: (0,0)"""
         if suffix == _OF_SLICER:
             shape, axes = (*shape[:2], 1, shape[2]), _slicer_axes(x, y)
             fields |= _slicer_fields(sweep.frame_time_s)
