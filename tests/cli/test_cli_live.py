@@ -4,17 +4,13 @@ import re
 import signal
 import subprocess
 import time
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from commands import RF, command, free_port, read_until
 
 import speckle3d as s3
-from speckle3d.cli.stream.live import _run
-from speckle3d.io.igtl.link import LinkState
 from speckle3d.io.reconstructions import read_reconstruction
-from speckle3d.live.progress import Progress
 
 
 def start(*arguments):
@@ -66,14 +62,3 @@ def test_a_played_sweep_is_recorded_placed_and_reconstructed_as_off_line(player,
     poses = read_reconstruction(out / "reconstruction.h5").poses["image"]
     expected = s3.track(sweep, s3.load_curves(curves)).image
     np.testing.assert_allclose(poses.as_matrix(), expected.as_matrix(), atol=1e-9)
-
-
-def test_progress_takes_one_line_of_a_narrow_terminal(monkeypatch, capsys):
-    monkeypatch.setenv("COLUMNS", "40")
-    monkeypatch.setenv("FORCE_COLOR", "1")
-    progress = Progress(frames=123, words="not overlapping: go back to where it was")
-    session = SimpleNamespace(run=lambda _, show: show(progress))
-    _run(session, None, SimpleNamespace(state=LinkState(peers=1)), "localhost:18944")
-    text = capsys.readouterr().err
-    assert "123 frames" in text
-    assert text.count("\n") == 1
