@@ -56,10 +56,14 @@ def contradictions(log: ImuLog) -> dict[str, str]:
     directions = {"accelerometer": force, "magnetometer": field, "own orientation": log.own_direction}
     sentences = {"gyroscope": "" if log.gyroscope_rad_s is None else _not_in_radians(log.gyroscope_rad_s)}
     for name, direction in directions.items():
-        turns = None if direction is None else _turns(log, direction, name == "magnetometer")
+        turns = None if direction is None else _turns(log, direction)
         if turns is not None:
             sentences["gyroscope"] = sentences["gyroscope"] or _still_axis(name, *turns)
             sentences[name] = _against_gyroscope(name, *turns[:2])
+            if sentences[name] and field is not None and direction is field:
+                freed = _turns(log, _without_iron(log, field))
+                if freed is not None and len(freed[1]) >= len(turns[1]):  # as steady as before, or more
+                    sentences[name] = _against_gyroscope(name, *freed[:2])
     if force is not None:
         sentences["gravity"] = not_in_metres(force)
         sentences["dip"] = "" if field is None else _upward_field(force, field)
@@ -95,12 +99,8 @@ def _upward_field(force: FloatArray, field: FloatArray) -> str:
     )
 
 
-def _turns(
-    log: ImuLog, direction: FloatArray, magnetic: bool
-) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray] | None:
+def _turns(log: ImuLog, direction: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray] | None:
     """What the gyroscope's turns make of a direction that rests in the world; None if it tells nothing.
-
-    From a magnetic one the field of iron on the sensor is taken off first.
 
     Returns
     -------
@@ -124,12 +124,6 @@ def _turns(
     means = columns[: count * width].reshape(count, width, 7).mean(axis=1)
     step_s, rates = np.diff(means[:, 0]), means[:, 1:4]
     rate = 0.5 * (rates[1:] + rates[:-1])
-    if magnetic:  # less the field b of iron on the sensor, with which it changes at the rate u x w + w x b
-        off = np.diff(means[:, 4:], axis=0) / step_s[:, None] - np.cross(
-            0.5 * (means[1:, 4:] + means[:-1, 4:]), rate
-        )
-        by_axis = np.cross(rate[:, None], np.eye(3)).swapaxes(1, 2)
-        means[:, 4:] -= np.linalg.lstsq(by_axis.reshape(-1, 3), off.ravel())[0]
     norm = np.linalg.norm(means[:, 4:], axis=1)
     calm = np.abs(norm / np.median(norm) - 1.0) < _CALM
     calm = calm[1:] & calm[:-1] & (step_s < 2.0 * np.median(step_s))
@@ -143,6 +137,17 @@ def _turns(
         return None
     same = np.diff(rates, axis=0)[calm].T == 0.0
     return turns, change, arms, same & ~same.all(axis=0)
+
+
+def _without_iron(log: ImuLog, field: FloatArray) -> FloatArray:
+    """The field less that of iron on the sensor, b: with it the field changes at the rate u x w + w x b."""
+    assert log.gyroscope_rad_s is not None
+    rows = finite_rows(log.gyroscope_rad_s) & finite_rows(field)
+    seen, step_s = field[rows], np.diff(log.time_s[rows])[:, None]
+    turn = log.gyroscope_rad_s[rows][1:] * step_s
+    off = np.diff(seen, axis=0) - np.cross(0.5 * (seen[1:] + seen[:-1]), turn)
+    by_axis = np.cross(turn[:, None], np.eye(3)).swapaxes(1, 2)
+    return field - np.linalg.lstsq(by_axis.reshape(-1, 3), off.ravel())[0]
 
 
 def _still_axis(name: str, turns: FloatArray, change: FloatArray, arms: FloatArray, same: BoolArray) -> str:
@@ -162,11 +167,12 @@ def _against_gyroscope(name: str, turns: FloatArray, change: FloatArray) -> str:
     for axis, turn in (("", whole), *zip((" x", " y", " z"), turns, strict=True)):
         rate, share = _rms(turn), 1.0 + (turn * (change - whole)).sum() / max((turn**2).sum(), 1e-12)
         if rate * max(share, 1.0) > _TURNING_RAD_S and not _HONEST_SHARES[0] < share < _HONEST_SHARES[1]:
-            doubt = "in rad/s" if share > 20.0 else "as it is told, in rate, axes and signs"
+            doubt = "are rate, axes and signs as they are told"
+            if 0.0 < share < 0.05 or share > 20.0:
+                doubt = f"is the gyroscope in {'rad' if share > 1.0 else 'deg'}/s"
             return (
                 f"gyroscope{axis} and {name} contradict each other: the one turns by {rate:.2g} rad/s, the "
-                f"other shows {100.0 * share:.3g} % of it: is the gyroscope "
-                f"{'in deg/s' if 0.0 < share < 0.05 else doubt}?"
+                f"other shows {100.0 * share:.3g} % of it: {doubt}?"
             )
     return ""
 

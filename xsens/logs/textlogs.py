@@ -117,7 +117,46 @@ def _mt9_export(table: TextTable) -> TextTable:
 
 def _samples(table: TextTable, rate_hz: float | None) -> Parts:
     """Samples of a table whose columns are known, at a rate that the header may name."""
-    columns, notes = dict(table.columns), list[str]()
+    notes = list[str]()
+    columns, stamps, dot = _stamps(table, rate_hz, notes)
+    force, rate, field = (_side_by_side(columns, keys) for keys in _VECTORS)
+    if rate is not None and dot and "gyr_x" not in table.with_unit:
+        rate = np.deg2rad(rate)
+    if force is None and any(key.startswith("free_") for key in columns):
+        force = _side_by_side(columns, [f"free_{axis}" for axis in "xyz"])
+        if force is None or np.nanmedian(np.linalg.norm(force, axis=1)) < _GRAVITY_M_S2:
+            force = None
+            notes.append("acceleration without gravity is no accelerometer's reading and was left out")
+    increments = (_side_by_side(columns, _VELOCITY_STEPS), _side_by_side(columns, _TURNS))
+    claim: Claim | None = _claim(table, dot)
+    orientation = otherwise = None
+    otherwise_note = ""
+    for keys in (_OPTICAL, _QUATERNION, _MATRIX, _EULER):
+        orientation = _side_by_side(columns, keys) if orientation is None else orientation
+    if _side_by_side(columns, _OPTICAL) is not None:
+        claim = None
+        notes.append("orientation: by cameras, in a world of their own: x and z need not be north and up")
+    elif orientation is not None and orientation.shape[1] == 4:
+        otherwise, otherwise_note = np.roll(orientation, 1, axis=1), "the scalar is the last number"
+    elif orientation is not None and _unit_open(table, orientation):
+        otherwise, otherwise_note = np.degrees(orientation), "angles are in radians"
+        if force is None:
+            raise InvalidInputError("expected angles with their unit, as roll_deg, got small ones without")
+    odd = _unknown_columns(table)
+    if all(part is None for part in (force, rate, field, orientation, *increments)):
+        columns_text = "; ".join(odd) or describe_unknown(table.names)
+        raise InvalidInputError(
+            f"expected columns of acceleration, rate of turn, field or orientation, {columns_text}"
+        )
+    vectors, all_notes = (force, rate, field), (*odd, *notes)
+    return Parts(stamps, vectors, orientation, claim, all_notes, increments, otherwise, otherwise_note)
+
+
+def _stamps(
+    table: TextTable, rate_hz: float | None, notes: list[str]
+) -> tuple[dict[str, FloatArray], Stamps, bool]:
+    """Columns without the lines that have no time, their stamps, and whether they are a DOT's."""
+    columns = dict(table.columns)
     rate_line = _RATE.search("\n".join(table.header))
     if rate_hz is None and rate_line:
         rate_hz = number(rate_line[1])
@@ -127,20 +166,7 @@ def _samples(table: TextTable, rate_hz: float | None) -> Parts:
             notes.append(f"{key}: the same in every line, left out")
             del columns[key]
     if "time" in columns and table.names and "time" not in table.with_unit:
-        times = columns.pop("time")
-        unit = _unit_of(times, TIMES)
-        if unit is not None:
-            columns["time"] = times * TIMES[unit]
-            if unit != "s":
-                notes.append(f"times without a unit: taken as in {unit}, by their steps")
-        elif np.isnan(period_s) or np.nanmax(times % 1.0) > 0.0:
-            raise InvalidInputError(
-                f"expected a time with its unit, as time_s or time_ms, got steps of {_usual_step(times):g}: "
-                "if they count samples, give --rate-hz"
-            )
-        else:
-            columns.setdefault("counter", times)
-            notes.append("times without a unit: taken for the samples' numbers")
+        columns |= _unnamed_time(columns.pop("time"), np.isfinite(period_s), notes)
     if not columns.keys() & {"time", "ticks"} and (utc_s := _utc_s(columns)) is not None:
         columns["time"] = utc_s
     if table.names and np.isnan(period_s) and not columns.keys() & set(STAMPS):
@@ -165,41 +191,21 @@ def _samples(table: TextTable, rate_hz: float | None) -> Parts:
         time_s = ticks * _TICKS["DOT" if dot else "MT Manager"]
     if counter is not None:
         counter = unwrap(counter.astype(np.int64), TICKS if dot else COUNTS)
-    force, rate, field = (_side_by_side(columns, keys) for keys in _VECTORS)
-    if rate is not None and dot and "gyr_x" not in table.with_unit:
-        rate = np.deg2rad(rate)
-    if force is None and any(key.startswith("free_") for key in columns):
-        force = _side_by_side(columns, [f"free_{axis}" for axis in "xyz"])
-        if force is None or np.nanmedian(np.linalg.norm(force, axis=1)) < _GRAVITY_M_S2:
-            force = None
-            notes.append("acceleration without gravity is no accelerometer's reading and was left out")
-    plain = "time" in table.columns
-    odd = _unknown_columns(table)
-    increments = (_side_by_side(columns, _VELOCITY_STEPS), _side_by_side(columns, _TURNS))
-    claim = otherwise = None
-    otherwise_note = "the scalar is the last number"
-    if (orientation := _side_by_side(columns, _OPTICAL)) is not None:
-        notes.append("orientation: by cameras, in a world of their own: x and z need not be north and up")
-    else:
-        claim = _claim(table, plain, dot)
-        notations = (_side_by_side(columns, keys) for keys in (_QUATERNION, _MATRIX, _EULER))
-        orientation = next((rows for rows in notations if rows is not None), None)
-        if orientation is not None and orientation.shape[1] == 4:
-            otherwise = np.roll(orientation, 1, axis=1)
-        elif orientation is not None and _unit_open(table, plain, orientation):
-            otherwise, otherwise_note = np.degrees(orientation), "angles are in radians"
-            if force is None:
-                raise InvalidInputError(
-                    "expected angles with their unit, as roll_deg, got small ones without"
-                )
-    if all(part is None for part in (force, rate, field, orientation, *increments)):
-        columns_text = "; ".join(odd) or describe_unknown(table.names)
+    return columns, Stamps(counter, time_s, period_s), dot
+
+
+def _unnamed_time(times: FloatArray, has_rate: bool, notes: list[str]) -> dict[str, FloatArray]:
+    """Times without a unit as the column that they are: times in s, or else the samples' numbers."""
+    unit = _unit_of(times, TIMES)
+    if unit is None and (not has_rate or np.nanmax(times % 1.0) > 0.0):
         raise InvalidInputError(
-            f"expected columns of acceleration, rate of turn, field or orientation, {columns_text}"
+            f"expected a time with its unit, as time_s or time_ms, got steps of {_usual_step(times):g}: "
+            "if they count samples, give --rate-hz"
         )
-    stamps = Stamps(counter, time_s, period_s)
-    vectors, all_notes = (force, rate, field), (*odd, *notes)
-    return Parts(stamps, vectors, orientation, claim, all_notes, increments, otherwise, otherwise_note)
+    if unit != "s":
+        meaning = "for the samples' numbers" if unit is None else f"as in {unit}, by their steps"
+        notes.append(f"times without a unit: taken {meaning}")
+    return {"counter": times} if unit is None else {"time": times * TIMES[unit]}
 
 
 def _usual_step(times: FloatArray) -> float:
@@ -215,10 +221,10 @@ def _unit_of(times: FloatArray, units: dict[str, float]) -> str | None:
     return next((unit for unit, scale in units.items() if low <= value * scale <= high), None)
 
 
-def _unit_open(table: TextTable, plain: bool, angles: FloatArray) -> bool:
-    """Whether angles name no unit and may be in radians."""
-    unnamed = plain and bool(table.names) and "euler_roll" not in table.with_unit
-    return unnamed and angles.shape[1] == 3 and np.nanmax(np.abs(angles), initial=0.0) < _HALF_TURN
+def _unit_open(table: TextTable, angles: FloatArray) -> bool:
+    """Whether angles of a table that is no program's export name no unit, and may be in radians."""
+    stated = "euler_roll" in table.with_unit or "time" not in table.columns or not table.names
+    return not stated and angles.shape[1] == 3 and np.nanmax(np.abs(angles), initial=0.0) < _HALF_TURN
 
 
 def _utc_s(columns: dict[str, FloatArray]) -> FloatArray | None:
@@ -241,12 +247,12 @@ def _side_by_side(columns: dict[str, FloatArray], keys: list[str]) -> FloatArray
     return np.stack(vectors, axis=1) if len(vectors) == len(keys) else None
 
 
-def _claim(table: TextTable, plain: bool, dot: bool) -> Claim:
+def _claim(table: TextTable, dot: bool) -> Claim:
     """World of the orientations as the header says, or as its program has it."""
     for line in table.header:
         if match := _WORLD.match(line):
             return Claim(match[2].upper(), "as the file says", final=match[1] == "# world")
-    if plain:
+    if "time" in table.columns:
         by = "as plain files are" if table.names else "as the MT9 software's are"
         return Claim("NWU", by, by_default=bool(table.names))
     return Claim("ENU", "as the sensor's are" if dot else "the program's default", by_default=True)

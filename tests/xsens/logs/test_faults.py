@@ -164,11 +164,22 @@ def test_what_a_sensor_may_repeat_is_a_measurement():
 FACTORS = (np.rad2deg(1.0), np.deg2rad(1.0), 1.5, 0.6, -1.0, 0.0)
 
 
-@pytest.mark.parametrize("mixing", [*(factor * np.eye(3) for factor in FACTORS), np.eye(3)[[1, 0, 2]]])
+MIXINGS = [*(factor * np.eye(3) for factor in FACTORS), np.eye(3)[[1, 0, 2]], np.diag([0.0, 1.0, 1.0])]
+
+
+@pytest.mark.parametrize("mixing", MIXINGS)
 def test_a_gyroscope_in_another_unit_rate_or_axes_or_a_dead_one_raises(mixing):
     log, _ = swinging(20.0)
     with pytest.raises(Speckle3DError, match="gyroscope"):
         orient(with_rows(log, [VECTORS[1]], lambda rows: rows @ mixing))
+
+
+def test_a_magnetometer_on_other_axes_is_left_out():
+    log, _ = swinging(20.0)
+    orientation = orient(with_rows(log, [VECTORS[2]], lambda rows: rows[:, [1, 0, 2]] * [1, 1, -1]))
+    assert not orientation.magnetic
+    assert "magnetometer" in orientation.notes[0]
+    assert orient(with_rows(log, [VECTORS[2]], lambda rows: rows + 0.6)).magnetic  # iron on the sensor
 
 
 NAMES = "time_s," + ",".join(f"{kind}_{axis}" for kind in ("acc", "gyr", "mag") for axis in "xyz")

@@ -227,6 +227,18 @@ def test_angles_that_name_no_unit_are_what_gravity_shows(s, factor):
         parse_text("time_s,roll,pitch,yaw\n0,0.1,0.2,1.0\n0.1,0.1,0.2,1.0\n")
 
 
+@pytest.mark.parametrize("names", ["OriInc_q{} VelInc_{}", "Delta_q_{} dv[{}]"])
+def test_increments_over_the_sampling_period_are_rates(s, names):
+    turns = Rotation.from_rotvec(s["gyroscope_rad_s"] / 100.0).as_quat(scalar_first=True)
+    turn, step = names.split()
+    head = [turn.format(i) for i in (range(4) if "q{}" in turn else "wxyz")]
+    head += [step.format(i) for i in ("123" if "[" in step else "XYZ")]
+    rows = lines([np.arange(60), turns, s["accelerometer_m_s2"] / 100.0], digits=9)
+    log = parse_text("// Update Rate: 100.0Hz\nPacketCounter\t" + "\t".join(head) + "\n" + rows)
+    for name in VECTORS[:2]:
+        np.testing.assert_allclose(getattr(log, name), s[name], atol=1e-6)
+
+
 def test_of_two_times_without_units_the_first_counts():
     log = parse_text("time,timestamp,acc_x,acc_y,acc_z\n0.00,5,0,0,9.8\n0.02,9,0,0,9.8\n0.04,13,0,0,9.8\n")
     np.testing.assert_allclose(log.time_s, [0.0, 0.02, 0.04])
