@@ -34,6 +34,9 @@ if the unit is deg/s, another if the rate of samples is, -1 or about 0 if axes a
 and simulated hands show 0.78 to 1.16, by the field 0.91 to 1.16; rocking once a second about a point 0.07 m
 above the sensor shows 0.7, 0.12 m below it 1.5."""
 
+_TIMES_LARGER = 3.0
+"""Share from which the other's turn counts, not the gyroscope's: no hand's movement makes so much."""
+
 _ABOUT_AXIS = 0.9
 """Share of the turn missed by a gyroscope that is about an axis which stands still. By the field, BROAD's
 trials with an axis set to zero show 0.8 to 1.0, and any axis as it is 0.4 to 0.91."""
@@ -166,7 +169,8 @@ def _against_gyroscope(name: str, turns: FloatArray, change: FloatArray) -> str:
     whole = turns.sum(axis=0)
     for axis, turn in (("", whole), *zip((" x", " y", " z"), turns, strict=True)):
         rate, share = _rms(turn), 1.0 + (turn * (change - whole)).sum() / max((turn**2).sum(), 1e-12)
-        if rate * max(share, 1.0) > _TURNING_RAD_S and not _HONEST_SHARES[0] < share < _HONEST_SHARES[1]:
+        larger = share if share > _TIMES_LARGER else 1.0
+        if rate * larger > _TURNING_RAD_S and not _HONEST_SHARES[0] < share < _HONEST_SHARES[1]:
             doubt = "are rate, axes and signs as they are told"
             if 0.0 < share < 0.05 or share > 20.0:
                 doubt = f"is the gyroscope in {'rad' if share > 1.0 else 'deg'}/s"

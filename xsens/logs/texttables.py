@@ -87,7 +87,7 @@ _COLUMNS: tuple[tuple[str, str, str, Mapping[str, float], Mapping[str, str]], ..
         {},
     ),
     ("ticks", "sampletimefine", "", {}, {}),
-    ("utc", "utc|(?:header_)?stamp", "hour|minute|s|nano|ns", {}, {"ns": "nano"}),
+    ("utc", "utc|(?:header_)?stamp", "year|month|day|hour|minute|s|nano|ns", {}, {"ns": "nano"}),
 )
 """Quantity; its names with other characters than letters and digits as underscores, and those of its axes;
 factors from its units to SI, angles to degrees, while fields stay in theirs; axes by their other names."""

@@ -175,7 +175,7 @@ def world_of(
         sensors = f"its own accelerometer, while the magnetometer has north {north_deg:.0f} degrees from x"
     chosen = world if claim.final else evident
     note = f"orientation: {chosen} ({claim.by}: {world}; by {sensors}: {evident}); --world decides"
-    told = world != evident or claim.by_default or (np.isfinite(north_deg) and not by_north)
+    told = world != evident or (not by_north and (claim.by_default or np.isfinite(north_deg)))
     return chosen, ((note,) if told else ())
 
 
