@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import binom
 
+from calibration.motion import DOUBTS
 from calibration.points import ImagePoints, affine_equations
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError
@@ -91,9 +92,8 @@ class Consensus:
             raise InsufficientDataError(
                 f"expected one point that the frames agree on beyond chance, got {self.inliers.sum()} "
                 f"of {len(self.inliers)} frames within {self.gate_mm:g} mm, which chance gives "
-                f"{self.false_alarms:.2g} times a recording (limit {FALSE_ALARMS:g}): do the images and the "
-                "sensor readings belong together, and do they show a crossing? Points picked by hand, or a "
-                "region to look in, would help"
+                f"{self.false_alarms:.2g} times a recording (limit {FALSE_ALARMS:g}): {DOUBTS} "
+                "Points picked by hand, or a region to look in, would help"
             )
         return self
 

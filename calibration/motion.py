@@ -63,9 +63,9 @@ SIDEWAYS = "shift the probe sideways (the phantom then appears elsewhere across 
 UP_AND_DOWN = "move the probe up and down (the phantom then appears at other depths)"
 MOTIONS = (TILT, YAW, ROLL, SIDEWAYS, UP_AND_DOWN)
 
-_DOUBTS = (
-    "do images and readings belong together (one clock, one order, readings in mm), and are the phantom, its "
-    "wires and their numbers the ones named?"
+DOUBTS = (
+    "do images and readings belong together (one clock, one order, right-handed, in mm), and are the "
+    "phantom, its wires and their numbers the ones named?"
 )
 _WORDS = (
     "the distance between columns", "the distance between rows",
@@ -107,15 +107,24 @@ class InadequateError(InsufficientDataError):
         self.solution = solution
 
 
-def require_adequate(solution: Solution) -> Solution:
+def require_adequate(solution: Solution, pixel_mm: FloatArray | None = None) -> Solution:
     """Return `solution` if its motion was sufficient.
+
+    Parameters
+    ----------
+    pixel_mm : ndarray, shape (2,), optional
+        Pixel size as the images have it, roughly.
 
     Raises
     ------
     InadequateError
         Naming the missing motions, if the answer is too uncertain to be used, or another explains the
-        images as well; or if the phantom does not explain the images.
+        images as well; or if the phantom does not explain the images, or readings have another unit.
     """
+    size = solution.chain.pixel_mm
+    if pixel_mm is not None and np.abs(np.log(size / pixel_mm)).max() > np.log(OBLONG):
+        sizes = f"pixels of {size.mean():.2g} mm where the images have {np.mean(pixel_mm):.2g}"
+        raise InadequateError(f"expected readings of the images' scale, got {sizes}: {DOUBTS}", solution)
     if solution.adequacy.refused:
         raise InadequateError(solution.adequacy.verdict, solution)
     return solution
@@ -133,7 +142,7 @@ def judge(solution: Solution) -> Adequacy:
     # Where residuals of the usual size would not determine the answer, the misfit comes from the motion: the
     # solver runs away in the direction left open.
     if rms > MISFIT[int(angular)] and usual / rms * float((white / LIMITS).max()) <= _LET_PASS:
-        misfit = f"the phantom does not explain the images (they miss it by {_size(rms, angular)}): {_DOUBTS}"
+        misfit = f"the phantom does not explain the images (they miss it by {_size(rms, angular)}): {DOUBTS}"
         return Adequacy(error, (), True, misfit)
     ambiguous = solution.evidence < TIE
     extent_of = extents(solution)
@@ -148,7 +157,7 @@ def judge(solution: Solution) -> Adequacy:
     noisy = rms > usual and not lacking
     missing = tuple(lacking) if weak or inadequate else ()
     if (weak or inadequate) and not lacking:
-        doubt = f"the images miss the phantom by {_size(rms, angular)} (RMS); {_DOUBTS}"
+        doubt = f"the images miss the phantom by {_size(rms, angular)} (RMS); {DOUBTS}"
         missing = (doubt if noisy else min(extent_of, key=extent_of.__getitem__),)
     state = f"standard error {_size(error, angular)}" + ("" if angular else " at the image's corners")
     if not angular and np.argmax(errors / LIMITS) == 1:

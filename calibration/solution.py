@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.special import ndtr, stdtrit
 
-from calibration.motion import Adequacy, judge
+from calibration.motion import DOUBTS, Adequacy, judge
 from calibration.noise import fit_noise
 from calibration.points import CHAIN, POSE, PROBE, SOME_FRAMES, ImagePoints, columns_of
 from calibration.robust import autocorrelation_time
@@ -275,8 +275,7 @@ class Problem:
             frames, agreeing = len(points.frames), len(np.unique(points.frame[inliers]))
             if 2 * agreeing <= frames:
                 raise InsufficientDataError(
-                    f"expected most frames to agree on one calibration, got {agreeing} of {frames}: do the "
-                    "images and the sensor readings belong together, and is the phantom the one named?"
+                    f"expected most frames to agree on one calibration, got {agreeing} of {frames}: {DOUBTS}"
                 )
             sigma, before = sigma_of(residuals[inliers]), inliers
             chain = equations[inliers].least_squares(chain, self.free, self.prior, sigma)

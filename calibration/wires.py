@@ -97,7 +97,7 @@ def calibrate_cross_wire(
     consensus = find_consensus(points, pixel_mm)
     if not consensus.is_significant and len(points) == len(points.frames):
         # Poor motion, too, can leave no consensus; then that is said.
-        require_adequate(problem.best(points, [wire_start(points, problem, _AS_IT_IS)[0]]))
+        require_adequate(problem.best(points, [wire_start(points, problem, _AS_IT_IS)[0]]), pixel_mm)
     consensus.require()
     agreeing = points[consensus.nearest[consensus.inliers]]
     first = problem.solve(agreeing, wire_start(agreeing, problem, _AS_IT_IS)[0])
@@ -108,7 +108,8 @@ def calibrate_cross_wire(
     solution = _beside(problem.best(crossings[inliers], [first.chain]), s.beside_mm)
     inliers[inliers] = solution.used
     residuals = phantom.equations(crossings).residuals(solution.chain)
-    return require_adequate(replace(solution, points=crossings, used=inliers, residuals=residuals))
+    solution = replace(solution, points=crossings, used=inliers, residuals=residuals)
+    return require_adequate(solution, pixel_mm)
 
 
 def _beside(solution: Solution, beside_mm: float) -> Solution:
@@ -153,7 +154,7 @@ def calibrate_wires(
     InsufficientDataError
         If there are too few points, they contradict each other, or the motion does not determine the answer.
     """
-    return require_adequate(solve_wires(points, geometry, pixel_mm, settings))
+    return require_adequate(solve_wires(points, geometry, pixel_mm, settings), pixel_mm)
 
 
 def solve_wires(

@@ -157,5 +157,5 @@ def test_few_good_lines_are_kept_and_their_errors_claimed():
 def test_readings_in_centimetres_are_not_taken_for_a_lack_of_motion():
     poses = (right := lines(noise_mm=0.2)).world_from_sensor
     shrunk = RigidTransform.from_components(poses.translation / 10.0, poses.rotation)
-    with pytest.raises(InsufficientDataError, match="readings in mm"):
+    with pytest.raises(InsufficientDataError, match="right-handed, in mm"):
         calibrate_plane(ImagePoints(right.pixels, right.frame, shrunk), PIXEL_MM)
