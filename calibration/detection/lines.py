@@ -54,10 +54,6 @@ _LEAST_SHARE = 0.25
 corner of the region, two or three noisy edges always agree."""
 
 
-class NoLineError(InsufficientDataError):
-    """An image shows no line that can be trusted; the message says why."""
-
-
 @dataclass(frozen=True)
 class EchoLine:
     """The line of a plane's echo in one image.
@@ -138,14 +134,16 @@ class LineFinder:
 
         Raises
         ------
-        NoLineError
+        InsufficientDataError
             If too few columns agree on a line.
         """
         s, columns = self.settings, self.columns
         samples, inside = np.asarray(image[columns.column], np.float32), columns.inside
         levels = samples[inside]
         if not (levels.size and 0 < np.ptp(levels) < np.inf):
-            raise NoLineError("no line: the image is of one level all over, or its values are not finite")
+            raise InsufficientDataError(
+                "no line: the image is of one level, or its values are not finite"
+            )
         row_mm = float(self.pixel_mm[1])
         tolerance, sigma, samples = s.tolerance_mm / row_mm, s.smoothing_mm / row_mm, columns.fill(samples)
         levels = gaussian_filter1d(samples, _FINE * sigma, truncate=_REACH, mode="nearest")
@@ -184,7 +182,7 @@ class LineFinder:
         lines = [line for line in candidates if line.consensus >= self._least_consensus(line)]
         if not lines:
             best = max(candidates, key=lambda line: line.consensus)
-            raise NoLineError(
+            raise InsufficientDataError(
                 f"no line: {best.consensus} of {best.possible} possible columns agree, "
                 f"{self._least_consensus(best)} needed"
             )

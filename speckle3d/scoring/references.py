@@ -105,10 +105,8 @@ def find_reference(sweep: Sweep, name: str | None = None) -> Reference | None:
         return Reference.over_all("truth", sweep.truth)
     if name == "truth":
         raise InsufficientDataError(f"{sweep.name}: expected true poses in /truth, got none")
-    if sweep.tracker is not None and sweep.tracker.sensor_from_image is not None:
-        mask = sweep.tracker.covers(sweep.frame_time_s)
-        if mask.sum() >= 2:
-            return Reference("tracker", sweep.tracker.world_from_image(sweep.frame_time_s[mask]), mask)
+    if (reference := _of_tracker(sweep)) is not None:
+        return reference
     if name == "tracker":
         raise InsufficientDataError(f"{sweep.name}: expected a calibrated tracker over the frames, got none")
     return None
@@ -116,10 +114,15 @@ def find_reference(sweep: Sweep, name: str | None = None) -> Reference | None:
 
 def tracker_alone(sweep: Sweep) -> RigidTransform | None:
     """Poses by the position sensor alone, no images; None unless it is calibrated and covers every frame."""
+    reference = _of_tracker(sweep)
+    return reference.world_from_image if reference is not None and reference.covered.all() else None
+
+
+def _of_tracker(sweep: Sweep) -> Reference | None:
     tracker, times = sweep.tracker, sweep.frame_time_s
-    if tracker is None or tracker.sensor_from_image is None or not tracker.covers(times).all():
+    if tracker is None or tracker.sensor_from_image is None or (mask := tracker.covers(times)).sum() < 2:
         return None
-    return tracker.world_from_image(times)
+    return Reference(TRACKER, tracker.world_from_image(times[mask]), mask)
 
 
 def sweep_curves(

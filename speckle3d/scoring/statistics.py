@@ -7,7 +7,7 @@ no interval is given.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -20,21 +20,10 @@ _RESAMPLES = 9999
 _SEED = 20081
 
 
-@dataclass(frozen=True)
-class MeanInterval:
-    """Mean over sweeps and its bootstrap interval, in the unit of the values.
+def mean_interval(values: npt.ArrayLike) -> dict[str, Any]:
+    """``sweeps``, their ``mean``, and ``low`` and ``high`` end of its 95 % interval, in the values' unit.
 
-    `low` and `high` are None where the sweeps are too few or all alike.
-    """
-
-    sweeps: int
-    mean: float
-    low: float | None
-    high: float | None
-
-
-def mean_interval(values: npt.ArrayLike) -> MeanInterval:
-    """Mean of one value per sweep, with its 95 % percentile bootstrap interval [1]_; seeded, so it repeats.
+    By a percentile bootstrap [1]_, seeded, so that it repeats; None where sweeps are too few or all alike.
 
     References
     ----------
@@ -45,7 +34,7 @@ def mean_interval(values: npt.ArrayLike) -> MeanInterval:
         rng = np.random.default_rng(_SEED)
         bootstrap = stats.bootstrap((sample,), np.mean, n_resamples=_RESAMPLES, method="percentile", rng=rng)
         low, high = map(float, bootstrap.confidence_interval)
-    return MeanInterval(sample.size, float(sample.mean()), low, high)
+    return {"sweeps": sample.size, "mean": float(sample.mean()), "low": low, "high": high}
 
 
 def signed_rank_p(differences: npt.ArrayLike) -> float | None:

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import asdict
 from itertools import combinations
 from typing import Any
 
@@ -85,7 +84,7 @@ def over_sweeps(
         values = _by_mode(quantity, rows if quantity in ERRORS else drift)
         for mode, by_sweep in values.items():
             interval = mean_interval([*by_sweep.values()])
-            intervals.append({"quantity": quantity, "mode": mode, **asdict(interval)})
+            intervals.append({"quantity": quantity, "mode": mode, **interval})
         comparisons += _compare_pairs(quantity, values)
     return intervals, comparisons
 
@@ -167,7 +166,7 @@ def _compare_pairs(quantity: str, values: Mapping[str, Mapping[str, float]]) -> 
         first, second = values[mode], values[against]
         differences = [first[sweep] - second[sweep] for sweep in first if sweep in second]
         if len(differences) >= FEWEST:
-            row = asdict(mean_interval(differences))
+            row = mean_interval(differences)
             row |= {"difference": row.pop("mean"), "wilcoxon_p": signed_rank_p(differences)}
             rows.append({"quantity": quantity, "mode": mode, "against": against, **row})
     for row, holm_p in zip(rows, holm([row["wilcoxon_p"] for row in rows]), strict=True):

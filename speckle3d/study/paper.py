@@ -16,7 +16,7 @@ from __future__ import annotations
 import csv
 import hashlib
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from importlib.metadata import version
 from importlib.resources import files
 from pathlib import Path
@@ -137,7 +137,7 @@ def beside(rows: Rows) -> list[dict[str, Any]]:
     Returns
     -------
     list of dict
-        ``mode``, ``against`` ("published", or a reference of ours), ``quantity`` and its `MeanInterval`.
+        ``mode``, ``against`` ("published", or a reference of ours), ``quantity`` and its `mean_interval`.
         Parts, not sweeps, are the units, as there are 17 in the tables.
     """
     errors = {"published": {mode: [part[mode] for part in paper_errors().values()] for mode in MODES}}
@@ -151,7 +151,7 @@ def beside(rows: Rows) -> list[dict[str, Any]]:
             "mode": mode,
             "against": name,
             "quantity": key,
-            **asdict(mean_interval(np.abs(errors[name][mode])[:, k])),
+            **mean_interval(np.abs(errors[name][mode])[:, k]),
         }
         for k, key in enumerate(QUANTITIES)
         for mode in MODES

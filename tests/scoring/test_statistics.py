@@ -9,8 +9,8 @@ def test_the_interval_of_many_values_is_the_textbook_one():
     interval = mean_interval(values)
     half = 1.96 * values.std() / np.sqrt(400)
     # A percentile from 9999 resamples scatters by about 0.03 standard errors: 4 of these of 1.96.
-    assert interval.low == pytest.approx(values.mean() - half, abs=0.06 * half)
-    assert interval.high == pytest.approx(values.mean() + half, abs=0.06 * half)
+    assert interval["low"] == pytest.approx(values.mean() - half, abs=0.06 * half)
+    assert interval["high"] == pytest.approx(values.mean() + half, abs=0.06 * half)
     assert interval == mean_interval(values)
 
 
@@ -28,8 +28,8 @@ def test_holms_correction_by_hand():
 def test_few_or_equal_values_have_no_interval_and_no_test():
     for values in ([1.0], [1.0, 3.0], [2.0, 2.0, 2.0, 2.0]):
         interval = mean_interval(values)
-        assert (interval.low, interval.high, signed_rank_p(values)) == (None, None, None)
-        assert interval.mean == np.mean(values)
+        assert (interval["low"], interval["high"], signed_rank_p(values)) == (None, None, None)
+        assert interval["mean"] == np.mean(values)
 
 
 def test_the_signs_of_five_sweeps_alike_are_two_of_their_assignments():

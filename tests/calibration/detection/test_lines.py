@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from calibration.detection.lines import LineFinder, NoLineError
+from calibration.detection.lines import LineFinder
 from calibration.settings import LineSettings
+from speckle3d.core.errors import InsufficientDataError
 
 PIXEL_MM = (0.25, 0.08)
 FRONT = LineSettings(place="front")
@@ -113,5 +114,5 @@ def test_images_without_a_line():
     noise = [np.random.default_rng(seed).integers(0, 256, SHAPE, dtype=np.uint8) for seed in range(20)]
     darker = np.tile(np.arange(300, 0, -1.0), (160, 1))
     for image in (*noise, darker, np.zeros(SHAPE), np.where(np.eye(*SHAPE) > 0, np.nan, floor_echo(0))):
-        with pytest.raises(NoLineError):
+        with pytest.raises(InsufficientDataError):
             detect_line(image, FRONT)
