@@ -141,9 +141,7 @@ class LineFinder:
         samples, inside = np.asarray(image[columns.column], np.float32), columns.inside
         levels = samples[inside]
         if not (levels.size and 0 < np.ptp(levels) < np.inf):
-            raise InsufficientDataError(
-                "no line: the image is of one level, or its values are not finite"
-            )
+            raise InsufficientDataError("no line: the image is of one level, or its values are not finite")
         row_mm = float(self.pixel_mm[1])
         tolerance, sigma, samples = s.tolerance_mm / row_mm, s.smoothing_mm / row_mm, columns.fill(samples)
         levels = gaussian_filter1d(samples, _FINE * sigma, truncate=_REACH, mode="nearest")
