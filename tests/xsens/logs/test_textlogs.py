@@ -201,11 +201,6 @@ def test_columns_of_utc_are_a_clock():
         assert parse_text("\n".join(parts)).duration_s == pytest.approx(0.01, abs=1e-6)
 
 
-def test_tables_without_a_time_name_the_columns_that_may_be_it():
-    with pytest.raises(InvalidInputError, match="got clock of day: name it so, or give --rate-hz"):
-        parse_text("clock of day,acc_x,acc_y,acc_z\n1,0,0,9.8\n2,0,0,9.8")
-
-
 def test_acceleration_without_gravity_is_no_accelerometers_reading(s):
     for name, gravity in (("linear_acc", 0.0), ("User Acceleration", 0.0), ("linear_acceleration.", 9.8)):
         columns = [s["time_s"], s["gyroscope_rad_s"], np.tile([0.1, 0.2, gravity], (60, 1))]
@@ -237,8 +232,3 @@ def test_increments_over_the_sampling_period_are_rates(s, names):
     log = parse_text("// Update Rate: 100.0Hz\nPacketCounter\t" + "\t".join(head) + "\n" + rows)
     for name in VECTORS[:2]:
         np.testing.assert_allclose(getattr(log, name), s[name], atol=1e-6)
-
-
-def test_of_two_times_without_units_the_first_counts():
-    log = parse_text("time,timestamp,acc_x,acc_y,acc_z\n0.00,5,0,0,9.8\n0.02,9,0,0,9.8\n0.04,13,0,0,9.8\n")
-    np.testing.assert_allclose(log.time_s, [0.0, 0.02, 0.04])
