@@ -25,7 +25,6 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from calibration.motion import OBLONG, require_adequate
 from calibration.points import ANGLES, CHAIN, SOME_FRAMES, ImagePoints, SeenAs, as_directions, columns_of
-from calibration.robust import absolute_weights, robust_linear
 from calibration.settings import PlaneFit
 from calibration.solution import UNKNOWN, Prior, Problem, Solution, are_distinct
 from speckle3d.core.arrays import BoolArray, FloatArray
@@ -44,6 +43,8 @@ _HOPELESS = 3.0
 """Ends whose mean absolute residual is as many times the least are not looked at again."""
 _TINY = 1e-12
 """Of a normal matrix's diagonal, where residuals do not depend on a parameter at all."""
+_SOLUTIONS, _NEARLY = 4, 0.1
+"""Rounds of weighting; share of the median above which residuals count by their absolute value."""
 _HALF_TURN_Z, _HALF_TURN_X = np.diag([-1.0, -1.0, 1.0, 1.0]), np.diag([1.0, -1.0, -1.0, 1.0])
 """Half a turn about the z axis, and about the x axis."""
 
@@ -282,6 +283,42 @@ def _cross_zyx(a: FloatArray, b: FloatArray) -> FloatArray:
     """Cross product, its z component first; NumPy's own takes five times as long."""
     first, second = [0, 2, 1], [1, 0, 2]
     return np.asarray(a[..., first] * b[..., second] - a[..., second] * b[..., first])
+
+
+def robust_linear(matrix: FloatArray, target: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Solve linear equations, some of which may be wrong, by iteratively reweighted least squares.
+
+    Parameters
+    ----------
+    matrix : ndarray, shape (n, p) or (n, r, p)
+        A group of r rows gets one weight, from the norm of its residuals.
+    target : ndarray, shape (n,) or (n, r)
+
+    Returns
+    -------
+    parameters : ndarray, shape (p,)
+        The smallest, where the equations leave some open.
+    residuals : ndarray, as `target`
+
+    References
+    ----------
+    .. [1] P. W. Holland and R. E. Welsch, "Robust regression using iteratively reweighted least-squares",
+       Commun. Stat. Theory Methods, 1977.
+    """
+    rows, values = matrix.reshape(-1, matrix.shape[-1]), target.ravel()
+    group = values.size // len(target)
+    root = np.ones(values.size)
+    for _ in range(_SOLUTIONS):
+        parameters = np.linalg.lstsq(rows * root[:, None], values * root)[0]
+        residuals = rows @ parameters - values
+        size = np.linalg.norm(residuals.reshape(-1, group), axis=1)
+        root = np.repeat(np.sqrt(absolute_weights(size)), group)
+    return np.asarray(parameters), np.asarray(residuals).reshape(target.shape)
+
+
+def absolute_weights(sizes: FloatArray, axis: int | None = None) -> FloatArray:
+    """Weights by which most residuals count by their absolute value: Huber's, with a tenth of the median."""
+    return np.asarray(1.0 / np.maximum(sizes, _NEARLY * np.median(sizes, axis, keepdims=True) + _TINY))
 
 
 # 3. The plane in three stages (TR 303, appendix A)

@@ -16,7 +16,6 @@ from scipy.special import ndtr, stdtrit
 from calibration.motion import DOUBTS, Adequacy, judge
 from calibration.noise import fit_noise
 from calibration.points import CHAIN, POSE, PROBE, SOME_FRAMES, ImagePoints, columns_of
-from calibration.robust import autocorrelation_time
 from calibration.settings import OUTLIER_SIGMA, PixelSettings
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
@@ -367,6 +366,25 @@ def together(residuals: FloatArray, frame: IntArray) -> float:
     energy = float(np.sum(residuals**2))
     times = [autocorrelation_time(s) * float(s @ s) for s in sums]
     return max(1.0, sum(times) / energy) if energy > 0 else 1.0
+
+
+def autocorrelation_time(residuals: FloatArray) -> float:
+    """How many neighbouring residuals count as one: m / this many of m residuals are independent.
+
+    One plus twice the correlations with neighbours, up to the first lag at which there is none.
+
+    Parameters
+    ----------
+    residuals : ndarray, shape (m,)
+        In order, about zero.
+    """
+    energy, time = max(float(residuals @ residuals), np.finfo(float).tiny), 1.0
+    for lag in range(1, len(residuals) // 4):
+        rho = float(residuals[lag:] @ residuals[:-lag]) / energy
+        if rho <= 0:
+            break
+        time += 2.0 * rho
+    return time
 
 
 def half_turns(chain: Chain, points: ImagePoints, phantom: Phantom) -> list[Chain]:

@@ -20,9 +20,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from calibration.consensus import GATES_MM, find_consensus, nearest_of_frames
 from calibration.motion import require_adequate
-from calibration.plane import Chain, Phantom
+from calibration.plane import Chain, Phantom, robust_linear
 from calibration.points import POSE, SOME_FRAMES, TARGET, ImagePoints, SeenAs, affine_equations
-from calibration.robust import robust_linear
 from calibration.settings import WireFit
 from calibration.solution import Problem, Solution
 from speckle3d.core.arrays import FloatArray

@@ -18,7 +18,7 @@ import numpy as np
 
 from calibration.clock.offset import SEARCH_S, ClockOffset, covered, delays_around, least_between, peak_of
 from calibration.clock.smoothing import SmoothReadings
-from calibration.robust import autocorrelation_time
+from calibration.solution import autocorrelation_time
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.streams import TimedPoses, TimedRotations
