@@ -251,8 +251,8 @@ def fit_noise(
         residuals = values.ravel() + expected + further_slopes @ further
         jacobian = np.hstack([derivatives.reshape(len(further_slopes), -1)[:, columns], further_slopes])
         effects = sensor_effects(exact, chain).reshape(len(further_slopes), 6) @ axes.T
-        known = prior.sigma[columns] ** -2.0, prior.displacement(chain)[columns]
-        certainty, excess = (np.append(values, 0.0 * further) for values in known)
+        beliefs = prior.sigma[columns] ** -2.0, prior.displacement(chain)[columns]
+        certainty, excess = (np.append(values, 0.0 * further) for values in beliefs)
         frames = starts, frame_time_s
         noise, grid = fit_wandering(jacobian, residuals, effects, *frames, grid, certainty, excess)
         residuals += jacobian @ noise.step

@@ -83,9 +83,9 @@ class Prior:
 
     def displacement(self, chain: Chain) -> FloatArray:
         """By how much a chain differs from what is known, in the order of `CHAIN`, shape (14,)."""
-        away, moved = np.zeros(len(CHAIN)), chain.target @ self.world_from_target
-        away[:2], away[8:11] = chain.pixel_mm - self.pixel_mm, moved[:3, 3]
-        away[11:] = 0.5 * (moved - moved.T)[[1, 0, 2], [0, 2, 1]]
+        away, offset = np.zeros(len(CHAIN)), chain.target @ self.world_from_target
+        away[:2], away[8:11] = chain.pixel_mm - self.pixel_mm, offset[:3, 3]
+        away[11:] = 0.5 * (offset - offset.T)[[1, 0, 2], [0, 2, 1]]
         return away
 
     def deviation(self, chain: Chain) -> FloatArray:

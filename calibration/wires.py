@@ -183,8 +183,8 @@ def solve_wires(
     use = "counts as known to 0.5 mm and 1 degree"
     if solution.contradicts_prior:
         solution, use = problem.best(points, [solution.chain]), "does not count"
-    moved = prior.displacement(solution.chain)
-    shift_mm, turn_deg = np.linalg.norm(moved[8:11]), np.rad2deg(np.linalg.norm(moved[11:]))
+    offset = prior.displacement(solution.chain)
+    shift_mm, turn_deg = np.linalg.norm(offset[8:11]), np.rad2deg(np.linalg.norm(offset[11:]))
     assumption = (
         f"the phantom's stated place {use}; the dots put it {shift_mm:.2f} mm and {turn_deg:.1f} degrees off"
     )
