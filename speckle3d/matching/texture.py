@@ -15,7 +15,7 @@ from scipy.signal import welch
 
 from speckle3d.core.arrays import BoolArray, Complex64Array, Float32Array, FloatArray, IntArray
 from speckle3d.core.curves import EchoSpectra, SpeckleSize
-from speckle3d.core.sweep import RFSettings, Sweep, spread_frames
+from speckle3d.core.sweep import BModeSettings, RFSettings, Sweep, spread_frames
 from speckle3d.matching.matcher import FrameMatcher, ReadyFrame
 
 FRAMES = 16
@@ -43,6 +43,8 @@ class _Look(NamedTuple):
         Power of the samples as read, by frequency.
     echo : ndarray, shape (p, k)
         Of each patch, of unit power.
+    step : float
+        Between neighbouring grey levels that occur; 0 of echoes.
     """
 
     size: FloatArray
@@ -50,6 +52,7 @@ class _Look(NamedTuple):
     level: FloatArray
     sampled: FloatArray
     echo: Float32Array
+    step: float
 
 
 class Texture:
@@ -75,6 +78,7 @@ class Texture:
         images = echo.intensity, ready.frame.echo if ready.frame.echo.size else ready.frame.image
         intensity, local_tiles = map(patches.tiles, images)
         power, level, sample_power = np.zeros((0, len(patches))), np.zeros((3, 0)), np.zeros(0)
+        step = 0.0
         if echo.analytic is not None:
             # A vector of each column of patches; frames that are not finite are flagged.
             vectors = np.nan_to_num(ready.samples[np.unique(patches.first[:, 0])], posinf=0.0, neginf=0.0)
@@ -84,9 +88,10 @@ class Texture:
         elif usable.any():
             thinned = intensity[usable, :, ::4].reshape(int(usable.sum()), -1)
             level = np.log(np.percentile(thinned, [10, 50, 90], axis=1))
+            step = float(np.median(np.diff(np.unique(ready.samples))))
         size = _sizes(intensity, patches.spacing_mm)
         size, power = (np.where(usable, values, np.nan) for values in (size, power))
-        self._looks[number] = _Look(size, power, level, sample_power, _unit_echoes(local_tiles))
+        self._looks[number] = _Look(size, power, level, sample_power, _unit_echoes(local_tiles), step)
 
     def leave_out(self, bad: BoolArray) -> None:
         """Forget the frames of a sweep, shape (n,), that are bad, unless all are."""
@@ -110,6 +115,13 @@ class Texture:
         size = np.full(measured_rows.shape, np.nan)
         size[measured_rows] = np.nanmedian(rows[measured_rows], axis=(1, 2))
         return SpeckleSize(*size)
+
+    def grey_step_db(self) -> float:
+        """Between neighbouring grey levels, dB; 0 of echoes."""
+        if not isinstance(self.signal, BModeSettings):
+            return 0.0
+        step = np.median([look.step for look in self._looks.values()])
+        return float(step / self.signal.full_scale * self.signal.dynamic_range_db)
 
     def balance(self) -> float:
         """Spread of dark over that of bright decibels, about the median; infinite where there are none."""

@@ -32,8 +32,8 @@ SMOOTHED = 21
 USABLE_SHARE = 0.8
 """Of the frames in which a patch must be usable to be compared from frame to frame."""
 LEAST_FRAMES = 24
-"""Pairs of neighbouring frames: of parts of simulated sweeps with fewer, one in twenty falls as steeply by
-chance, and most means of two frames do not."""
+"""Pairs of neighbouring frames. With 12 to 16, three to six in a hundred single ones fall as steeply by
+chance, half of a sweep over bone among them, and two of three means of two frames do not."""
 AVERAGED_SLOPE = -0.25
 """Logarithm of the grey levels' spread over correlation lost from frame to frame, below which frames are
 averages. Simulated sweeps of two physics have -0.21 to 0.1; means of two frames -0.37 to -0.7, of three -0.5
@@ -42,6 +42,8 @@ RANGE_EFFECT = 0.2
 """Relative change of distances over that of the dynamic range, either way: phantom and tissue of two physics
 at 40, 60 and 80 dB have 0 to 0.12, smoothed by 3 x 3 and 5 x 5 samples up to 0.2."""
 CONFIDENCE = 0.9
+"""Of the slope's interval, which must end below zero: with -0.1, the median of single frames, fewer images
+black on one side are taken for averages (6 of 100 for 12), and one mean of two frames in four is missed."""
 SHORT_BY_SPREAD = 3.0
 """Length lost over what is lost of the spread: 2 to first order, simulated sweeps have 2 to 4."""
 STRUCTURE_BALANCE = 0.8

@@ -5,10 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from accuracy_set import INDEPENDENT, SHEET
+from spoiled_images import with_frames
 from sweep_examples import frames_of
 
 from speckle3d.config import Config
-from speckle3d.core.errors import InsufficientDataError
+from speckle3d.core.errors import InsufficientDataError, MismatchError
 from speckle3d.examine.images import examine_echoes
 from speckle3d.io.load import load_sweep
 from speckle3d.matching.frames import match_sweep
@@ -35,21 +36,12 @@ def grey(sweep):
 def frame_means(sweep, count):
     """Each frame the mean of some, as scanners in persistence show them."""
     sums = np.cumsum(sweep.frames.astype(float), axis=0)
-    means = (sums[count:] - sums[:-count]) / count
-    times = sweep.frame_time_s[count:]
-    return replace(
-        sweep,
-        frames=np.rint(means).astype(np.uint8),
-        frame_time_s=times,
-        truth=None,
-        tracker=None,
-        orientation=None,
-    )
+    return with_frames(sweep, np.rint((sums[count:] - sums[:-count]) / count), range(count, len(sums)))
 
 
 def matches_of(sweep):
-    c, curves = Config(), data_sheet_curves(SHEET, sweep)
-    return match_sweep(sweep, FrameMatcher(sweep, c, curves), PairSchedule(c.trajectory))
+    matcher = FrameMatcher(sweep, curves=data_sheet_curves(SHEET, sweep))
+    return match_sweep(sweep, matcher, PairSchedule(Config().trajectory))
 
 
 def test_frames_of_one_moment_each_are_not_doubted(grey):
@@ -87,5 +79,7 @@ def test_a_range_that_curves_state_is_taken_for_an_estimated_one(grey):
 def test_grey_levels_cut_off_at_white_are_doubted(grey):
     short, bright = grey.part(0, 8), np.minimum(grey.frames[:8].astype(int) + 90, 255).astype(np.uint8)
     assert examine_echoes(matches_of(short)) == ()
+    with pytest.raises(MismatchError):
+        examine_echoes(matches_of(replace(short, frames=grey.frames[:8] // 32 * 32)))
     (doubt,) = examine_echoes(matches_of(replace(short, frames=bright)))
     assert (doubt.suspect, doubt.refuted) == ("gain", False)
