@@ -114,7 +114,8 @@ def _bad(name: str, rows: FloatArray, force: FloatArray, rate: FloatArray) -> di
         zero &= np.isnan(force[:, 0]) | ~force.any(axis=1)
     if name == VECTORS[2] and (finite & ~zero).any():
         unit = float(np.median(size[finite & ~zero]))
-    beyond = np.abs(rows).max(axis=1) > limits.largest * unit
+    beyond = size > limits.largest * unit
+    beyond[beyond] = np.abs(rows[beyond]).max(axis=1) > limits.largest * unit
     if beyond.sum() > _FEW * finite.sum():  # another unit, which whoever uses the log refuses
         beyond = size >= _ABSURD
     valid, repeats = finite & ~beyond & ~zero, np.zeros(len(rows), dtype=bool)
@@ -185,10 +186,12 @@ def _spikes(rows: FloatArray, height: float) -> BoolArray:
     """Single rows far from both neighbours, which are near each other."""
     if len(rows) < 3:
         return np.zeros(len(rows), dtype=bool)
-    around = np.pad(rows, ((1, 1), (0, 0)), "reflect")
+    around = np.concatenate([rows[1:2], rows, rows[-2:-1]])
     before, after = around[:-2], around[2:]
     away = _norm(rows - 0.5 * (before + after))
-    return np.asarray((away > height) & (_norm(after - before) < 0.2 * away))
+    bad = away > height
+    bad[bad] = _norm((after - before)[bad]) < 0.2 * away[bad]
+    return bad
 
 
 def _require_one_sensor(readings: dict[str, FloatArray]) -> None:
