@@ -34,8 +34,7 @@ class TrajectorySettings(BaseModel):
         0.4,
         gt=0,
         lt=1,
-        description="Median correlation that speckle at a pair's distance must have to be used, where frames "
-        "have enough such pairs: from there on what has decorrelated at the top of the image bends planes.",
+        description="Median correlation with the last frame below which a live sweep is told to go slower.",
     )
     huber: float = Field(2.0, gt=0, description="Standard deviations at which a pair begins to lose weight.")
 

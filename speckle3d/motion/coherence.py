@@ -8,66 +8,70 @@ whose echo is speckle and a share c of structure has
 
 where the gain is what electronic noise leaves, a = 0 stands for structure that does not change and a near 1
 for structure hardly longer than speckle, and s is what the distances of the path are still to be multiplied
-by. Each patch is fitted over the whole sweep, and s is the median over all patches: no patch is judged to
-hold structure or not. Its standard deviation comes from the scatter of the rows of patches, since structure
-lies in layers. Near d = 0 only s^2 (1 - c (1 - a)) is observable, and structure and scale part by the shape
-where r < 0.5 alone: over tissue some 2 % of the scale stay open.
+by. Near d = 0 only s^2 (1 - c (1 - a)) is observable, and structure and scale part by the shape where r < 0.5
+alone: a patch in noise, or of few cells, fits as well with a large share and a scale a quarter too large.
+What a patch says of s is therefore its likelihood averaged over all shares and powers, and s is the likeliest
+for all patches together: no patch is judged to hold structure or not.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import theilslopes
+from scipy.ndimage import map_coordinates
+from scipy.special import log_softmax, logsumexp, softmax
 
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
-from speckle3d.core.leastsquares import robust_sigma
 from speckle3d.core.shown import shown
 from speckle3d.kernels.plane_misfit import EchoModels
 from speckle3d.kernels.statistics import INTERPOLATION, correlation_variance
 from speckle3d.matching.table import CorrelationTable
-from speckle3d.motion.planes import LEVEL_END, MotionProblem, fully_developed
+from speckle3d.motion.planes import MotionProblem, fully_developed
 
-CURVES_SIGMA = 0.002
-"""Relative error of all distances that curves from some twenty independent blocks of phantom have."""
+CURVES_SIGMA = 0.006
+"""Relative error of all distances by curves of some twenty blocks of the same phantom: twelve lengths over
+phantoms of two physics are 0.8 % off, of which rows show half."""
 PIECE_MM = 10.0
 """Travel over which a patch's echo is taken as alike: less does not part structure from scale (12 mm of
 tissue fitted in halves read 1 % longer), more would outlast the tissue's layers."""
 NOISY_GAIN = 0.9
 """Part of the correlation that noise leaves, below which a row is noisy: speckle looks finer, structure
 unsure."""
-ROW_SIGMA, PRIOR_ROWS = 0.06, 10
-"""Scatter of the scales that rows of patches ask for over tissue, and how many rows of the sweep's own it
-counts: simulated tissue of two physics has 0.04 to 0.09, the scatter of 13 rows is known to a third."""
-NO_STRUCTURE = 0.02
-"""Mean share, over rows of patches, below which all speckle is taken as fully developed: simulated phantoms
-have 0.000 to 0.006, tissue 0.05 to 0.14."""
-LEAST_GAIN = 0.5
-"""Part of the correlation that noise leaves from which a patch counts for the scale: with less it is noise
-for the most part. Sweeps without such patches do not depend on it; halved, it moves the length over tissue by
-2 % where attenuation leaves noise at depth, and by 3.5 % under a shadow."""
+ROW_SIGMA = 0.06
+"""Scatter of the scales that patches and rows of them ask for: rows of simulated tissue of two physics have
+0.04 to 0.09. With half of it lengths of the two are 0.03 % rms worse."""
 PHANTOM_SIGMA = 0.15
 """Relative error of distances by a phantom's curves where no patch tells its own scale, as in two frames:
 tissue reads 5 to 25 % short with them."""
+LOOSE = 1.0, 1.0
+"""Standard deviation of yaw and tilt per distance, rad/mm, where nothing tells them."""
 _BIN_EDGES_MM = np.concatenate([np.arange(0.0, 1.0, 0.03), np.arange(1.0, 4.01, 0.15)])
 """Fine where the curves fall, coarse where only structure is left."""
-ROUNDS, LAST_STEP, DIFFERENCE = 30, 1e-3, 1e-6
-"""Most rounds of a fit, the step of its numbers that ends them, and that of derivatives."""
-MOST_SHARE, MOST_POWER = {"echo": 0.5, "intensity": 0.95}, 0.9
-"""Bounds of c, by what is correlated, and of a. An echo that is structure for the most part is r^a alone, a
-curve of another width, and tells no scale; of intensity, structure's share is larger, because its phase does
-not count."""
+PAIRS_PER_FACT = 4.0
+"""Frame pairs per independent piece of information, of some six that a frame has. Over 71 lengths of two
+physics and three arrays, 3 to 6 leave 1.4 % rms: with more, tissue of the other physics reads shorter, with
+fewer a phased array's longer."""
+STEP = 0.04
+LOG_SCALES, POWERS = STEP * np.arange(-20, 21), np.linspace(0.0, 0.8, 5)
+"""Values of ln s and a that are tried: twice as many move lengths by less than 0.1 %."""
+SHARES = np.array([0.0, 0.01, 0.02, 0.03, 0.05, 0.07, 0.1, 0.14, 0.19, 0.25, 0.32, 0.4, 0.5])
+LARGER_SHARES = [0.65, 0.8, 0.95]
+"""Values of c. An echo that is structure for the most part is r^a alone, a curve of another width, and tells
+no scale; of intensity, structure's share is larger, because its phase does not count."""
+LEAST_GAIN, TINY = 0.05, 1e-12
+ROUNDS, LEAST_MEAN = 30, 1e-3
+"""Of the mean share, by expectation and maximisation; and the least that it comes to."""
 
 
 @dataclass(frozen=True)
 class RowScales:
-    """Scale that each row of patches asks for, over that of the path.
+    """Scale that each row of patches asks for, over that of all.
 
     Attributes
     ----------
     depth_mm, logarithm, gain : ndarray, shape (r,)
-        Medians over the patches of a row.
+        Of its patches together; the gain is their median.
     """
 
     depth_mm: FloatArray
@@ -87,8 +91,8 @@ class Coherence:
     share, gain : ndarray, shape (b, p)
     scale : float
         Of all distances over those of the path that they were read from.
-    scale_sigma : float
-        Standard deviation of its logarithm.
+    covariance : ndarray, shape (3, 3)
+        Of its logarithm, and of the yaw and tilt per distance, rad/mm, that errors of distances feign.
     rows : RowScales or None
         None where too few distances tell them.
     """
@@ -96,9 +100,14 @@ class Coherence:
     frame: FloatArray
     share: FloatArray
     gain: FloatArray
-    scale: float = 1.0
-    scale_sigma: float = CURVES_SIGMA
+    scale: float
+    covariance: FloatArray
     rows: RowScales | None = None
+
+    @property
+    def scale_sigma(self) -> float:
+        """Standard deviation of the scale's logarithm."""
+        return float(np.sqrt(self.covariance[0, 0]))
 
     def models(self, frame: IntArray) -> EchoModels:
         """Echo models of pairs about frames of shape (e,): those of the nearest piece."""
@@ -113,74 +122,39 @@ class _Binning:
     Attributes
     ----------
     distance, mean, weight : ndarray, shape (q, bins)
-        Of fully developed speckle that would fall to zero.
+        In steps of the curves' grid; of fully developed speckle that would fall to zero.
     amplitude : ndarray, shape (q, m)
-        Of fully developed speckle, on a grid of `step_mm`.
-    determined : ndarray of bool, shape (q,)
-        Patches seen at enough distances.
+        Of fully developed speckle, on the curves' grid.
     """
 
     distance: FloatArray
     mean: FloatArray
     weight: FloatArray
     amplitude: FloatArray
-    step_mm: float
-    determined: BoolArray
 
-    def fit(
-        self,
-        most_share: float,
-        most_power: float = 0.0,
-        log_scale: float | None = None,
-        sigma: float = np.inf,
-    ) -> FloatArray:
-        """Fit ln s, gain, c and a of every patch by bounded Levenberg-Marquardt, shape (q, 4).
+    def log_likelihood(
+        self, log_scale: float, power: float, share: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Log-likelihood of each patch at its likeliest gain, and that gain, shape (q, c).
 
         Parameters
         ----------
-        most_share, most_power : float
-            Upper bounds of c and a.
-        log_scale : float, optional
-            To which ln s is held; by default each patch tells its own.
-        sigma : float
-            Standard deviation of a normal prior of c about zero.
+        log_scale, power : float
+            ln s and a.
+        share : ndarray, shape (c,)
         """
-        low, high = (-1.0, 1.0) if log_scale is None else (log_scale, log_scale)
-        lowest, highest = np.array([low, 0.05, 0.0, 0.0]), np.array([high, 1.2, most_share, most_power])
-        x = np.tile(np.clip([0.0, 0.95, 0.05, 0.1], lowest, highest), (len(self.mean), 1))
-        misfit = self._misfit(x, sigma)
-        damping = np.full((len(x), 1), 1e-2)
-        for _ in range(ROUNDS):
-            steps = DIFFERENCE * np.eye(4)
-            jacobian = (
-                np.stack([self._misfit(x + step, sigma) - misfit for step in steps], axis=-1) / DIFFERENCE
-            )
-            gradient = np.einsum("kmn,km->kn", jacobian, misfit)
-            free = ~(((x <= lowest) & (gradient > 0)) | ((x >= highest) & (gradient < 0)))
-            normal = np.einsum("kmn,kmo->kno", jacobian, jacobian) * (free[:, :, None] & free[:, None, :])
-            diagonal = np.einsum("knn->kn", normal)
-            diagonal += damping * diagonal + np.where(free, 1e-12, 1.0)
-            step = np.linalg.solve(normal, np.where(free, gradient, 0.0)[:, :, None])[:, :, 0]
-            trial = np.clip(x - step, lowest, highest)
-            trial_misfit = self._misfit(trial, sigma)
-            better = (trial_misfit**2).sum(axis=1) <= (misfit**2).sum(axis=1)
-            largest_step = np.abs(trial - x).max()
-            x[better], misfit[better] = trial[better], trial_misfit[better]
-            damping *= np.where(better, 0.2, 4.0)[:, None]
-            if largest_step < LAST_STEP:
-                break
-        return x
-
-    def _misfit(self, x: FloatArray, sigma: float) -> FloatArray:
-        """Weighted misfits, and c over its deviation, shape (q, bins + 1)."""
-        log_scale, gain, share, power = x.T[:, :, None]
-        last = self.amplitude.shape[1] - 1
-        position = np.minimum(self.distance * np.exp(log_scale) / self.step_mm, last)
-        cell = np.minimum(position, last - 1).astype(int)
-        low, high = (np.take_along_axis(self.amplitude, cell + k, axis=1) for k in (0, 1))
-        speckle = np.maximum(low + (position - cell) * (high - low), 1e-6)
-        echo = (1 - share) * speckle + share * speckle**power
-        return np.append(self.weight * (gain * echo**2 - self.mean), share / sigma, axis=1)
+        row, position = np.indices(self.mean.shape)[0], self.distance * np.exp(log_scale)
+        amplitude = map_coordinates(self.amplitude, [row, position], order=1, mode="nearest")
+        speckle = np.maximum(amplitude, 1e-6)
+        # The squared echo is a sum of three terms, whatever the share.
+        terms = np.stack([speckle**2, 2.0 * speckle ** (1.0 + power), speckle ** (2.0 * power)], axis=1)
+        parts = np.stack([(1.0 - share) ** 2, share * (1.0 - share), share**2])
+        weighted = terms * self.weight[:, None] ** 2
+        product = (weighted @ self.mean[:, :, None])[:, :, 0] @ parts
+        square = np.einsum("ic,qij,jc->qc", parts, weighted @ terms.transpose(0, 2, 1), parts)
+        # Without an echo there is nothing that noise could have taken.
+        gain = (np.maximum(product, LEAST_GAIN * square) + TINY) / (square + TINY)
+        return gain * product - 0.5 * gain**2 * square, gain
 
 
 def _bin_correlations(
@@ -191,18 +165,16 @@ def _bin_correlations(
     curves, levers, grid = problem.at_patches, problem.levers, problem.curves.distance_mm
     travel = np.append(0.0, np.cumsum(np.abs(np.diff(path[:, 0]))))
     pieces = max(1, int(travel[-1] / PIECE_MM))
-    edges = np.searchsorted(travel, np.linspace(0, travel[-1], pieces + 1)[1:-1])
+    ends = np.searchsorted(travel, np.linspace(0, travel[-1], pieces + 1))
     motion = np.zeros((first.size, 3))
     motion[:, : path.shape[1]] = path[second] - path[first]
     z, yaw, tilt = motion.T[:, :, None]
     along = z + yaw * levers.lateral_mm + tilt * levers.lever_mm
     distance = np.hypot(along, tilt * levers.spread_mm)
-    usable = np.isfinite(correlation)
-    if problem.end_amplitude.any():
-        usable &= distance <= grid[-1]
+    usable = np.isfinite(correlation) & (distance <= grid[-1])
     patch_count, bin_count = correlation.shape[1], _BIN_EDGES_MM.size - 1
-    at = np.minimum(np.searchsorted(_BIN_EDGES_MM, distance, side="right") - 1, bin_count - 1)
-    piece = np.searchsorted(edges, (first + second) / 2, side="right")
+    at = np.digitize(distance, _BIN_EDGES_MM[1:-1])
+    piece = np.digitize((first + second) / 2, ends[1:-1])
     at = (at + bin_count * (np.arange(patch_count) + patch_count * piece[:, None]))[usable]
     count, by_distance, by_correlation = (
         np.bincount(at, weights, pieces * patch_count * bin_count).reshape(-1, bin_count)
@@ -210,30 +182,18 @@ def _bin_correlations(
     )
     counts = np.maximum(count, 1)
     mean = by_correlation / counts
-    end = curves.amplitude[:, -1] ** 2
-    floor = np.where(end > LEVEL_END, 0.0, end)[:, None]
+    floor = (curves.amplitude[:, -1:] ** 2) * (problem.end_amplitude[:, None] == 0.0)
     amplitude = np.sqrt(np.clip((curves.amplitude**2 - floor) / (1 - floor), 0.0, 1.0))
     floor, cells = np.tile(floor, (pieces, 1)), np.tile(curves.cells, pieces)[:, None]
     variance = correlation_variance(np.clip(mean, 0.0, 0.995), cells, curves.of_echo) + INTERPOLATION**2
-    # Scale, gain, share and power are four numbers.
-    determined = (count > 0).sum(axis=1) >= 4
+    variance *= PAIRS_PER_FACT
     binning = _Binning(
-        by_distance / counts,
+        by_distance / counts / curves.step_mm,
         (mean - floor) / (1 - floor),
         (1 - floor) * np.sqrt(count / variance),
         np.tile(amplitude, (pieces, 1)),
-        curves.step_mm,
-        determined,
     )
-    return binning, (np.append(0, edges) + np.append(edges, len(path) - 1)) / 2
-
-
-def standard_error(values: FloatArray, prior: int) -> float:
-    """Standard error of the median of finite values, by their own scatter and `prior` more of `ROW_SIGMA`."""
-    finite = values[np.isfinite(values)]
-    count, spread = finite.size, robust_sigma(finite) if finite.size > 2 else ROW_SIGMA
-    spread = np.sqrt((count * spread**2 + prior * ROW_SIGMA**2) / max(count + prior, 1))
-    return float(1.2533 * spread / np.sqrt(max(count, 1)))
+    return binning, (ends[1:] + ends[:-1]) / 2
 
 
 def estimate_coherence(
@@ -241,9 +201,9 @@ def estimate_coherence(
 ) -> Coherence:
     """Estimate shares of structure, gains, and the factor that distances along the path are still to get.
 
-    Structure of an echo turns its phase, so that it decays with some power of speckle's coherence; of
-    intensity, which has no phase, shapes with and without decay fit alike: the mean of both scales is taken,
-    and what lies between them is claimed.
+    Shares are exponentially distributed, their mean being that of all patches, and all powers alike likely.
+    The scales of patches scatter about the common one as Cauchy's distribution has it, of half width
+    `ROW_SIGMA`: some are wrong.
 
     Parameters
     ----------
@@ -253,45 +213,93 @@ def estimate_coherence(
         Elevational position of each frame's centre, and its slopes along x and, if known, y.
     """
     binning, centres = _bin_correlations(problem, table, sound, path)
-    is_determined, of_echo = binning.determined, problem.at_patches.of_echo
+    patches = problem.patches
+    unknown = np.diag([PHANTOM_SIGMA, *LOOSE]) ** 2
+    as_measured = Coherence(np.zeros(1), *fully_developed(len(patches)), 1.0, unknown)
+    # Scale, gain, share and power are four numbers.
+    if (binning.weight > 0.0).sum(axis=1).max() < 4:
+        return as_measured
+    values = SHARES if problem.at_patches.of_echo else np.append(SHARES, LARGER_SHARES)
     # Curves of tissue hold its structure.
-    if problem.curves.of_tissue or not is_determined.any():
-        return Coherence(np.zeros(1), *fully_developed(len(problem.patches)), scale_sigma=PHANTOM_SIGMA)
-    most_share = MOST_SHARE["echo" if of_echo else "intensity"]
-
-    static_fit = binning.fit(most_share)
-    # Where noise is most of the correlation, its course tells nothing of the scale.
-    clear = is_determined & (static_fit[:, 1] >= LEAST_GAIN)
-    clear = clear if clear.any() else is_determined
-
-    def row_medians(values: FloatArray) -> FloatArray:
-        by_piece = np.where(clear, values, np.nan).reshape(centres.size, -1)
-        by_row = np.moveaxis(problem.patches.rows_of(by_piece), 1, 0)
-        finite = (row[np.isfinite(row)] for row in by_row)
-        return np.array([np.median(row) if row.size else np.nan for row in finite])
-
-    typical = float(np.nanmean(row_medians(static_fit[:, 2])))
-    if typical < NO_STRUCTURE:
-        most_share = 0.0
-    fits = [binning.fit(most_share, MOST_POWER), *([static_fit] if most_share and not of_echo else [])]
-    medians = [float(np.median(fit[clear, 0])) for fit in fits]
-    log_scale = float(np.mean(medians))
-    gain, share = binning.fit(most_share, 0.0, log_scale, max(typical, NO_STRUCTURE))[:, 1:3].T
-    # Patches that tell nothing are taken for the sweep's typical ones.
-    gain, share = (np.where(is_determined, v, np.median(v[is_determined])) for v in (gain, share))
-    patch_scales = np.mean(fits, axis=0)[:, 0] - log_scale
-    rows = RowScales(problem.patches.row_depth_mm, row_medians(patch_scales), row_medians(gain))
-    # Deviations from a line over depth: tilt makes one.
-    finite_rows, line = np.isfinite(rows.logarithm), (0.0, 0.0)
-    if finite_rows.sum() > 2:
-        line = theilslopes(rows.logarithm[finite_rows], rows.depth_mm[finite_rows])[:2]
-    by_row = standard_error(rows.logarithm - np.polyval(line, rows.depth_mm), PRIOR_ROWS if most_share else 0)
-    # Of few frames and rows, patches scatter more than structure's layers.
-    scatter = patch_scales - np.polyval(line, np.tile(problem.patches.depth_mm, centres.size))
-    by_patch = standard_error(scatter[clear], 0)
-    errors = max(by_row, by_patch), np.ptp(medians) / np.sqrt(12.0), CURVES_SIGMA
-    sigma = float(np.linalg.norm(errors))
-    shape = centres.size, -1
-    return Coherence(
-        centres, share.reshape(shape), gain.reshape(shape), float(np.exp(log_scale)), sigma, rows
+    values = values[:2] if problem.curves.of_tissue else values
+    likelihood = np.stack(
+        [
+            logsumexp([binning.log_likelihood(scale, power, values)[0] for power in POWERS], axis=0)
+            for scale in LOG_SCALES
+        ],
+        axis=1,
     )
+    log_prior = _share_prior(logsumexp(likelihood, axis=1), values)
+    posterior = softmax(logsumexp(likelihood + log_prior, axis=2), axis=1)
+    scatter = 1.0 / (1.0 + ((LOG_SCALES - LOG_SCALES[:, None]) / ROW_SIGMA) ** 2)
+    log_posterior = np.log(posterior @ (scatter / scatter.sum(axis=0)))
+    by_patch = log_posterior.reshape(centres.size, -1, LOG_SCALES.size).sum(axis=0).T
+    by_row = patches.rows_of(by_patch).sum(axis=2)
+    log_scale = _peak(by_patch.sum(axis=1))
+    covariance = _covariance(problem, by_patch, log_scale)
+    if problem.curves.of_tissue:
+        return replace(as_measured, covariance=covariance)
+    weight, gains = binning.log_likelihood(log_scale, 0.0, values)
+    weight = softmax(weight + log_prior, axis=1)
+    share, gain = (v.reshape(centres.size, -1) for v in (weight @ values, (weight * gains).sum(axis=1)))
+    # Rows without an echo have neither scale nor gain.
+    row_scale = np.where(np.ptp(by_row, axis=0) > 1e-9, [_peak(row) for row in by_row.T], np.nan)
+    row_gain = np.median(patches.rows_of(gain), axis=(0, 2)) + 0.0 * row_scale
+    rows = RowScales(patches.row_depth_mm, row_scale - log_scale, row_gain)
+    # To first order s^2 (1 - c (1 - a)) is observable, and a is open.
+    covariance[0, 0] += (0.5 * float(share.mean()) * POWERS.std()) ** 2
+    return Coherence(centres, share, gain, float(np.exp(log_scale)), covariance, rows)
+
+
+def _share_prior(by_share: FloatArray, share: FloatArray) -> FloatArray:
+    """Logarithm of the exponential distribution whose mean is that of all patches' shares, shape (c,).
+
+    Parameters
+    ----------
+    by_share : ndarray, shape (q, c)
+        Log-likelihood of each patch.
+    """
+    mean, width = float(share.mean()), np.gradient(share)
+    for _ in range(ROUNDS):
+        log_prior = np.asarray(log_softmax(np.log(width) - share / mean))
+        mean = max(float((softmax(by_share + log_prior, axis=1) @ share).mean()), LEAST_MEAN)
+    return log_prior
+
+
+def _peak(log_posterior: FloatArray) -> float:
+    """Likeliest ln s by the parabola about it."""
+    at = int(np.clip(log_posterior.argmax(), 1, LOG_SCALES.size - 2))
+    low, middle, high = log_posterior[at - 1 : at + 2]
+    return float(LOG_SCALES[at] + STEP * (high - low) / (2.0 * max(2.0 * middle - low - high, 1e-9)))
+
+
+def _covariance(problem: MotionProblem, by_patch: FloatArray, log_scale: float) -> FloatArray:
+    """Covariance of the scale, and of the turns that are feigned, by the scatter of rows, shape (3, 3).
+
+    Structure lies in layers, and curves err by depth: the patches of a row err together.
+
+    Parameters
+    ----------
+    by_patch : ndarray, shape (s, p)
+        Logarithm of each patch's posterior.
+
+    References
+    ----------
+    .. [1] P. J. Huber, "The behavior of maximum likelihood estimates under nonstandard conditions", Proc.
+       Fifth Berkeley Symp. Math. Stat. Prob. 1, 1967.
+    """
+    posterior = softmax(by_patch, axis=0)
+    error = LOG_SCALES @ posterior - log_scale
+    variance = (LOG_SCALES - log_scale) ** 2 @ posterior - error**2
+    arm = np.stack([np.ones(error.size), problem.levers.lateral_mm, problem.levers.lever_mm])
+    loose = np.diag([0.0, *LOOSE])
+    inverse = np.linalg.inv(arm / variance @ arm.T + loose)
+    # What turning explains is no scatter.
+    error -= inverse @ (arm @ (error / variance)) @ arm
+    by_row = problem.patches.rows_of(arm * error / variance).sum(axis=2)
+    rows = by_row.shape[1]
+    covariance = inverse @ (by_row @ by_row.T * (rows / max(rows - 3, 1)) + loose) @ inverse
+    # The scale is that of turns as they are taken.
+    covariance[0] = covariance[:, 0] = 0.0
+    covariance[0, 0] = (np.linalg.norm(by_row[0]) / (1.0 / variance).sum()) ** 2 + CURVES_SIGMA**2
+    return np.asarray(covariance)

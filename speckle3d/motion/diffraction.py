@@ -147,7 +147,7 @@ def _two_way_fields(
     z: FloatArray = STEP_MM * np.arange(steps + 1, dtype=float)
     delay = probe.focus_mm - np.hypot(probe.focus_mm, strip)
     off_mm = np.sqrt(_OFF_AXIS) * probe.transmit_mm / 2.0
-    distance = np.append(depth_mm, np.hypot(depth_mm, off_mm)) if off_mm else depth_mm
+    distance = np.append(depth_mm, np.hypot(depth_mm, off_mm))
     parts = np.empty((distance.size, frequency_hz.size, z.size, 2))
     spread = z, strip, delay, wavenumber, 1
     in_parallel(lambda first, stop: lens_fields(distance, *spread, first, stop, parts), distance.size)

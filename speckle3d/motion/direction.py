@@ -57,7 +57,7 @@ def sensed_orientation(sweep: Sweep, settings: SensorSettings) -> Rotation | Non
     if not sensor.covers(time_s).all():
         return None
     orientation = image_orientation(sensor, time_s)
-    if sigma_s == 0 or len(time_s) < 3:
+    if sigma_s == 0:
         return orientation
     # As turns from their mean, of which they stay within a half turn.
     mean, frames = orientation.mean(), sigma_s / float(np.median(np.diff(time_s)))

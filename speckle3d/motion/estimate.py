@@ -13,7 +13,7 @@ from speckle3d.core.geometry import mirrored
 from speckle3d.core.reconstruction import FramePairs, SharedErrors
 from speckle3d.core.relative import MIRROR, RelativePoses
 from speckle3d.matching.table import CorrelationTable
-from speckle3d.motion.coherence import CURVES_SIGMA, Coherence, estimate_coherence, standard_error
+from speckle3d.motion.coherence import Coherence, estimate_coherence
 from speckle3d.motion.lens import with_fitted_lens
 from speckle3d.motion.planes import (
     LEAST_CORRELATION,
@@ -23,7 +23,7 @@ from speckle3d.motion.planes import (
     pair_planes,
     patch_distances,
 )
-from speckle3d.motion.signs import RELATIVE_ERROR, UNADAPTED_ERROR, Strangers, likeliest_path, on_path
+from speckle3d.motion.signs import Strangers, likeliest_path, on_path
 from speckle3d.motion.trajectory import Trajectory, edges_of, loose_frames, solve_trajectory
 from speckle3d.motion.uncertainty import SlopeWeights, claimed_covariance, weigh_slopes
 
@@ -32,8 +32,6 @@ ROUNDS = 2
 moves lengths by less than 0.2 %."""
 LENS_ROUNDS = 4
 """Fits of a data sheet's lens: a path read with a wrong lens bends the rows otherwise than the right one."""
-ENOUGH_PAIRS = 3
-"""Pairs to earlier frames from which a frame needs none that tells less."""
 
 
 @dataclass(frozen=True)
@@ -87,7 +85,8 @@ class Motion:
         curves_sigma : float
             Relative standard deviation of all distances by the curves' mismatch with probe and tissue.
         """
-        shared = SharedErrors(self.coherence.scale_sigma, curves_sigma, self.slopes.deviation_per_mm)
+        scale_sigma = float(np.hypot(self.coherence.scale_sigma, self.slopes.length_sigma))
+        shared = SharedErrors(scale_sigma, curves_sigma, self.slopes.deviation_per_mm)
         structure = float(self.coherence.share.mean())
         centre_mm = self.problem.centre_mm
         return shared, claimed_covariance(self.poses, self.covariance, centre_mm, shared, structure)
@@ -124,63 +123,46 @@ def estimate_motion(problem: MotionProblem, table: CorrelationTable, sound: Bool
     models = fully_developed(table.correlation.shape[1])
     alike, firm = pair_planes(problem, table, alike_pairs(problem, table), models)
     apart = strangers(problem, table)
-    path = likeliest_path(alike[firm], problem.frames, apart, None, UNADAPTED_ERROR)
+    path = likeliest_path(alike[firm], problem.frames, apart)
     sheet, tilt = problem.curves.nominal, problem.curves.tilt
-    lens_rounds = LENS_ROUNDS if sheet and problem.curves.origin == "data sheet" else 0
+    lens_rounds = LENS_ROUNDS * (problem.curves.origin == "data sheet")
     for lens_round in range(lens_rounds, -1, -1):
         # Tilt bends rows as a lens does: it is left out until the lens is known.
         problem = replace(problem, curves=replace(problem.curves, tilt=None if lens_round else tilt))
         for _ in range(ROUNDS):
             coherence = estimate_coherence(problem, table, sound, path)
             pairs = _signed_planes(problem, table, sound, path * coherence.scale, coherence)
-            slopes = weigh_slopes(pairs, coherence.scale_sigma, problem.planes)
+            slopes = weigh_slopes(pairs, coherence.covariance, problem.planes)
             _, trajectory = solve_planes(problem, table, slopes.applied(pairs))
             path = elevation_of(trajectory.poses, problem.centre_mm)
         coherence = estimate_coherence(problem, table, sound, path)
         if lens_round and sheet and coherence.rows:
             path = path * coherence.scale
             problem = replace(problem, curves=with_fitted_lens(problem.curves, coherence.rows, sheet))
-    if problem.curves.of_tissue:
-        coherence = replace(coherence, scale_sigma=_disagreement(problem, table, pairs))
-    slopes = weigh_slopes(pairs, coherence.scale_sigma, problem.planes)
+    slopes = weigh_slopes(pairs, coherence.covariance, problem.planes)
     pairs = pairs.scaled(coherence.scale)
-    edges, trajectory = solve_planes(problem, table, slopes.applied(pairs), with_covariance=True)
+    edges, trajectory = solve_planes(problem, table, slopes.applied(pairs))
     return Motion(problem, table, pairs, coherence, slopes, edges, trajectory.poses, trajectory.covariance)
 
 
-def _disagreement(problem: MotionProblem, table: CorrelationTable, pairs: PairPlanes) -> float:
-    """Standard error of the scale of distances read as they are, by what rows of patches disagree."""
-    correlation = table.correlation[pairs.row]
-    distance, _ = patch_distances(problem, correlation, fully_developed(correlation.shape[1]))
-    offset, yaw, tilt = pairs.coefficients.T[:, :, None]
-    plane = np.abs(offset + yaw * problem.levers.lateral_mm + tilt * problem.levers.lever_mm)
-    with np.errstate(divide="ignore"):
-        logarithm = np.where(pairs.used, np.log(distance / plane), np.nan)
-    by_row = np.moveaxis(problem.patches.rows_of(logarithm), 1, 0)
-    rows = np.array([np.nanmedian(row) for row in by_row if np.isfinite(row).any()])
-    return float(np.hypot(CURVES_SIGMA, standard_error(rows, 0)))
-
-
 def solve_planes(
-    problem: MotionProblem, table: CorrelationTable, pairs: PairPlanes, with_covariance: bool = False
+    problem: MotionProblem, table: CorrelationTable, pairs: PairPlanes
 ) -> tuple[RelativePoses, Trajectory]:
     """Trajectory of some pairs, and the edges that it is solved from."""
     edges, huber = edges_of(table, pairs), problem.trajectory.huber
-    return edges, solve_trajectory(edges, problem.frames, problem.centre_mm, huber, with_covariance)
+    return edges, solve_trajectory(edges, problem.frames, problem.centre_mm, huber)
 
 
 def alike_pairs(problem: MotionProblem, table: CorrelationTable) -> IntArray:
     """Rows of frames' pairs with earlier frames that they resemble; without any, of their best pair."""
     alike = table.median >= problem.trajectory.least_correlation
-    return np.flatnonzero(alike | (_rank(table.second, table.median) == 0))
+    return np.flatnonzero(alike | _is_best(table.second, table.median))
 
 
-def _rank(frame: IntArray, score: FloatArray) -> IntArray:
-    """How many pairs of the same frame score higher than each, shape (e,)."""
-    order = np.lexsort((-score, frame))
-    rank = np.empty_like(order)
-    rank[order] = np.arange(order.size) - np.searchsorted(frame[order], frame[order])
-    return rank
+def _is_best(frame: IntArray, score: FloatArray) -> BoolArray:
+    """Whether no pair of the same frame scores higher, shape (e,); frames increase."""
+    _, begin, count = np.unique(frame, return_index=True, return_counts=True)
+    return np.asarray(score >= np.repeat(np.fmax.reduceat(score, begin), count))
 
 
 def _signed_planes(
@@ -200,9 +182,8 @@ def _signed_planes(
             f"expected frame pairs whose patches determine a plane, got none in {len(table)} pairs of "
             f"{table.correlation.shape[1]} patches: is the image wide enough, and do the curves fit it?"
         )
-    error = UNADAPTED_ERROR if problem.curves.of_tissue else RELATIVE_ERROR
     apart = strangers(problem, table.where(sound))
-    return on_path(planes, likeliest_path(planes, problem.frames, apart, None, error))
+    return on_path(planes, likeliest_path(planes, problem.frames, apart))
 
 
 def _near_pairs(
@@ -210,12 +191,11 @@ def _near_pairs(
 ) -> IntArray:
     """Rows of pairs so near that fully developed speckle would keep enough correlation.
 
-    Frames without enough of them take those that tell less, and if need be one that tells little.
+    Frames without any take the pair of which it would keep most, if that tells a little.
     """
-    settings, left = problem.trajectory, np.where(sound, problem.typical_correlation(apart_mm), -1.0)
-    rank = _rank(table.second, left)
-    near = left >= np.where(rank < ENOUGH_PAIRS, settings.least_correlation, settings.clear_correlation)
-    return np.flatnonzero(sound & (near | ((rank == 0) & (table.median >= LEAST_CORRELATION))))
+    left = np.where(sound, problem.typical_correlation(apart_mm), -1.0)
+    nearest = _is_best(table.second, left) & (table.median >= LEAST_CORRELATION)
+    return np.flatnonzero(sound & ((left >= problem.trajectory.least_correlation) | nearest))
 
 
 def strangers(problem: MotionProblem, table: CorrelationTable) -> Strangers:

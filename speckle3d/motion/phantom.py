@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
+from scipy.ndimage import map_coordinates
 from scipy.optimize import least_squares
 
 from speckle3d.core.arrays import FloatArray, IntArray
@@ -72,12 +73,6 @@ class PhantomSamples:
     pairs: int
 
 
-def _means(label: FloatArray, *values: FloatArray) -> list[FloatArray]:
-    """Means of values over those of equal label, in the labels' order."""
-    _, group = np.unique(label, return_inverse=True)
-    return [np.bincount(group, value) / np.bincount(group) for value in values]
-
-
 def fit_curves(
     key: CurveKey, samples: Iterable[PhantomSamples], settings: CurveSettings | None = None
 ) -> DecorrelationCurves:
@@ -92,8 +87,6 @@ def fit_curves(
         If a depth has too few samples over too little of its curve.
     """
     s, every = settings or CurveSettings(), list(samples)
-    if not every:
-        raise InsufficientDataError("expected samples of at least one phantom sweep, got none")
     depth, offset, tilt, rho = (
         np.concatenate([getattr(sample, name)[np.isfinite(sample.correlation)] for sample in every])
         for name in ("depth_mm", "offset_mm", "tilt_rad", "correlation")
@@ -102,15 +95,13 @@ def fit_curves(
     of_echo, response, distance = key.correlation_of == "echo", None, np.abs(offset)
     fair = np.ones(depth.size, dtype=bool)
     # Turning distorts the curves a little and is itself read from them: estimate both in turn.
-    for turn in range(TILT_ROUNDS):
+    for _ in range(TILT_ROUNDS):
         members = [np.flatnonzero(fair & (row == number)) for number in range(rows.size)]
         fits = [
             _fit_row(at, grid, s.terms, of_echo, distance[member], rho[member])
             for at, member in zip(rows, members, strict=True)
         ]
         curves, cells, ends = (np.array(part) for part in zip(*fits, strict=True))
-        if turn == TILT_ROUNDS - 1:
-            break
         response = _fit_tilt(key, DecorrelationCurves(key, rows, grid, curves, cells), row, offset, tilt, rho)
         if response is None:
             break
@@ -129,7 +120,8 @@ def _fit_row(
 
     A curve that has fallen as low as can be told goes on; one whose phantom did not go so far ends there.
     """
-    centre, mean = _means(np.round(distance / BIN_MM), distance, rho)
+    _, group, count = np.unique(np.round(distance / BIN_MM), return_inverse=True, return_counts=True)
+    centre, mean = (np.bincount(group, values) / count for values in (distance, rho))
     # The fit of in-plane motion finds a little correlation in frames that share no speckle. Curves include
     # it, so that it is not taken for coherent scattering in a sweep.
     low = centre[mean < LEAST_RHO]
@@ -198,9 +190,7 @@ def _fit_tilt(
 
     def misfit(values: FloatArray) -> FloatArray:
         at = np.hypot(offset - (design @ values)[row] * tilt, spread[row] * tilt) / step
-        cell = np.minimum(at.astype(int), curves.distance_mm.size - 2)
-        low, high = curves.correlation[row, cell], curves.correlation[row, cell + 1]
-        expected = low + np.minimum(at - cell, 1.0) * (high - low)
+        expected = map_coordinates(curves.correlation, [row, at], order=1, mode="nearest")
         variance = correlation_variance(
             np.minimum(expected, 0.98), curves.cells[row] / PAIRS_PER_FACT, of_echo
         )

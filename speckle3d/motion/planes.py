@@ -209,9 +209,9 @@ def pair_planes(
     rows: IntArray,
     models: EchoModels,
     start_mm: FloatArray | None = None,
-    subset: BoolArray | None = None,
+    subset: BoolArray | bool = True,
     slopes: FloatArray | None = None,
-    either_side: BoolArray | None = None,
+    either_side: BoolArray | bool = True,
 ) -> tuple[PairPlanes, BoolArray]:
     """Fit planes to the correlations of frame pairs by robust maximum likelihood, pair by pair.
 
@@ -240,16 +240,14 @@ def pair_planes(
     correlation = table.correlation[rows]
     end = problem.end_amplitude
     least = models.gain * (models.share + (1 - models.share) * end) ** 2
-    members = np.isfinite(correlation) & ((end == 0.0) | (correlation > least))
-    members = members if subset is None else members & subset
+    members = np.isfinite(correlation) & ((end == 0.0) | (correlation > least)) & subset
     members &= (members.sum(axis=1) > 3)[:, None]
     if start_mm is None:
-        start = problem.typical_distance(np.sqrt(np.maximum(table.median[rows], 0.0)))
-    else:
-        start = np.maximum(start_mm, NEAR_MM)
+        start_mm = problem.typical_distance(np.sqrt(np.maximum(table.median[rows], 0.0)))
+    start = np.maximum(start_mm, NEAR_MM)
     from_sensor = slopes is not None
     start_slopes = np.zeros((rows.size, 2)) if slopes is None else np.ascontiguousarray(slopes)
-    side = np.ones(rows.size, dtype=bool) if either_side is None else either_side
+    side = np.zeros(rows.size, dtype=bool) | either_side
     settings = problem.planes
     slope_sd = SENSED_SLOPE if from_sensor else LOOSE_SLOPE
     rules = FitRules(from_sensor, slope_sd, LOOSE_SLOPE, settings.huber, OUTLYING, CROSSING_EVIDENCE, ROUNDS)
@@ -264,7 +262,7 @@ def pair_planes(
             correlation[block],
             members[block],
             shift[block],
-            models if len(models.share) == 1 else EchoModels(models.share[block], models.gain[block]),
+            EchoModels(*(values[block] if len(values) > 1 else values for values in models)),
             problem.levers,
             problem.at_patches,
             start[block],

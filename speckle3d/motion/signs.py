@@ -17,11 +17,9 @@ from speckle3d.motion.planes import OUTLYING, PairPlanes
 
 HYPOTHESES = 8
 """Paths that are followed; 4 move lengths by at most 0.06 %."""
-RELATIVE_ERROR, UNADAPTED_ERROR = 0.1, 0.25
-"""Of distances, besides their covariance, once coherence is adapted to, and without that: coherent tissue
-makes long distances too short, so that a misfit of a quarter is no sign of turning back. Over 58 lengths of
-two physics 0.25 leaves 1.24 % rms before adapting, 0.1 leaves 1.26; a half of a person's sweep of bone, whose
-structure is not adapted to, folds with 0.1."""
+RELATIVE_ERROR = 0.25
+"""Of distances, besides their covariance: coherent tissue makes long distances too short, so that a misfit of
+a quarter is no sign of turning back. A half of a person's sweep of bone folds with 0.1."""
 TREND_MM = 0.3
 """Travel over which a direction is remembered: a few frames of a hand-held sweep."""
 TURNING_COST = 2.0
@@ -56,7 +54,6 @@ def likeliest_path(
     frames: int,
     strangers: Strangers,
     known: FloatArray | None = None,
-    relative_error: float = RELATIVE_ERROR,
 ) -> FloatArray:
     """Follow the most likely paths: elevational position and slope along x of one frame after the other.
 
@@ -80,7 +77,7 @@ def likeliest_path(
     """
     rules = PathRules(
         HYPOTHESES,
-        relative_error,
+        RELATIVE_ERROR,
         PLACED,
         OUTLYING,
         TURNING_COST,
@@ -110,7 +107,5 @@ def on_path(planes: PairPlanes, path: FloatArray) -> PairPlanes:
     """Planes on the sides of their first frames that agree best with a path of shape (n, 2)."""
     relative, moved = path[planes.second] - path[planes.first], planes.coefficients[:, :2]
     weight = np.linalg.inv(planes.sign_covariance)
-    plus, minus = (
-        np.einsum("ei,eij,ej->e", off, weight, off) for off in (relative - moved, relative + moved)
-    )
-    return planes.signed(np.where(plus <= minus, 1.0, -1.0))
+    agreement = np.einsum("ei,eij,ej->e", relative, weight, moved)
+    return planes.signed(np.where(agreement >= 0.0, 1.0, -1.0))

@@ -37,13 +37,30 @@ class Trajectory:
     ----------
     poses : RigidTransform, length n
         ``world_from_image``, the first frame being the identity.
-    covariance : ndarray, shape (n, 6, 6)
-        Of each frame's (x, y, z, tilt, yaw, roll) about the image's centre, in the frame's own axes, as far
-        as the pairs' errors are independent of each other.
+    normal : SuperLU
+        Factors of the normal equations for twists of all frames but the first.
     """
 
     poses: RigidTransform
-    covariance: FloatArray
+    normal: Any
+
+    @property
+    def covariance(self) -> FloatArray:
+        """Of (x, y, z, tilt, yaw, roll) about the image's centre in each frame's own axes, shape (n, 6, 6).
+
+        As far as the pairs' errors are independent of each other. Of frames between those computed it is
+        interpolated.
+        """
+        frames = len(self.poses)
+        frame_numbers = np.unique(np.linspace(1, frames - 1, min(frames - 1, COVARIANCE_FRAMES)).astype(int))
+        blocks = [np.zeros((6, 6))]
+        for frame in frame_numbers:
+            rows = slice(6 * frame - 6, 6 * frame)
+            unit = np.zeros((6 * (frames - 1), 6))
+            unit[rows] = np.eye(6)
+            blocks.append(self.normal.solve(unit)[rows])
+        by_frame = make_interp_spline(np.append(0, frame_numbers), np.array(blocks), k=1)(np.arange(frames))
+        return np.asarray(by_frame + by_frame.transpose(0, 2, 1)) / 2
 
 
 def solve_trajectory(
@@ -51,7 +68,6 @@ def solve_trajectory(
     frames: int,
     centre_mm: FloatArray,
     huber: float = 2.0,
-    with_covariance: bool = False,
 ) -> Trajectory:
     """Poses of all frames from all pairs: robust Gauss-Newton on the graph of relative poses.
 
@@ -72,11 +88,8 @@ def solve_trajectory(
         poses = poses * RigidTransform.from_exp_coords(step[:, _TWIST])
         if np.abs(step).max() < LAST_STEP:
             break
-    covariance = np.zeros((frames, 6, 6))
-    if with_covariance:
-        covariance = _marginals(_normal(pairs, root, poses, huber)[0], frames)
     centre = RigidTransform.from_translation(centre_mm)
-    return Trajectory(centre * poses * centre.inv(), covariance)
+    return Trajectory(centre * poses * centre.inv(), normal)
 
 
 def _normal(
@@ -108,25 +121,9 @@ def _normal(
     return factors, jacobian.T @ (whiten @ error).ravel()
 
 
-def _marginals(normal: Any, frames: int) -> FloatArray:
-    """Covariance of each frame's pose, shape (n, 6, 6); those between known frames are interpolated."""
-    frame_numbers = np.unique(np.linspace(1, frames - 1, min(frames - 1, COVARIANCE_FRAMES)).astype(np.int64))
-    blocks = [np.zeros((6, 6))]
-    for frame in frame_numbers:
-        rows = slice(6 * frame - 6, 6 * frame)
-        unit = np.zeros((6 * (frames - 1), 6))
-        unit[rows] = np.eye(6)
-        blocks.append(normal.solve(unit)[rows])
-    covariance = make_interp_spline(np.append(0, frame_numbers), np.array(blocks), k=1)(np.arange(frames))
-    return np.asarray(covariance + covariance.transpose(0, 2, 1)) / 2
-
-
 def loose_frames(second: IntArray, frames: int) -> BoolArray:
     """Frames after the first that are the second of no pair, shape (n,)."""
-    lone = np.ones(frames, dtype=bool)
-    lone[0] = False
-    lone[second] = False
-    return lone
+    return ~np.isin(np.arange(frames), np.append(0, second))
 
 
 def _with_loose_edges(pairs: RelativePoses, frames: int) -> RelativePoses:

@@ -11,7 +11,7 @@ from speckle3d.core.arrays import FloatArray
 from speckle3d.core.pose_errors import PoseErrors
 from speckle3d.core.reconstruction import SharedErrors
 from speckle3d.core.relative import SCALE_CHANGE_MM, SHARED, STRUCTURE, TURN_CHANGE_MM
-from speckle3d.motion.planes import UNEVENNESS, PairPlanes, PlaneSettings
+from speckle3d.motion.planes import PairPlanes, PlaneSettings
 
 TREMBLING_MM = 0.1
 """Frames nearer than this may turn as if they were this far apart: a hand trembles in place. At 0.15 B-mode
@@ -83,7 +83,7 @@ def joint_errors(
     covariance: FloatArray,
     world_from_image: RigidTransform,
     centre_mm: FloatArray,
-    shared: SharedErrors | None = None,
+    shared: SharedErrors | None,
 ) -> PoseErrors:
     """Errors of all frames together whose covariances, frame by frame, are those given.
 
@@ -96,8 +96,8 @@ def joint_errors(
         Of (x, y, z, tilt, yaw, roll) about the image's centre along the first frame's axes, mm and rad.
     world_from_image : RigidTransform, length n
     centre_mm : ndarray, shape (3,)
-    shared : SharedErrors, optional
-        Which part of `covariance` all frames have in common; without it, none.
+    shared : SharedErrors or None
+        Which part of `covariance` all frames have in common; None: none of it.
     """
     poses = world_from_image[0].inv() * world_from_image
     common = _common_factors(poses, centre_mm, shared or SharedErrors(0.0, 0.0, np.zeros(2)))
@@ -128,45 +128,44 @@ class SlopeWeights:
         Of the slopes seen along x and y, yaw and tilt, that is believed.
     deviation_per_mm : ndarray, shape (2,)
         Standard deviation of the slopes per distance that is left, rad/mm.
+    lever_mm : ndarray, shape (2,)
+        Where patches lie from the image's centre, on average as planes weigh them.
     """
 
     share: FloatArray
     deviation_per_mm: FloatArray
+    lever_mm: FloatArray
+
+    @property
+    def length_sigma(self) -> float:
+        """Relative standard deviation of the centre's distances that errors of the slopes leave."""
+        return float(np.linalg.norm(self.lever_mm * self.deviation_per_mm))
 
     def applied(self, planes: PairPlanes) -> PairPlanes:
-        """Keep only the believed shares of planes' slopes; their offsets follow as the fits have it.
-
-        Offsets stay on their side: it is the path's, and a plane's sign is open.
-        """
+        """Keep only the believed shares of planes' slopes; their offsets follow as the fits have it."""
         covariance = planes.covariance
         keep = np.tile(np.diag([1.0, *self.share]), (len(planes), 1, 1))
         keep[:, :1, 1:] = -covariance[:, :1, 1:] @ np.linalg.inv(covariance[:, 1:, 1:]) * (1.0 - self.share)
         coefficients = (keep @ planes.coefficients[:, :, None])[:, :, 0]
-        coefficients *= np.where(coefficients[:, :1] * planes.coefficients[:, :1] < 0, -1.0, 1.0)
         covariance = keep @ covariance @ keep.transpose(0, 2, 1)
         turn_sigma = np.maximum(np.abs(coefficients[:, :1]), TREMBLING_MM) * self.deviation_per_mm
         covariance[:, [1, 2], [1, 2]] += turn_sigma**2
         return replace(planes, coefficients=coefficients, covariance=covariance)
 
 
-def weigh_slopes(planes: PairPlanes, scale_sigma: float, settings: PlaneSettings) -> SlopeWeights:
+def weigh_slopes(planes: PairPlanes, covariance: FloatArray, settings: PlaneSettings) -> SlopeWeights:
     """Weigh the slopes of all pairs of a sweep by what uneven errors of distances feign.
 
     Parameters
     ----------
-    scale_sigma : float
-        Relative standard deviation of the scale of distances.
+    covariance : ndarray, shape (3, 3)
+        Of scale, yaw and tilt per distance; see `Coherence`.
     """
-    covariance = planes.covariance.copy()
-    covariance[:, 0, 0] -= settings.bias_mm**2
-    information = np.linalg.inv(covariance).sum(axis=0)
-    information = information / information[0, 0]
-    lever_mm = np.sqrt(np.diagonal(information)[1:] - information[0, 1:] ** 2)
-    false = UNEVENNESS * scale_sigma / np.maximum(lever_mm, 1e-6)
+    false = np.sqrt(np.diagonal(covariance)[1:])
     travel = np.maximum((planes.offset_mm**2).sum(), 1e-12)
     mean_slope = (planes.coefficients[:, 1:] * planes.coefficients[:, :1]).sum(axis=0) / travel
-    noise = planes.offset_mm**2 @ np.diagonal(covariance, axis1=1, axis2=2)[:, 1:] / travel**2
     usual = np.deg2rad(settings.turn_deg_per_mm) ** 2
-    expected = np.maximum(usual, mean_slope**2 - BEYOND_DOUBT**2 * (false**2 + noise))
+    expected = np.maximum(usual, mean_slope**2 - BEYOND_DOUBT**2 * false**2)
     share = expected / (expected + false**2)
-    return SlopeWeights(share, np.sqrt(share) * false)
+    information = np.linalg.inv(planes.covariance).sum(axis=0)
+    return SlopeWeights(share, np.sqrt(share) * false, information[0, 1:] / information[0, 0])

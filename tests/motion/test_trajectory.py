@@ -127,7 +127,7 @@ def test_a_chain_of_equal_steps_is_a_random_walk():
     first = np.arange(frames - 1)
     still = RigidTransform.from_translation(np.zeros((frames - 1, 3)))
     pairs = RelativePoses(first, first + 1, still, np.tile(step, (frames - 1, 1, 1)))
-    walk = solve_trajectory(pairs, frames, CENTRE_MM, with_covariance=True)
+    walk = solve_trajectory(pairs, frames, CENTRE_MM)
     assert walk.covariance.shape == (frames, 6, 6)
     np.testing.assert_allclose(
         walk.covariance, np.arange(frames)[:, None, None] * step, rtol=1e-3, atol=1e-12
@@ -141,7 +141,7 @@ def test_a_chain_of_equal_steps_is_a_random_walk():
 def test_a_frame_that_is_held_alone_lies_between_its_neighbours_and_is_not_trusted():
     (pairs, truth), lone = neighbours(), 17
     without_lone = subset(pairs, (pairs.first != lone) & (pairs.second != lone))
-    estimate, full = (solve_trajectory(p, len(truth), CENTRE_MM, 2.0, True) for p in (without_lone, pairs))
+    estimate, full = (solve_trajectory(p, len(truth), CENTRE_MM, 2.0) for p in (without_lone, pairs))
     before, at, after = elevation(estimate.poses)[lone - 1 : lone + 2]
     assert abs(at - (before + after) / 2) < 1e-3
     neighbour_frames = np.delete(np.arange(len(truth)), lone)

@@ -86,6 +86,6 @@ def test_the_claim_of_two_frames_does_not_hang_on_rounding():
     claims[:, :, YAW] = claims[:, YAW, :] = 0.0
     claims[:, YAW, YAW] = 1e-20
     noisy_claims = claims * (1.0 + 1e-15 * np.random.default_rng(1).normal(size=claims.shape))
-    factors = [joint_errors(c, ONE_WAY, CENTRE_MM).factors for c in (claims, noisy_claims)]
+    factors = [joint_errors(c, ONE_WAY, CENTRE_MM, None).factors for c in (claims, noisy_claims)]
     exact, rough = (f[:, 10].T @ f[:, 40] for f in factors)
     np.testing.assert_allclose(exact, rough, rtol=1e-9, atol=1e-15)
