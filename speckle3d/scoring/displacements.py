@@ -73,7 +73,7 @@ def point_errors(
     Parameters
     ----------
     poses, true : RigidTransform, length n
-        Estimate and reference.
+        Estimate and reference; `drift_rates` checks that they are of the same frames.
     grid, landmarks : optional
         Without, their errors are None. Landmarks lie in frame 1 and later: the first frame has no error.
 
@@ -82,7 +82,6 @@ def point_errors(
     InvalidInputError
         If there are no landmarks, or one is in no frame that has an error.
     """
-    _require_comparable(poses, true)
     relative = [(path[0].inv() * path[1:], relative_poses(path)) for path in (poses, true)]
     errors: dict[str, Any] = dict.fromkeys(CHALLENGE_ERRORS)
     for letter, estimate, exact in zip("GL", *relative, strict=True):
@@ -115,9 +114,14 @@ def drift_rates(
     ------
     InsufficientDataError
         If the reference does not move.
+    MismatchError
+        If they are not of the same frames, two or more.
     """
     centre = np.asarray(centre_mm, dtype=float)
-    _require_comparable(world_from_image, reference)
+    if len(world_from_image) != len(reference) or len(reference) < 2:
+        raise MismatchError(
+            f"expected 2 poses or more of both, got {len(world_from_image)} and {len(reference)}"
+        )
     estimate, true = (p[0].inv() * p for p in (world_from_image, reference))
     centres, true_centres = estimate.apply(centre), true.apply(centre)
     path_mm = np.cumsum(np.linalg.norm(np.diff(true_centres, axis=0), axis=1))
@@ -125,7 +129,7 @@ def drift_rates(
         raise InsufficientDataError("drift rates: expected a reference that moves, got one that rests")
     drift = np.linalg.norm(centres - true_centres, axis=1)[1:]
     moves = path_mm > 0
-    angle = np.rad2deg(np.atleast_1d((true.rotation.inv() * estimate.rotation).magnitude())[1:])
+    angle = np.rad2deg((true.rotation.inv() * estimate.rotation).magnitude()[1:])
     return {
         "FDR_percent": float(100.0 * drift[-1] / path_mm[-1]),
         "ADR_percent": float(100.0 * np.mean(drift[moves] / path_mm[moves])),
@@ -199,8 +203,3 @@ def _mean_over_pixels(differences: FloatArray, grid: ImageGrid) -> float:
         squares = (along**2).sum(axis=-1) + 2.0 * (along @ down) * y + down @ down * y**2
         means.append(np.sqrt(np.maximum(squares, 0.0)).mean())
     return float(np.mean(means))
-
-
-def _require_comparable(poses: RigidTransform, reference: RigidTransform) -> None:
-    if len(poses) != len(reference) or len(poses) < 2:
-        raise MismatchError(f"expected 2 poses or more of both, got {len(poses)} and {len(reference)}")

@@ -9,26 +9,20 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import MismatchError
 from speckle3d.core.reconstruction import Reconstruction, Trust
-from speckle3d.correction.claims import length_sigma
+from speckle3d.correction.claims import LEAST_LENGTH_MM, length_sigma
 from speckle3d.examine.disagreements import differing_lengths
 from speckle3d.scoring.lengths import part_lengths
 
 
-def relative_claims(
+def length_claims(
     poses: Mapping[str, RigidTransform], trust: Trust, centre_mm: FloatArray
-) -> dict[str, float]:
-    """Relative standard deviation of its length by every mode that claims one."""
+) -> dict[str, tuple[float, float]]:
+    """Length of each mode that claims one, all parts together, and its standard deviation, mm."""
     claims = {"image": length_sigma(poses["image"], trust.covariance, centre_mm)}
     claims |= {mode: errors.length_sigma for mode, errors in trust.modes.items()}
-    return {mode: claim for mode, claim in claims.items() if mode in poses}
-
-
-def length_claims(
-    poses: Mapping[str, RigidTransform], claims: Mapping[str, float], centre_mm: FloatArray
-) -> dict[str, tuple[float, float]]:
-    """Length of each mode with a relative claim, all parts together, and its standard deviation, mm."""
-    lengths = {mode: float(parts.sum()) for mode, parts in part_lengths(poses, centre_mm)[1].items()}
-    return {mode: (lengths[mode], claim * lengths[mode]) for mode, claim in claims.items()}
+    parts = part_lengths(poses, centre_mm)[1]
+    lengths = {mode: max(float(parts[mode].sum()), LEAST_LENGTH_MM) for mode in claims if mode in parts}
+    return {mode: (length, claims[mode] * length) for mode, length in lengths.items()}
 
 
 def default_mode(reconstruction: Reconstruction) -> tuple[str, str]:
@@ -40,14 +34,13 @@ def default_mode(reconstruction: Reconstruction) -> tuple[str, str]:
         If modes differ by more than three joint claims: there is no best one.
     """
     trust, poses, centre = reconstruction.trust, reconstruction.poses, reconstruction.grid.centre_mm
-    claims = {} if trust is None else relative_claims(poses, trust, centre)
-    lengths = length_claims(poses, claims, centre)
+    lengths = {} if trust is None else length_claims(poses, trust, centre)
     if doubts := differing_lengths(lengths):
         raise MismatchError(f"{doubts[0].evidence}: expected --mode to say which to take, got none")
-    if len(claims) < 2:
+    if len(lengths) < 2:
         return "image", ""
     # Of modes that claim as much, the later corrects more.
-    best = min(reversed(claims), key=claims.__getitem__)
+    best = min(reversed(lengths), key=lambda mode: lengths[mode][1] / lengths[mode][0])
     length, sigma = lengths[best]
     return best, (
         f"mode {best}: claims the smallest error of length, {length:.2f} +- {1.96 * sigma:.2f} mm (95 %); "

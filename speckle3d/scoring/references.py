@@ -25,7 +25,8 @@ from speckle3d.scoring.lengths import (
     sum_motion,
 )
 
-REFERENCES = ("tracker", "truth")
+REFERENCES = {"tracker": "a calibrated tracker over the frames", "truth": "true poses in /truth"}
+"""What a sweep may be compared with, and what it needs for that."""
 _UNITS = np.array([[1.0], *[[180.0 / np.pi]] * 3])
 """mm per mm and degrees per radian, of length and three turns."""
 
@@ -103,13 +104,10 @@ def find_reference(sweep: Sweep, name: str | None = None) -> Reference | None:
         raise InvalidInputError(f"expected {' or '.join(REFERENCES)}, got {name!r}")
     if sweep.truth is not None and name != "tracker":
         return Reference.over_all("truth", sweep.truth)
-    if name == "truth":
-        raise InsufficientDataError(f"{sweep.name}: expected true poses in /truth, got none")
-    if (reference := _of_tracker(sweep)) is not None:
-        return reference
-    if name == "tracker":
-        raise InsufficientDataError(f"{sweep.name}: expected a calibrated tracker over the frames, got none")
-    return None
+    reference = None if name == "truth" else _of_tracker(sweep)
+    if name and reference is None:
+        raise InsufficientDataError(f"{sweep.name}: expected {REFERENCES[name]}, got none")
+    return reference
 
 
 def tracker_alone(sweep: Sweep) -> RigidTransform | None:

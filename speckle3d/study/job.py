@@ -42,7 +42,7 @@ from speckle3d.io.reconstructions import write_reconstruction
 from speckle3d.motion.direction import sensed_orientation
 from speckle3d.scoring.displacements import score_row
 from speckle3d.scoring.lengths import TRACKER
-from speckle3d.scoring.modes import length_claims, relative_claims
+from speckle3d.scoring.modes import length_claims
 from speckle3d.scoring.references import (
     Reference,
     error_rows,
@@ -196,8 +196,9 @@ def run_job(
         if reference is None and credible.tracker is None:
             reference_poses = find_reference(credible)
         estimates = poses if tracker_poses is None else {**poses, TRACKER: tracker_poses}
-        claims = relative_claims(poses, trust, centre)
-        doubts = (*tracked.doubts, *differing_lengths(length_claims(poses, claims, centre)))
+        lengths = length_claims(poses, trust, centre)
+        claims = {mode: sigma / length for mode, (length, sigma) in lengths.items()}
+        doubts = (*tracked.doubts, *differing_lengths(lengths))
         rows = [
             replace(row, sigma_mm=claims[row.mode] * abs(row.estimate_mm)) if row.mode in claims else row
             for row in error_rows(estimates, reference_poses, centre)

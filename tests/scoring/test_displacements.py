@@ -65,4 +65,4 @@ def test_errors_need_a_path_and_frames_of_landmarks():
     with pytest.raises(InsufficientDataError):
         drift_rates(sliding(1.0), RigidTransform.identity(51), CENTRE_MM)
     with pytest.raises(MismatchError):
-        point_errors(sliding(1.0), sliding(1.0)[1:], None)
+        drift_rates(sliding(1.0), sliding(1.0)[1:], CENTRE_MM)
