@@ -129,7 +129,7 @@ def drift_rates(
         raise InsufficientDataError("drift rates: expected a reference that moves, got one that rests")
     drift = np.linalg.norm(centres - true_centres, axis=1)[1:]
     moves = path_mm > 0
-    angle = np.rad2deg((true.rotation.inv() * estimate.rotation).magnitude()[1:])
+    angle = np.rad2deg((true[1:].rotation.inv() * estimate[1:].rotation).magnitude())
     return {
         "FDR_percent": float(100.0 * drift[-1] / path_mm[-1]),
         "ADR_percent": float(100.0 * np.mean(drift[moves] / path_mm[moves])),
@@ -138,7 +138,7 @@ def drift_rates(
         "HD_mm": max(
             directed_hausdorff(a, b)[0] for a, b in ((centres, true_centres), (true_centres, centres))
         ),
-        "EA_deg": float(angle.mean()),
+        "EA_deg": float(np.mean(angle)),
     }
 
 
