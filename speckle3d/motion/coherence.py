@@ -267,10 +267,11 @@ def _share_prior(by_share: FloatArray, share: FloatArray) -> FloatArray:
 
 
 def _peak(log_posterior: FloatArray) -> float:
-    """Likeliest ln s by the parabola about it."""
+    """Likeliest ln s by the parabola about it, or the last of the scales tried that way."""
     at = int(np.clip(log_posterior.argmax(), 1, LOG_SCALES.size - 2))
     low, middle, high = log_posterior[at - 1 : at + 2]
-    return float(LOG_SCALES[at] + STEP * (high - low) / (2.0 * max(2.0 * middle - low - high, 1e-9)))
+    steps = (high - low) / (2.0 * max(2.0 * middle - low - high, 1e-9))
+    return float(LOG_SCALES[at] + STEP * np.clip(steps, -1.0, 1.0))
 
 
 def _covariance(problem: MotionProblem, by_patch: FloatArray, log_scale: float) -> FloatArray:
