@@ -18,7 +18,7 @@ from xsens.fusion.readings import PAUSE_S, Samples, lost_variance
 from xsens.fusion.settings import LOST, FusionSettings
 from xsens.logs.contradictions import FASTEST_RAD_S, not_in_metres
 from xsens.logs.faults import LIMITS
-from xsens.logs.samples import VECTORS
+from xsens.logs.samples import VECTORS, row_norms
 
 _FOLLOWS = 0.05
 """How fast the usual step between samples follows theirs, as a fraction of a sample."""
@@ -181,7 +181,7 @@ def _require_readings(step_s: npt.ArrayLike, *vectors: npt.ArrayLike | None) -> 
     if any(rows.shape != shape for rows in readings):
         raise MismatchError(f"expected readings of shape {shape}, got {[rows.shape for rows in readings]}")
     rate, force, field = readings
-    fast = np.linalg.norm(np.nan_to_num(rate), axis=1).max(initial=0.0)
+    fast = row_norms(np.nan_to_num(rate)).max(initial=0.0)
     if fast > FASTEST_RAD_S:
         raise InvalidInputError(f"gyroscope_rad_s: expected rad/s, got a reading of {fast:.3g}: in deg/s?")
     force[~force.any(axis=1) | ~(np.abs(force) < LIMITS[VECTORS[0]].largest).all(axis=1)] = np.nan

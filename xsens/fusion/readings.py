@@ -170,11 +170,7 @@ def _interpolated_means(
 
 def _near(time_s: FloatArray, valid: BoolArray) -> BoolArray:
     """Where a reading is valid, or one before and one after it at most a bridged pause apart."""
-    valid_s = time_s[valid]
-    if valid.all() or not valid_s.size:
+    if valid.all():
         return valid
-    after = np.searchsorted(valid_s, time_s)
-    before = np.searchsorted(valid_s, time_s, side="right") - 1
-    inside = (after < valid_s.size) & (before >= 0)
-    span = valid_s[np.minimum(after, valid_s.size - 1)] - valid_s[np.maximum(before, 0)]
-    return np.asarray(inside & (span <= PAUSE_S))
+    valid_s, before = np.concatenate([[-np.inf], time_s[valid], [np.inf]]), np.cumsum(valid)
+    return np.asarray(valid_s[before + ~valid] - valid_s[before] <= PAUSE_S)

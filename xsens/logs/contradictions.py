@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from speckle3d.core.arrays import BoolArray, FloatArray
-from xsens.logs.samples import ImuLog, finite_rows
+from xsens.logs.samples import ImuLog, finite_rows, median_norm, row_norms, selection
 
 FORCE_M_S2 = (4.0, 25.0)
 """Limits of the median of the accelerometer's norm if it is in m/s^2."""
@@ -75,25 +75,23 @@ def contradictions(log: ImuLog) -> dict[str, str]:
 
 def not_in_metres(force: FloatArray) -> str:
     """Sentence on an accelerometer, shape (m, 3), that is not in m/s^2; empty for one that is."""
-    norm = np.linalg.norm(force[finite_rows(force)], axis=1)
-    median = float(np.median(norm)) if norm.size else 9.8
-    if FORCE_M_S2[0] < median < FORCE_M_S2[1]:
+    median = median_norm(force)
+    if not (median <= FORCE_M_S2[0] or median >= FORCE_M_S2[1]):
         return ""
     unit = ": in g, without saying so?" if 0.9 < median < 1.1 else ""
     return f"expected an accelerometer in m/s^2, with norm near 9.8, got a median of {median:.3g}{unit}"
 
 
 def _not_in_radians(rate: FloatArray) -> str:
-    fast = float(np.nanpercentile(np.linalg.norm(rate, axis=1), 99.0))
+    fast = float(np.nanpercentile(row_norms(rate), 99.0))
     if fast <= FASTEST_RAD_S:
         return ""
     return f"expected a gyroscope in rad/s, got one in a hundred over {fast:.3g}: in deg/s?"
 
 
 def _upward_field(force: FloatArray, field: FloatArray) -> str:
-    both = finite_rows(force) & finite_rows(field)
-    lengths = np.linalg.norm(force[both], axis=1) * np.linalg.norm(field[both], axis=1)
-    up = np.einsum("ij,ij->i", force[both], field[both]) / np.maximum(lengths, 1e-12)
+    up = np.einsum("ij,ij->i", force, field) / np.maximum(row_norms(force) * row_norms(field), 1e-12)
+    up = up[np.isfinite(up)]
     if not up.size or np.median(up) < _UPWARD:
         return ""
     return (
@@ -118,21 +116,20 @@ def _turns(log: ImuLog, direction: FloatArray) -> tuple[FloatArray, FloatArray, 
     """
     if log.gyroscope_rad_s is None:
         return None
-    columns = np.column_stack([log.time_s, log.gyroscope_rad_s, direction])
-    columns = columns[np.isfinite(columns.sum(axis=1))]
-    if len(columns) <= _FEWEST:
+    part = selection(finite_rows(log.gyroscope_rad_s) & finite_rows(direction))
+    time_s = log.time_s[part]
+    if len(time_s) <= _FEWEST:
         return None
-    width = max(1, round(_COMPARED_S / float(np.median(np.diff(columns[:, 0])))))
-    count = len(columns) // width
-    means = columns[: count * width].reshape(count, width, 7).mean(axis=1)
-    step_s, rates = np.diff(means[:, 0]), means[:, 1:4]
-    rate = 0.5 * (rates[1:] + rates[:-1])
-    norm = np.linalg.norm(means[:, 4:], axis=1)
+    width = max(1, round(_COMPARED_S / float(np.median(np.diff(time_s)))))
+    first = np.arange(0, len(time_s) - width + 1, width)
+    end, readings = len(first) * width, (time_s, log.gyroscope_rad_s[part], direction[part])
+    time_s, rates, means = (np.add.reduceat(values[:end], first) / width for values in readings)
+    step_s, rate, norm = np.diff(time_s), 0.5 * (rates[1:] + rates[:-1]), row_norms(means)
     calm = np.abs(norm / np.median(norm) - 1.0) < _CALM
     calm = calm[1:] & calm[:-1] & (step_s < 2.0 * np.median(step_s))
     if calm.sum() < _FEWEST:
         return None
-    u = means[:, 4:] / np.maximum(norm, 1e-9)[:, None]
+    u = means / np.maximum(norm, 1e-9)[:, None]
     change = (np.diff(u, axis=0) / step_s[:, None])[calm]
     arms = np.cross(0.5 * (u[1:] + u[:-1])[calm], np.eye(3)[:, None])
     turns = arms * rate[calm].T[:, :, None]
@@ -158,7 +155,7 @@ def _still_axis(name: str, turns: FloatArray, change: FloatArray, arms: FloatArr
     missed = change - turns.sum(axis=0)
     for axis, arm, rows in zip("xyz", arms, same, strict=True):
         if rows.sum() > _FEWEST:
-            along = (missed * arm)[rows].sum(axis=1) / np.linalg.norm(arm[rows], axis=1)
+            along = (missed * arm)[rows].sum(axis=1) / row_norms(arm[rows])
             if _rms(along[:, None]) > max(_ABOUT_AXIS * _rms(missed[rows]), _MOVING_RAD_S):
                 return f"the gyroscope's {axis} axis reads the same while the {name} turns about it"
     return ""

@@ -13,7 +13,7 @@ import numpy as np
 
 from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.errors import InvalidInputError
-from xsens.logs.samples import VECTORS, ImuLog, finite_rows
+from xsens.logs.samples import VECTORS, ImuLog, finite_rows, median_norm, row_norms, selection
 
 
 class _Limits(NamedTuple):
@@ -93,20 +93,15 @@ def without_faults(log: ImuLog) -> ImuLog:
     return replace(log, **changes, notes=(*log.notes, *notes))
 
 
-def _norm(rows: FloatArray) -> FloatArray:
-    with np.errstate(over="ignore", invalid="ignore"):  # damage
-        return np.asarray(np.sqrt(np.einsum("ij,ij->i", rows, rows)))
-
-
-def _digit(readings: FloatArray) -> float:
-    """Smallest change along the rows, of any axis: the last digit of a sensor."""
-    steps = np.abs(np.diff(readings, axis=0))
-    return float(np.min(steps, where=steps > 0.0, initial=np.inf))
+def _digit(steps: FloatArray) -> float:
+    """Smallest change from row to row, of any axis: the last digit of a sensor."""
+    size = np.abs(steps)
+    return float(np.min(size, where=size > 0.0, initial=np.inf))
 
 
 def _bad(name: str, rows: FloatArray, force: FloatArray, rate: FloatArray) -> dict[str, BoolArray]:
     """Rows that are no measurement of one sensor, by reason."""
-    limits, size = LIMITS[name], _norm(rows)
+    limits, size = LIMITS[name], row_norms(rows)
     finite = ~np.isnan(size)
     size[~finite] = 0.0
     zero, unit = finite & (size < 1e-12), 1.0
@@ -120,8 +115,10 @@ def _bad(name: str, rows: FloatArray, force: FloatArray, rate: FloatArray) -> di
         beyond = size >= _ABSURD
     valid, repeats = finite & ~beyond & ~zero, np.zeros(len(rows), dtype=bool)
     if valid.any():
-        repeats[valid] = _repeats(name, limits.change * unit, rows[valid], force[valid], rate[valid])
-    rows = np.where((valid & ~repeats)[:, None], rows, np.nan)
+        part = selection(valid)
+        repeats[part] = _repeats(name, limits.change * unit, rows[part], force[part], rate[part])
+    if not (valid := valid & ~repeats).all():
+        rows = np.where(valid[:, None], rows, np.nan)
     return {
         "readings of zero": zero,
         "out of range": beyond,
@@ -140,28 +137,34 @@ def _repeats(name: str, change: float, rows: FloatArray, force: FloatArray, rate
     changes = np.logical_or.reduce([axis[1:] != axis[:-1] for axis in rows.T])
     start = np.flatnonzero(np.append(True, changes))
     length = np.diff(np.append(start, len(rows)))
-    usual = int(min(3.0 * np.median(length), np.percentile(length, 90))) if len(length) > 1 else 1
-    long = length > max(2, 2 * usual)
+    middle, high = np.percentile(length, [50, 90]) if len(length) > 1 else (1, 1)
+    usual = int(min(3.0 * middle, high))
+    long, repeats = length > max(2, 2 * usual), np.zeros(len(rows), dtype=bool)
     if not long.any():
-        return np.zeros(len(rows), dtype=bool)
-    step = np.pad(_norm(np.diff(rows, axis=0)), 1, constant_values=np.nan)
-    before, after = step[start], step[start + length]
-    noisy = np.minimum(before, after) > _NOISY * _digit(rows)
-    moves = noisy | (after > change) | (np.isnan(after) & (start > 0))
+        return repeats
+    steps = np.diff(rows, axis=0)
+    step = np.pad(row_norms(steps), 1, constant_values=np.nan)
+    changes = step[start]
+    at, start, length = np.flatnonzero(np.repeat(long, length)), start[long], length[long]
+    before, after, first = step[start], step[start + length], np.cumsum(length) - length
+    moves = (np.minimum(before, after) > _NOISY * _digit(steps)) | (after > change)
+    moves |= np.isnan(after) & (start > 0)
     if name == VECTORS[1]:  # a resting one may read its bias, or zero
-        spread = np.fmax.reduceat(force, start) - np.fmin.reduceat(force, start)
+        spread = np.fmax.reduceat(force[at], first) - np.fmin.reduceat(force[at], first)
         still = ~(spread > _STEADY_M_S2).any(axis=1)
         drops = np.isnan(before) | np.isnan(after) | (before > _DROP_RAD_S)
-        moves = (moves & ~(still & drops & (_norm(rows[start]) < _SLOW_RAD_S))) | (np.isnan(after) & ~still)
+        bias = still & drops & (row_norms(rows[start]) < _SLOW_RAD_S)
+        bad = (moves & ~bias) | (np.isnan(after) & ~still)
     else:  # what is repeated to the log's end was left while the sensor turned
-        turn = np.add.reduceat(np.nan_to_num(_norm(rate)), start)
-        moves &= ~np.isnan(after) | (turn > _TURNING_RAD_S * length)
-    bad, first = long & moves, np.full(len(start), usual)
+        turn = np.add.reduceat(np.nan_to_num(row_norms(rate[at])), first)
+        bad = moves & (~np.isnan(after) | (turn > _TURNING_RAD_S * length))
+    valid = np.full(len(start), usual)
     if bad.any():  # what readings jump to again and again is none, but a number that stands for none
         _, code, count = np.unique(rows[start[bad]], axis=0, return_inverse=True, return_counts=True)
-        first[bad] *= (count[code] == 1) | ~(before[bad] > _NOISY * np.median(np.nan_to_num(before)))
-    place = np.arange(len(rows)) - np.repeat(start, length)
-    return np.asarray(np.repeat(bad, length) & (place >= np.repeat(first, length)))
+        valid[bad] *= (count[code] == 1) | ~(before[bad] > _NOISY * np.median(np.nan_to_num(changes)))
+    place = at - np.repeat(start, length)
+    repeats[at] = np.repeat(bad, length) & (place >= np.repeat(valid, length))
+    return repeats
 
 
 def at_ends(rows: FloatArray) -> BoolArray:
@@ -175,7 +178,7 @@ def at_ends(rows: FloatArray) -> BoolArray:
                 continue
             steps = np.abs(np.pad(np.diff(axis), 2))  # into each sample from the second before it, and out
             first, last = at[np.diff(at, prepend=-2) > 1], at[np.diff(at, append=len(axis) + 1) > 1]
-            steep = np.minimum(steps[first], steps[last + 3]) > 3.0 * _digit(axis)
+            steep = np.minimum(steps[first], steps[last + 3]) > 3.0 * _digit(steps)
             for i, k in zip(first[steep], last[steep], strict=True):
                 others_go_on = (rows[i + 1 : k + 1] != rows[i:k]).any(axis=1).sum() > 1
                 bad[i : k + 1] |= others_go_on
@@ -184,13 +187,13 @@ def at_ends(rows: FloatArray) -> BoolArray:
 
 def _spikes(rows: FloatArray, height: float) -> BoolArray:
     """Single rows far from both neighbours, which are near each other."""
-    if len(rows) < 3:
-        return np.zeros(len(rows), dtype=bool)
-    around = np.concatenate([rows[1:2], rows, rows[-2:-1]])
-    before, after = around[:-2], around[2:]
-    away = _norm(rows - 0.5 * (before + after))
-    bad = away > height
-    bad[bad] = _norm((after - before)[bad]) < 0.2 * away[bad]
+    bad = np.zeros(len(rows), dtype=bool)
+    if len(rows) > 2:
+        step = row_norms(np.diff(rows, axis=0))
+        at = np.flatnonzero(np.append(step[0], step) > 0.9 * height)
+        before, after = rows[np.abs(at - 1)], rows[np.where(at + 1 < len(rows), at + 1, at - 1)]
+        away = row_norms(rows[at] - 0.5 * (before + after))
+        bad[at] = (away > height) & (row_norms(after - before) < 0.2 * away)
     return bad
 
 
@@ -202,17 +205,11 @@ def _require_one_sensor(readings: dict[str, FloatArray]) -> None:
         middle = len(rows) // 2
         rows = rows[max(middle - _LOOKED_AT, 0) : middle + _LOOKED_AT]
         rows = np.where((rows != 0.0).any(axis=1)[:, None], rows, np.nan)
-        apart = [_median_norm(rows[lag:] - rows[:-lag]) for lag in range(1, _MOST_SENSORS + 1)]
+        apart = [median_norm(rows[lag:] - rows[:-lag]) for lag in range(1, _MOST_SENSORS + 1)]
+        least = 0.02 * median_norm(rows)
         for sensors in range(2, _MOST_SENSORS + 1):
-            if np.min(apart[: sensors - 1]) > _TURNS_APART * apart[sensors - 1] + 0.02 * _median_norm(rows):
+            if np.min(apart[: sensors - 1]) > _TURNS_APART * apart[sensors - 1] + least:
                 raise InvalidInputError(
                     f"expected the rows of one sensor, got those of {sensors} in turn: neighbouring readings "
                     f"differ, and every {sensors}. is alike: split the table"
                 )
-
-
-def _median_norm(rows: FloatArray) -> float:
-    """Median length of the rows that have one; NaN if none has."""
-    norms = _norm(rows)
-    norms = norms[np.isfinite(norms)]
-    return float(np.median(norms)) if norms.size else float("nan")

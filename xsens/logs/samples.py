@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -28,6 +29,24 @@ _PAUSE = 2.5
 def finite_rows(rows: FloatArray) -> BoolArray:
     """Mark the rows of three finite numbers; many times faster than a reduction over a few columns."""
     return np.asarray(np.isfinite(rows[:, 0]) & np.isfinite(rows[:, 1]) & np.isfinite(rows[:, 2]))
+
+
+def row_norms(rows: FloatArray) -> FloatArray:
+    """Length of each row, whatever damage it holds."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        return np.asarray(np.sqrt(np.einsum("ij,ij->i", rows, rows)))
+
+
+def median_norm(rows: FloatArray) -> float:
+    """Median length of the rows that have one; NaN if none has."""
+    norms = row_norms(rows)
+    norms = norms[np.isfinite(norms)]
+    return float(np.median(norms)) if norms.size else float("nan")
+
+
+def selection(rows: BoolArray) -> Any:
+    """Index of the marked rows; all of them are a view, not a copy."""
+    return slice(None) if rows.all() else rows
 
 
 @dataclass(frozen=True)

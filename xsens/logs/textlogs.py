@@ -21,7 +21,7 @@ from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.parts import whole_file
 from xsens.logs.clocks import COUNTS, SHORTEST_S, TICK_S, TICKS, Stamps, unwrap
 from xsens.logs.parts import Hints, Parts, assemble_log
-from xsens.logs.samples import VECTORS, ImuLog
+from xsens.logs.samples import VECTORS, ImuLog, median_norm
 from xsens.logs.texttables import (
     STAMPS,
     TIMES,
@@ -124,7 +124,7 @@ def _samples(table: TextTable, rate_hz: float | None) -> Parts:
         rate = np.deg2rad(rate)
     if force is None and any(key.startswith("free_") for key in columns):
         force = _side_by_side(columns, [f"free_{axis}" for axis in "xyz"])
-        if force is None or np.nanmedian(np.linalg.norm(force, axis=1)) < _GRAVITY_M_S2:
+        if force is None or median_norm(force) < _GRAVITY_M_S2:
             force = None
             notes.append("acceleration without gravity is no accelerometer's reading and was left out")
     increments = (_side_by_side(columns, _VELOCITY_STEPS), _side_by_side(columns, _TURNS))

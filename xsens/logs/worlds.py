@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.errors import InvalidInputError
+from xsens.logs.samples import row_norms
 
 WORLDS = {
     "NWU": Rotation.identity(),
@@ -85,9 +86,7 @@ def quaternions_of(numbers: FloatArray) -> FloatArray:
         Quaternions; matrices row by row; or roll, pitch and yaw in degrees, R = Rz(yaw) Ry(pitch) Rx(roll).
     """
     if numbers.shape[1] == 4:
-        with np.errstate(over="ignore", invalid="ignore"):
-            off = np.abs(np.sqrt(np.einsum("ij,ij->i", numbers, numbers)) - 1.0)
-        return np.where((off < _WORST_NORM)[:, None], numbers, np.nan)
+        return np.where((np.abs(row_norms(numbers) - 1.0) < _WORST_NORM)[:, None], numbers, np.nan)
     if numbers.shape[1] == 3:
         good = np.asarray((np.abs(numbers) <= _WORST_ANGLE_DEG).all(axis=1))
         turns = Rotation.from_euler("xyz", numbers[good], degrees=True)
@@ -131,7 +130,7 @@ def likelier(notations: Sequence[FloatArray], acceleration: FloatArray | None) -
 
 def _at_rest(vectors: FloatArray) -> FloatArray:
     """Directions of the accelerations whose length is the usual, of all if these are few, shape (n, 3)."""
-    length = np.linalg.norm(vectors, axis=1)
+    length = row_norms(vectors)
     calm = np.abs(length - np.median(length)) < _AT_REST * np.median(length)
     calm |= calm.sum() < _FEWEST
     return np.asarray(vectors[calm] / length[calm, None])
