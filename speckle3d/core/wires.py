@@ -77,7 +77,7 @@ class WirePhantom:
 
     def crossings_mm(self) -> FloatArray:
         """Where the middle wire of each N meets the first and the last wire, shape (n_shapes, 2, 3)."""
-        n = np.reshape(self.n_shapes, (-1, 3))
+        n = np.array(self.n_shapes, dtype=int).reshape(-1, 3)
         point, along = self.points_mm[n[:, 1], None], self.directions[n[:, 1], None]
         rows, offsets = self.equations(n[:, ::2])
         # Nearest to the outer wire: its distance is linear along the middle one.

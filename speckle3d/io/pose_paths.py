@@ -109,8 +109,8 @@ def rigid(matrices: FloatArray) -> tuple[FloatArray, list[str]]:
     exact = np.tile(np.eye(4), (len(r), 1, 1))
     exact[near, :3, 3] = matrices[near, :3, 3]
     exact[near, :3, :3] = nearest_rotation(r[near])
-    reasons = np.where(near, "", np.where(is_near, "whose pose is not rigid", "whose pose is beyond 100 m"))
-    return exact, reasons.tolist()
+    reasons = np.where(is_near, "whose pose is not rigid", "whose pose is not within 100 m")
+    return exact, np.where(near, "", reasons).tolist()
 
 
 def _loss(noun: str, total: int, reasons: Mapping[str, int], time_s: FloatArray) -> list[str]:
