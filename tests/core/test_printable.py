@@ -5,16 +5,9 @@ import pickle
 import pytest
 
 from speckle3d.core.errors import FileError, InvalidInputError, naming
-from speckle3d.core.printable import printable
 
 HOSTILE = "a\x1b[31m\r\n\x9b\u202e\u2028\udc80\x00b"
 ESCAPES = r"a\x1b[31m\r\n\x9b\u202e\u2028\udc80\x00b"
-
-
-def test_what_drives_a_terminal_is_escaped_once():
-    assert printable(HOSTILE) == ESCAPES
-    assert printable(ESCAPES) == ESCAPES
-    assert printable("a\nb\x1b", kept="\n") == "a\nb\\x1b"
 
 
 @pytest.mark.parametrize("kind", [InvalidInputError, FileError])
