@@ -64,7 +64,7 @@ def repeatability(
     MismatchError
         If they are not of one kind of sensor.
     """
-    if size_px is not None and min(size_px) < 1:
+    if size_px and min(size_px) < 1:
         raise InvalidInputError(f"size_px: expected columns and rows above zero, got {size_px}")
     if len(calibrations) < 2:
         raise InsufficientDataError(f"expected at least two calibrations to compare, got {len(calibrations)}")

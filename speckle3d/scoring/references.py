@@ -113,7 +113,7 @@ def find_reference(sweep: Sweep, name: str | None = None) -> Reference | None:
 def tracker_alone(sweep: Sweep) -> RigidTransform | None:
     """Poses by the position sensor alone, no images; None unless it is calibrated and covers every frame."""
     reference = _of_tracker(sweep)
-    return reference.world_from_image if reference is not None and reference.covered.all() else None
+    return reference.world_from_image if reference and reference.covered.all() else None
 
 
 def _of_tracker(sweep: Sweep) -> Reference | None:
@@ -196,5 +196,5 @@ def _estimates(
 def _curves(poses: RigidTransform, centre_mm: npt.ArrayLike, end_frames: int) -> FloatArray:
     """Length (mm), tilt, yaw and roll (degrees), shape (4, n), zero where the first end is read."""
     curves = _UNITS * np.stack(sum_motion(poses, centre_mm))
-    start = np.array([[read_end(curve[::-1], end_frames)] for curve in curves])
-    return np.asarray(curves - start)
+    curves -= [[read_end(curve[::-1], end_frames)] for curve in curves]
+    return np.asarray(curves)
