@@ -129,6 +129,11 @@ class MissingSettingsError(InvalidInputError):
         super().__init__(_request(path, settings) if settings else str(path))
 
 
+def option_of(name: str) -> str:
+    """Option of commands that gives a setting."""
+    return f"--{name.removeprefix('tracker_').replace('_', '-')}"
+
+
 def settings_for(path: PathLike, options: ImportSettings | None = None) -> ImportSettings:
     """Settings beside a recording, with options over them.
 
@@ -160,7 +165,7 @@ def settings_file(path: PathLike) -> Path | None:
 
 def _request(path: PathLike | str, settings: tuple[str, ...]) -> str:
     fields = ImportSettings.model_fields
-    options = "; ".join(f"--{name.replace('_', '-')} ({fields[name].description})" for name in settings)
+    options = "; ".join(f"{option_of(name)} ({fields[name].description})" for name in settings)
     return (
         f"{path}: the file does not say, so give `speckle3d convert` or {Path(path).name}.toml beside it: "
         f"{options}"

@@ -27,6 +27,7 @@ from speckle3d.io.import_settings import (
     SPEED_OF_SOUND_M_S,
     ImportSettings,
     MissingSettingsError,
+    option_of,
     settings_file,
     settings_for,
 )
@@ -182,7 +183,7 @@ class Recording:
         words, number, unit = number_row(name, () if value.value is None else value.value)
         source = f" ({value.source})" if value.source else ""
         if setting is None:
-            option = f"missing: --{self.substitutes.get(name, name).replace('_', '-')}"
+            option = f"missing: {option_of(self.substitutes.get(name, name))}"
             return ((words, f"{number}{source}", unit) if number else (words, option, "")), ""
         text, giver = number_row(name, setting)[1], "given"
         if (file := settings_file(self.path)) and getattr(settings_for(self.path), name) == setting:

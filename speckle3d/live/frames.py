@@ -13,7 +13,7 @@ from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import Sweep
 from speckle3d.io.igtl.messages import ImageReceived
-from speckle3d.io.import_settings import ImportSettings, MissingSettingsError
+from speckle3d.io.import_settings import ImportSettings, MissingSettingsError, option_of
 from speckle3d.io.recordings import Recording, Value
 
 _ECHOES, _GREY_LEVELS = ("int16", "float32"), "uint8"
@@ -72,7 +72,7 @@ class ImageLayout:
         try:
             example = _example(pixels, image, settings, where)
         except MissingSettingsError as error:
-            options = ", ".join(f"--{name.replace('_', '-')}" for name in error.settings)
+            options = ", ".join(map(option_of, error.settings))
             raise MissingSettingsError(
                 f"{where}: its messages do not say what {'RF' if of_rf else 'B-mode'} needs, so give "
                 f"{options} (`speckle3d live --help` tells what they are)"

@@ -155,7 +155,7 @@ def _still_axis(name: str, turns: FloatArray, change: FloatArray, arms: FloatArr
     missed = change - turns.sum(axis=0)
     for axis, arm, rows in zip("xyz", arms, same, strict=True):
         if rows.sum() > _FEWEST:
-            along = (missed * arm)[rows].sum(axis=1) / row_norms(arm[rows])
+            along = (missed * arm)[rows].sum(axis=1) / np.maximum(row_norms(arm[rows]), 1e-9)
             if _rms(along[:, None]) > max(_ABOUT_AXIS * _rms(missed[rows]), _MOVING_RAD_S):
                 return f"the gyroscope's {axis} axis reads the same while the {name} turns about it"
     return ""

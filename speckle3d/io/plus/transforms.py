@@ -108,7 +108,7 @@ def tracked_poses(
     if not chain:
         wanted = " and ".join(filter(None, (name, reference)))
         listing = ", ".join(transforms) or "none"
-        raise InvalidInputError(f"{header.path}: expected transforms {wanted}, got {listing}")
+        raise InvalidInputError(f"{header.path}: expected a chain of transforms for {wanted}, got {listing}")
     matrices, faults = np.eye(4), [""] * header.frame_count
     for pair in chain:
         step, reasons = _column(header, *pair, is_rigid=names.image not in pair)
