@@ -109,7 +109,7 @@ def received(
     width_hz = 2 * (max(high - frequency_hz, frequency_hz - low) + _GUARD * (high - low))
     usual = max(1, int(rate_hz / (_ROOM * width_hz))) if dynamic_range_db is None else _GREY_DECIMATION
     every = decimation or usual
-    with naming(f"decimation by {every}"):
+    with naming("decimation"):
         signal = replace(rf, sampling_rate_hz=rate_hz / every, demodulation_frequency_hz=frequency_hz)
     frames = ReceivedFrames(sweep.frames, frequency_hz / rate_hz, every, dynamic_range_db)
     return replace(
