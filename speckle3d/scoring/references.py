@@ -142,7 +142,6 @@ def sweep_curves(
         the first reading, whose jitter they would carry throughout.
     covariance : ndarray, shape (n, 6, 6), optional
         Of the poses of mode `image`: (x, y, z) in mm and (tilt, yaw, roll) in radians.
-
     """
     modes = {
         mode: _curves(path, centre_mm, END_FRAMES if mode == TRACKER else 1)
