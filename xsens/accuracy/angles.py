@@ -162,7 +162,7 @@ def pair_errors(
     # each pair's rotation vector is computed once for all calibrations.
     angles = np.einsum("kji,pj->kpi", matrices, turns)
     errors = _nearest_turn(angles, reference) - reference
-    return PairErrors(len(world_from_sensor), reference[:, ::-1].copy(), errors[..., ::-1].copy())
+    return PairErrors(len(world_from_sensor), reference[:, ::-1], errors[..., ::-1])
 
 
 def common_readings(

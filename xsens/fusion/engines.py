@@ -139,8 +139,9 @@ def _at_samples(
 
     When in its interval a gyroscope's reading is taken is not known: half of it is claimed as well.
     """
-    rates = Rotation.from_quat(xyzw).apply(samples.rate_rad_s - bias_rad_s[of_sample])
+    bias_rad_s = bias_rad_s[of_sample]
+    rates = Rotation.from_quat(xyzw).apply(samples.rate_rad_s - bias_rad_s)
     late_rad = 0.5 * float(np.median(samples.step_s)) * rates
     _, _, distrust, stray, iron = north[of_sample].T
     sd_rad, resting = np.hypot(sd_rad[of_sample], late_rad), steps["resting"][of_sample]
-    return Estimate(xyzw, sd_rad, bias_rad_s[of_sample], distrust > 0.0, resting, stray, iron)
+    return Estimate(xyzw, sd_rad, bias_rad_s, distrust > 0.0, resting, stray, iron)

@@ -12,7 +12,7 @@ import numpy as np
 from speckle3d.core.arrays import FloatArray
 from xsens.fusion.orient import Orientation, orient
 from xsens.fusion.settings import FusionSettings
-from xsens.logs.samples import ImuLog
+from xsens.logs.samples import ImuLog, row_norms
 
 if TYPE_CHECKING:
     from xsens.fusion.online import OnlineState  # which loads numba
@@ -150,5 +150,4 @@ def field_now(state: OnlineState, disbelieved: float) -> FieldFound:
 
 def dip_rad(field_in_world: FloatArray) -> FloatArray:
     """Angle of fields in the world, shape (m, 3), below the horizontal."""
-    across = np.hypot(field_in_world[:, 0], field_in_world[:, 1])
-    return np.asarray(np.arctan2(-field_in_world[:, 2], across))
+    return np.asarray(np.arctan2(-field_in_world[:, 2], row_norms(field_in_world[:, :2])))

@@ -52,8 +52,8 @@ class OnlineState:
     disturbed: bool
     resting: bool
     started: bool
-    field_stray: float = math.nan
-    field_iron: float = math.nan
+    field_stray: float
+    field_iron: float
 
 
 class OnlineFilter:

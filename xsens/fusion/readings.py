@@ -12,7 +12,7 @@ from xsens.fusion.settings import BRIDGED_S, LOST
 from xsens.logs.clocks import SHORTEST_S
 from xsens.logs.contradictions import contradictions
 from xsens.logs.faults import without_faults
-from xsens.logs.samples import ImuLog, finite_rows
+from xsens.logs.samples import ImuLog, finite_rows, row_norms
 
 PAUSE_S = 1.25 * BRIDGED_S
 """A longer step is a pause. Steps of a clock of 10 Hz vary by rounding, and by jitter."""
@@ -116,8 +116,9 @@ def usable_samples(log: ImuLog) -> tuple[IntArray, Samples, list[str]]:
             f"{median_s:.4g} s: times in milliseconds?"
         )
     against = contradictions(log)
-    agrees = against.get("accelerometer") == ""
-    fatal = ("gravity", "gyroscope", *(() if agrees else ("accelerometer", "own orientation")))
+    fatal = ["gravity", "gyroscope", "accelerometer", "own orientation"]
+    if against.get("accelerometer") == "":
+        fatal.pop()
     if problem := next(filter(None, map(against.get, fatal)), ""):
         raise InvalidInputError(f"{source}: {problem}")
     notes += filter(None, against.values())
@@ -129,8 +130,8 @@ def usable_samples(log: ImuLog) -> tuple[IntArray, Samples, list[str]]:
         notes.append(f"{left_out} samples without gyroscope or accelerometer left out")
     rate, force, turns, pulls, time_s = rate[rows], force[rows], turns[rows], pulls[rows], log.time_s[rows]
     for name, valid in (("gyroscope", turns), ("accelerometer", pulls)):
-        if not valid.all():
-            notes.append(f"{int((~valid).sum())} {name} readings missing: interpolated")
+        if count := int((~valid).sum()):
+            notes.append(f"{count} {name} readings missing: interpolated")
     field = np.full((rows.size, 3), np.nan) if field is None else field[rows]
     step_s = np.diff(time_s, prepend=time_s[0] - np.median(np.diff(time_s)))
     lost_rad2 = np.zeros(rows.size)
@@ -144,9 +145,9 @@ def lost_variance(time_s: FloatArray, rate_rad_s: FloatArray, usual_s: float) ->
 
     Its shape is (m - 1,). The rate may change as much as it did from the sample before to the one after.
     """
-    step_s, change = np.diff(time_s), np.diff(rate_rad_s, axis=0)
+    step_s = np.diff(time_s)
     gap = (step_s > LOST * usual_s) & (step_s <= PAUSE_S)
-    return np.where(gap, step_s**2 * np.einsum("ij,ij->i", change, change), 0.0)
+    return np.asarray(gap * (step_s * row_norms(np.diff(rate_rad_s, axis=0))) ** 2)
 
 
 def _interpolated_means(

@@ -157,7 +157,7 @@ def timeline(stamps: Stamps) -> Timeline:
     anew = _new_starts(values, stamps)
     if anew.any():  # each start far behind all before it, to sort them
         steps = np.diff(values)
-        steps[anew[1:]] = LATE * _usual_step(steps)
+        steps[anew[1:]] = LATE * usual_step(steps)
         values = _running_sums(steps)
     notes, rows = list[str](), np.argsort(values, kind="stable")
     rank = np.argsort(rows)
@@ -178,8 +178,10 @@ def _running_sums(steps: Any) -> Any:
     return np.append(steps.dtype.type(0), np.cumsum(steps))
 
 
-def _usual_step(steps: FloatArray) -> float:
-    return float(np.median(steps[steps > 0])) if (steps > 0).any() else 1.0
+def usual_step(steps: FloatArray, none: float = 1.0) -> float:
+    """Median of the steps forward, or what it is taken for if there is none."""
+    forward = steps[steps > 0]
+    return float(np.median(forward)) if forward.size else none
 
 
 def _sample_numbers(counter: IntArray, extras: IntArray | None) -> FloatArray:
@@ -196,7 +198,7 @@ def _new_starts(values: FloatArray, stamps: Stamps) -> BoolArray:
     A step far back shows it, unless those overtaken were followed by a jump forward to where it was.
     """
     steps = np.diff(values)
-    usual = _usual_step(steps)
+    usual = usual_step(steps)
     anew = np.zeros(values.size, dtype=bool)
     back = np.flatnonzero(steps < -LATE * usual)
     anew[back + 1] = True

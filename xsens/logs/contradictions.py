@@ -55,18 +55,18 @@ def contradictions(log: ImuLog) -> dict[str, str]:
 
     What tells nothing, as an accelerometer of a sensor that turns about the vertical alone, is left out.
     """
-    force, field = log.accelerometer_m_s2, log.magnetometer_au
+    rate, force, field = log.gyroscope_rad_s, log.accelerometer_m_s2, log.magnetometer_au
     directions = {"accelerometer": force, "magnetometer": field, "own orientation": log.own_direction}
-    sentences = {"gyroscope": "" if log.gyroscope_rad_s is None else _not_in_radians(log.gyroscope_rad_s)}
+    sentences = {"gyroscope": "" if rate is None else _not_in_radians(rate)}
     for name, direction in directions.items():
-        turns = None if direction is None else _turns(log, direction)
-        if turns is not None:
-            sentences["gyroscope"] = sentences["gyroscope"] or _still_axis(name, *turns)
-            sentences[name] = _against_gyroscope(name, *turns[:2])
-            if sentences[name] and field is not None and direction is field:
-                freed = _turns(log, _without_iron(log, field))
-                if freed is not None and len(freed[1]) >= len(turns[1]):  # as steady as before, or more
-                    sentences[name] = _against_gyroscope(name, *freed[:2])
+        if rate is None or direction is None or not (turns := _turns(log.time_s, rate, direction)):
+            continue
+        sentences["gyroscope"] = sentences["gyroscope"] or _still_axis(name, *turns)
+        sentences[name] = _against_gyroscope(name, *turns[:2])
+        if sentences[name] and direction is field:
+            freed = _turns(log.time_s, rate, _without_iron(log.time_s, rate, direction))
+            if freed and len(freed[1]) >= len(turns[1]):  # as steady as before, or more
+                sentences[name] = _against_gyroscope(name, *freed[:2])
     if force is not None:
         sentences["gravity"] = not_in_metres(force)
         sentences["dip"] = "" if field is None else _upward_field(force, field)
@@ -84,9 +84,8 @@ def not_in_metres(force: FloatArray) -> str:
 
 def _not_in_radians(rate: FloatArray) -> str:
     fast = float(np.nanpercentile(row_norms(rate), 99.0))
-    if fast <= FASTEST_RAD_S:
-        return ""
-    return f"expected a gyroscope in rad/s, got one in a hundred over {fast:.3g}: in deg/s?"
+    sentence = f"expected a gyroscope in rad/s, got one in a hundred over {fast:.3g}: in deg/s?"
+    return sentence if fast > FASTEST_RAD_S else ""
 
 
 def _upward_field(force: FloatArray, field: FloatArray) -> str:
@@ -100,7 +99,9 @@ def _upward_field(force: FloatArray, field: FloatArray) -> str:
     )
 
 
-def _turns(log: ImuLog, direction: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray] | None:
+def _turns(
+    time_s: FloatArray, rate: FloatArray, direction: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray] | None:
     """What the gyroscope's turns make of a direction that rests in the world; None if it tells nothing.
 
     Returns
@@ -114,15 +115,13 @@ def _turns(log: ImuLog, direction: FloatArray) -> tuple[FloatArray, FloatArray, 
     ndarray of bool, shape (3, n)
         Whether an axis of the gyroscope reads the same as before, while others do not.
     """
-    if log.gyroscope_rad_s is None:
-        return None
-    part = selection(finite_rows(log.gyroscope_rad_s) & finite_rows(direction))
-    time_s = log.time_s[part]
+    part = selection(finite_rows(rate) & finite_rows(direction))
+    time_s = time_s[part]
     if len(time_s) <= _FEWEST:
         return None
     width = max(1, round(_COMPARED_S / float(np.median(np.diff(time_s)))))
     first = np.arange(0, len(time_s) - width + 1, width)
-    end, readings = len(first) * width, (time_s, log.gyroscope_rad_s[part], direction[part])
+    end, readings = len(first) * width, (time_s, rate[part], direction[part])
     time_s, rates, means = (np.add.reduceat(values[:end], first) / width for values in readings)
     step_s, rate, norm = np.diff(time_s), 0.5 * (rates[1:] + rates[:-1]), row_norms(means)
     calm = np.abs(norm / np.median(norm) - 1.0) < _CALM
@@ -139,12 +138,10 @@ def _turns(log: ImuLog, direction: FloatArray) -> tuple[FloatArray, FloatArray, 
     return turns, change, arms, same & ~same.all(axis=0)
 
 
-def _without_iron(log: ImuLog, field: FloatArray) -> FloatArray:
+def _without_iron(time_s: FloatArray, rate: FloatArray, field: FloatArray) -> FloatArray:
     """The field less that of iron on the sensor, b: with it the field changes at the rate u x w + w x b."""
-    assert log.gyroscope_rad_s is not None
-    rows = finite_rows(log.gyroscope_rad_s) & finite_rows(field)
-    seen, step_s = field[rows], np.diff(log.time_s[rows])[:, None]
-    turn = log.gyroscope_rad_s[rows][1:] * step_s
+    rows = finite_rows(rate) & finite_rows(field)
+    seen, turn = field[rows], rate[rows][1:] * np.diff(time_s[rows])[:, None]
     off = np.diff(seen, axis=0) - np.cross(0.5 * (seen[1:] + seen[:-1]), turn)
     by_axis = np.cross(turn[:, None], np.eye(3)).swapaxes(1, 2)
     return field - np.linalg.lstsq(by_axis.reshape(-1, 3), off.ravel())[0]

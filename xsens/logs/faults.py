@@ -87,8 +87,8 @@ def without_faults(log: ImuLog) -> ImuLog:
         wrong = np.logical_or.reduce(list(bad.values()))
         if name == _ORIENTATION:
             changes["oriented"] = log.oriented & ~wrong
-        elif counts or not finite_rows(rows).any():
-            rows = np.where(wrong[:, None], np.nan, rows)
+        else:
+            rows = np.where(wrong[:, None], np.nan, rows) if counts else rows
             changes[name] = rows if finite_rows(rows).any() else None
     return replace(log, **changes, notes=(*log.notes, *notes))
 
@@ -102,18 +102,18 @@ def _digit(steps: FloatArray) -> float:
 def _bad(name: str, rows: FloatArray, force: FloatArray, rate: FloatArray) -> dict[str, BoolArray]:
     """Rows that are no measurement of one sensor, by reason."""
     limits, size = LIMITS[name], row_norms(rows)
-    finite = ~np.isnan(size)
-    size[~finite] = 0.0
-    zero, unit = finite & (size < 1e-12), 1.0
+    zero, unit, repeats = size < 1e-12, 1.0, np.zeros(len(rows), dtype=bool)
     if name == VECTORS[1]:  # at rest zero is a reading
-        zero &= np.isnan(force[:, 0]) | ~force.any(axis=1)
-    if name == VECTORS[2] and (finite & ~zero).any():
-        unit = float(np.median(size[finite & ~zero]))
-    beyond = size > limits.largest * unit
-    beyond[beyond] = np.abs(rows[beyond]).max(axis=1) > limits.largest * unit
-    if beyond.sum() > _FEW * finite.sum():  # another unit, which whoever uses the log refuses
+        zero &= ~(row_norms(force) > 0.0)
+    valid = ~(np.isnan(size) | zero)
+    if name == VECTORS[2] and valid.any():
+        unit = float(np.median(size[valid]))
+    largest = limits.largest * unit
+    beyond = size > largest
+    beyond[beyond] = np.abs(rows[beyond]).max(axis=1) > largest
+    if beyond.sum() > _FEW * (size >= 0.0).sum():  # another unit, which whoever uses the log refuses
         beyond = size >= _ABSURD
-    valid, repeats = finite & ~beyond & ~zero, np.zeros(len(rows), dtype=bool)
+    valid &= ~beyond
     if valid.any():
         part = selection(valid)
         repeats[part] = _repeats(name, limits.change * unit, rows[part], force[part], rate[part])
@@ -204,7 +204,7 @@ def _require_one_sensor(readings: dict[str, FloatArray]) -> None:
             continue
         middle = len(rows) // 2
         rows = rows[max(middle - _LOOKED_AT, 0) : middle + _LOOKED_AT]
-        rows = np.where((rows != 0.0).any(axis=1)[:, None], rows, np.nan)
+        rows = np.where(row_norms(rows)[:, None] > 0.0, rows, np.nan)
         apart = [median_norm(rows[lag:] - rows[:-lag]) for lag in range(1, _MOST_SENSORS + 1)]
         least = 0.02 * median_norm(rows)
         for sensors in range(2, _MOST_SENSORS + 1):

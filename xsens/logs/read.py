@@ -84,8 +84,8 @@ def read_log(path: PathLike, hints: Hints | None = None) -> ImuLog:
 def _is_text(first: bytes) -> bool:
     """Whether hardly any byte is a control character and the bytes hold no message of the sensor."""
     head = np.frombuffer(first, dtype=np.uint8)
-    controls = int((_TEXT_CONTROLS[head]).sum())
-    return (first.startswith(_WIDE) or controls <= _DAMAGE_SHARE * head.size) and not len(find_frames(head))
+    readable = first.startswith(_WIDE) or _TEXT_CONTROLS[head].mean() <= _DAMAGE_SHARE
+    return bool(readable) and not len(find_frames(head))
 
 
 # -- the sensor's own bytes

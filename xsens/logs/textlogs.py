@@ -19,7 +19,7 @@ import numpy as np
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.parts import whole_file
-from xsens.logs.clocks import COUNTS, SHORTEST_S, TICK_S, TICKS, Stamps, unwrap
+from xsens.logs.clocks import COUNTS, SHORTEST_S, TICK_S, TICKS, Stamps, unwrap, usual_step
 from xsens.logs.parts import Hints, Parts, assemble_log
 from xsens.logs.samples import VECTORS, ImuLog, median_norm
 from xsens.logs.texttables import (
@@ -66,13 +66,14 @@ _HALF_TURN = 3.2
 _GRAVITY_M_S2 = 4.0
 """Median length of accelerations from which they hold gravity: a hand's own are less."""
 
-_VECTORS = [[f"{quantity}_{axis}" for axis in "xyz"] for quantity in ("acc", "gyr", "mag")]
+*_VECTORS, _VELOCITY_STEPS = (
+    [f"{quantity}_{axis}" for axis in "xyz"] for quantity in ("acc", "gyr", "mag", "dv")
+)
 _EULER = ["euler_roll", "euler_pitch", "euler_yaw"]
 _MATRIX = [f"mat_{row}_{column}" for row in "123" for column in "123"]
 _QUATERNION, _OPTICAL, _TURNS = (
     [f"{source}_{axis}" for axis in "wxyz"] for source in ("quat", "optical", "dq")
 )
-_VELOCITY_STEPS = [f"dv_{axis}" for axis in "xyz"]
 
 
 def parse_text(text: str | Iterable[str], hints: Hints | None = None, source: str = "text") -> ImuLog:
@@ -196,10 +197,10 @@ def _stamps(
 
 def _unnamed_time(times: FloatArray, has_rate: bool, notes: list[str]) -> dict[str, FloatArray]:
     """Times without a unit as the column that they are: times in s, or else the samples' numbers."""
-    unit = _unit_of(times, TIMES)
+    unit, usual = _unit_of(times, TIMES), usual_step(np.diff(times))
     if unit is None and (not has_rate or np.nanmax(times % 1.0) > 0.0):
         raise InvalidInputError(
-            f"expected a time with its unit, as time_s or time_ms, got steps of {_usual_step(times):g}: "
+            f"expected a time with its unit, as time_s or time_ms, got steps of {usual:g}: "
             "if they count samples, give --rate-hz"
         )
     if unit != "s":
@@ -208,15 +209,9 @@ def _unnamed_time(times: FloatArray, has_rate: bool, notes: list[str]) -> dict[s
     return {"counter": times} if unit is None else {"time": times * TIMES[unit]}
 
 
-def _usual_step(times: FloatArray) -> float:
-    """Median of the steps forward; of a single time a sensor's."""
-    steps = np.diff(times)
-    return float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else 0.01
-
-
 def _unit_of(times: FloatArray, units: dict[str, float]) -> str | None:
     """Unit in which the steps of times are a sensor's, or those of one are of an epoch; None if in none."""
-    usual = _usual_step(times)
+    usual = usual_step(np.diff(times), 0.01)  # of a single time a sensor's
     value, low, high = (times[0], *_EPOCH_S) if usual == 1.0 else (usual, SHORTEST_S, 1.0 / _SLOWEST_HZ)
     return next((unit for unit, scale in units.items() if low <= value * scale <= high), None)
 

@@ -183,7 +183,7 @@ def _north_deg(wxyz: FloatArray, field: FloatArray | None) -> float:
     vectors = _in_world(wxyz, field)
     if vectors is None:
         return float("nan")
-    along = vectors[:, :2] / np.maximum(np.hypot(vectors[:, 0], vectors[:, 1]), 1e-12)[:, None]
+    along = vectors[:, :2] / np.maximum(row_norms(vectors[:, :2]), 1e-12)[:, None]
     if np.hypot(*along.mean(axis=0)) < _STEADY:
         return float("nan")
     x, y = np.median(along, axis=0)
@@ -197,7 +197,8 @@ def _in_world(wxyz: FloatArray, vectors: FloatArray | None) -> FloatArray | None
     indices = np.flatnonzero(np.isfinite(wxyz[:, 0]))
     sample = indices[:: len(indices) // _MOST + 1]
     wxyz, vectors = wxyz[sample], vectors[sample]
-    valid = (np.abs(vectors) < 1e6).all(axis=1) & (vectors != 0.0).any(axis=1)
+    norms = row_norms(vectors)
+    valid = (norms > 0.0) & (norms < 1e6)
     if valid.sum() < _FEWEST:
         return None
     return Rotation.from_quat(wxyz[valid], scalar_first=True).apply(vectors[valid])

@@ -144,16 +144,13 @@ class DataLayout:
             return (_COUNTER, *_RAW)
         counter = (_COUNTER,) if self.settings & OutputSettings.COUNTER else ()
         utc = (Field("utc", 12, ">u1"),) if self.settings & OutputSettings.UTC else ()
-        body = _RAW if self.mode == OutputMode.RAW else self._calibrated_fields()
-        return (*body, *counter, *utc)
-
-    def _calibrated_fields(self) -> tuple[Field, ...]:
         orientation = _ORIENTATION[(self.settings >> 2) & 3]
-        return tuple(
+        calibrated = (
             field or orientation
             for part, off, field in _PARTS
             if self.mode & part and not self.settings & off
         )
+        return (*(_RAW if self.mode == OutputMode.RAW else calibrated), *counter, *utc)
 
     @cached_property
     def dtype(self) -> np.dtype[np.void]:
