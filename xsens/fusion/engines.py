@@ -143,5 +143,5 @@ def _at_samples(
     rates = Rotation.from_quat(xyzw).apply(samples.rate_rad_s - bias_rad_s)
     late_rad = 0.5 * float(np.median(samples.step_s)) * rates
     _, _, distrust, stray, iron = north[of_sample].T
-    sd_rad, resting = np.hypot(sd_rad[of_sample], late_rad), steps["resting"][of_sample]
-    return Estimate(xyzw, sd_rad, bias_rad_s, distrust > 0.0, resting, stray, iron)
+    sd_rad = np.sqrt(np.square(sd_rad)[of_sample] + late_rad**2)
+    return Estimate(xyzw, sd_rad, bias_rad_s, distrust > 0.0, steps["resting"][of_sample], stray, iron)

@@ -12,7 +12,7 @@ from xsens.fusion.settings import BRIDGED_S, LOST
 from xsens.logs.clocks import SHORTEST_S
 from xsens.logs.contradictions import contradictions
 from xsens.logs.faults import without_faults
-from xsens.logs.samples import ImuLog, finite_rows, row_norms
+from xsens.logs.samples import ImuLog, finite_rows, row_norms, selection
 
 PAUSE_S = 1.25 * BRIDGED_S
 """A longer step is a pause. Steps of a clock of 10 Hz vary by rounding, and by jitter."""
@@ -98,8 +98,8 @@ def usable_samples(log: ImuLog) -> tuple[IntArray, Samples, list[str]]:
     before, log = len(log.notes), without_faults(log)
     notes, rate, force = list(log.notes[before:]), log.gyroscope_rad_s, log.accelerometer_m_s2
     turns, pulls = (np.zeros(len(log), bool) if part is None else finite_rows(part) for part in (rate, force))
-    rows = np.flatnonzero(_near(log.time_s, turns) & _near(log.time_s, pulls))
-    count = int(min(turns[rows].sum(), pulls[rows].sum()))
+    rows = _near(log.time_s, turns) & _near(log.time_s, pulls)
+    count = int(min((rows & turns).sum(), (rows & pulls).sum()))
     if rate is None or force is None or count < 2:
         missing = {"no gyroscope": rate, "no accelerometer": force}
         problems = [name for name, part in missing.items() if part is None] or [str(count)]
@@ -126,18 +126,22 @@ def usable_samples(log: ImuLog) -> tuple[IntArray, Samples, list[str]]:
     if against.get("magnetometer"):
         field = None
         notes.append("the magnetometer is left out")
-    if left_out := len(log) - rows.size:
+    part, indices = selection(rows), np.flatnonzero(rows)
+    if left_out := len(log) - indices.size:
         notes.append(f"{left_out} samples without gyroscope or accelerometer left out")
-    rate, force, turns, pulls, time_s = rate[rows], force[rows], turns[rows], pulls[rows], log.time_s[rows]
+    rate, force, turns, pulls, time_s = rate[part], force[part], turns[part], pulls[part], log.time_s[part]
     for name, valid in (("gyroscope", turns), ("accelerometer", pulls)):
         if count := int((~valid).sum()):
             notes.append(f"{count} {name} readings missing: interpolated")
-    field = np.full((rows.size, 3), np.nan) if field is None else field[rows]
-    step_s = np.diff(time_s, prepend=time_s[0] - np.median(np.diff(time_s)))
-    lost_rad2 = np.zeros(rows.size)
-    lost_rad2[np.flatnonzero(turns)[1:]] = lost_variance(time_s[turns], rate[turns], float(np.median(step_s)))
-    rate, force = (_interpolated_means(time_s, step_s, *part) for part in ((rate, turns), (force, pulls)))
-    return rows, Samples(step_s, rate, force, field, lost_rad2), notes
+    field = np.full_like(force, np.nan) if field is None else field[part]
+    usual_s = float(np.median(np.diff(time_s)))
+    step_s, lost_rad2 = np.diff(time_s, prepend=time_s[0] - usual_s), np.zeros_like(time_s)
+    valid = selection(turns)
+    lost_rad2[np.flatnonzero(turns)[1:]] = lost_variance(time_s[valid], rate[valid], usual_s)
+    rate, force = (
+        _interpolated_means(time_s, step_s, usual_s, *part) for part in ((rate, turns), (force, pulls))
+    )
+    return indices, Samples(step_s, rate, force, field, lost_rad2), notes
 
 
 def lost_variance(time_s: FloatArray, rate_rad_s: FloatArray, usual_s: float) -> FloatArray:
@@ -151,7 +155,7 @@ def lost_variance(time_s: FloatArray, rate_rad_s: FloatArray, usual_s: float) ->
 
 
 def _interpolated_means(
-    time_s: FloatArray, step_s: FloatArray, readings: FloatArray, valid: BoolArray
+    time_s: FloatArray, step_s: FloatArray, usual_s: float, readings: FloatArray, valid: BoolArray
 ) -> FloatArray:
     """Mean reading since the sample before, shape (m, 3), where samples between the two were lost.
 
@@ -159,11 +163,10 @@ def _interpolated_means(
     """
     if not valid.all():
         readings = np.column_stack([np.interp(time_s, time_s[valid], axis[valid]) for axis in readings.T])
-    usual = float(np.median(step_s))
-    late = np.flatnonzero((step_s > LOST * usual) & (step_s <= PAUSE_S))
+    late = np.flatnonzero((step_s > LOST * usual_s) & (step_s <= PAUSE_S))
     if not late.size:
         return readings
-    share = (usual / step_s[late])[:, None]
+    share = (usual_s / step_s[late])[:, None]
     means = readings.copy()
     means[late] = 0.5 * ((1.0 + share) * readings[late] + (1.0 - share) * readings[late - 1])
     return means
