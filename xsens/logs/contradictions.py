@@ -176,4 +176,4 @@ def _against_gyroscope(name: str, turns: FloatArray, change: FloatArray) -> str:
 
 
 def _rms(vectors: FloatArray) -> float:
-    return float(np.sqrt((vectors**2).sum(axis=1).mean()))
+    return float(np.sqrt(np.mean(row_norms(vectors) ** 2)))
