@@ -25,8 +25,7 @@ def words_for(pose: LivePose, settings: TrajectorySettings) -> str:
     """Advice by one frame.
 
     A frame is like none before where no median correlation reaches `least_correlation`, below which the
-    reconstruction uses no pair; it came too fast where it is less like the last one than `clear_correlation`,
-    from where on planes bend.
+    reconstruction uses no pair; it came too fast where it is less like the last one than `clear_correlation`.
     """
     for flag, words in _OF_FLAGS.items():
         if pose.flags & flag:
