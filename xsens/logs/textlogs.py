@@ -34,6 +34,7 @@ from xsens.logs.texttables import (
 )
 from xsens.logs.worlds import Claim, are_rotations
 
+_SENSOR_LIKE = re.compile("acc|gyr|mag|quat|euler|roll|pitch|yaw|time")
 _EQUALS = r"\s*[:=,;][,;\s]*"
 _RATE = re.compile(
     r"(?:update|output|sampl(?:e|ing)|data)[ _]?(?:rate|frequency)(?:[ _]?\(?hz\)?)?"
@@ -254,9 +255,13 @@ def _claim(table: TextTable, dot: bool) -> Claim:
 
 
 def _unknown_columns(table: TextTable) -> Names:
-    """Note on unknown columns, and on those of a quantity some of whose axes are missing."""
+    """Note on unknown columns, and on those of a quantity some of whose axes are missing.
+
+    A program's exports hold many other columns: of theirs, only those that look like a sensor's are listed.
+    """
     keys = {name: column[0] for name in table.names if (column := column_of(name))}
-    odd = [name for name in table.names if name not in keys]
+    plain = "time" in keys.values()
+    odd = [name for name in table.names if name not in keys and (plain or _SENSOR_LIKE.match(name))]
     for quantity in (*_VECTORS, _QUATERNION):
         columns = [name for name, key in keys.items() if key in quantity]
         odd += columns if len(columns) < len(quantity) else []

@@ -93,7 +93,8 @@ def _report(curves: DecorrelationCurves) -> Result:
     tilt = {} if curves.tilt is None else vars(curves.tilt)
     about = {"pairs": curves.pairs_used, "origin": curves.origin, "scale_sigma": curves.scale_sigma}
     pairs = f", {curves.pairs_used} frame pairs" if curves.pairs_used else ""
-    lines = [f"curves by {curves.origin}{pairs}; correlation falls to one half at"]
+    source = curves.origin.replace("tracked", "tracked sweep")
+    lines = [f"curves by {source}{pairs}; correlation falls to one half at"]
     for depth, distance, cells in zip(curves.depth_mm, half_mm, curves.cells, strict=True):
         width = f"{distance:.2f}" if np.isfinite(distance) else f"more than {curves.distance_mm[-1]:.2f}"
         lines.append(f"  {depth:5.1f} mm depth: {width} mm  ({cells:.0f} independent cells in a patch)")
