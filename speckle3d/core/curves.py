@@ -226,6 +226,8 @@ class DecorrelationCurves:
             "correlation: expected values in (0, 1] that fall with distance": rho.shape == shape
             and ((rho > 0) & (rho <= 1)).all()
             and (np.diff(rho, axis=1) <= 0).all(),
+            "cells: expected values above zero": (self.cells > 0).all(),
+            "scale_sigma: expected zero or more": self.scale_sigma >= 0.0,
             "cells, speckle, tilt: expected a number for each depth": all(
                 values.shape == shape[:1] and np.isfinite(values).all() for values in by_depth
             ),

@@ -205,10 +205,10 @@ def _require_one_sensor(readings: dict[str, FloatArray]) -> None:
         middle = len(rows) // 2
         rows = rows[max(middle - _LOOKED_AT, 0) : middle + _LOOKED_AT]
         rows = np.where(row_norms(rows)[:, None] > 0.0, rows, np.nan)
-        apart = [median_norm(rows[lag:] - rows[:-lag]) for lag in range(1, _MOST_SENSORS + 1)]
+        difference = [median_norm(rows[lag:] - rows[:-lag]) for lag in range(1, _MOST_SENSORS + 1)]
         least = 0.02 * median_norm(rows)
         for sensors in range(2, _MOST_SENSORS + 1):
-            if np.min(apart[: sensors - 1]) > _TURNS_APART * apart[sensors - 1] + least:
+            if np.min(difference[: sensors - 1]) > _TURNS_APART * difference[sensors - 1] + least:
                 raise InvalidInputError(
                     f"expected the rows of one sensor, got those of {sensors} in turn: neighbouring readings "
                     f"differ, and every {sensors}. is alike: split the table"

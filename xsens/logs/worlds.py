@@ -174,8 +174,8 @@ def world_of(
         sensors = f"its own accelerometer, while the magnetometer has north {north_deg:.0f} degrees from x"
     chosen = world if claim.final else evident
     note = f"orientation: {chosen} ({claim.by}: {world}; by {sensors}: {evident}); --world decides"
-    told = world != evident or (not by_north and (claim.by_default or np.isfinite(north_deg)))
-    return chosen, ((note,) if told else ())
+    needs_note = world != evident or (not by_north and (claim.by_default or np.isfinite(north_deg)))
+    return chosen, ((note,) if needs_note else ())
 
 
 def _north_deg(wxyz: FloatArray, field: FloatArray | None) -> float:
