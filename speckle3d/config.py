@@ -18,9 +18,9 @@ from speckle3d.imaging.voxels.settings import CompoundingSettings
 from speckle3d.io.toml import parsed, read_toml, validated
 from speckle3d.matching.matcher import ImageSettings
 from speckle3d.matching.schedule import TrajectorySettings
-from speckle3d.motion.direction import SensorSettings
 from speckle3d.motion.phantom import CurveSettings
 from speckle3d.motion.planes import PlaneSettings
+from speckle3d.motion.sensors import SensorSettings
 
 _COMMENT_WIDTH = 100
 _UNITS = {

@@ -24,10 +24,9 @@ from speckle3d.matching.frames import ImageSink, match_sweep
 from speckle3d.matching.matcher import FrameMatcher
 from speckle3d.matching.quality import placed_flags, require_placed
 from speckle3d.matching.schedule import PairSchedule
-from speckle3d.motion.direction import settle_direction
 from speckle3d.motion.estimate import estimate_motion, frame_pairs
 from speckle3d.motion.planes import MotionProblem
-from speckle3d.motion.subset import consistent_poses
+from speckle3d.motion.sensors import consistent_poses, settle_direction
 from speckle3d.motion.tissue import averaging_loss, compression_error, tissue_curves
 from speckle3d.tracked import Tracked
 

@@ -11,7 +11,7 @@ from speckle3d.core.geometry import mirrored
 from speckle3d.io.curves import read_curves
 from speckle3d.io.load import load_sweep
 from speckle3d.matching.quality import FrameFlag
-from speckle3d.motion.direction import SensorSettings, settle_direction
+from speckle3d.motion.sensors import SensorSettings, settle_direction
 from speckle3d.tracking import track
 
 

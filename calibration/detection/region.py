@@ -15,7 +15,7 @@ from calibration.points import Detections
 from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, naming
 from speckle3d.core.geometry import require_finite
-from speckle3d.core.region import polygon_mask
+from speckle3d.core.grid import polygon_mask
 from speckle3d.core.sweep import Frames
 
 _GLANCES = 48

@@ -15,12 +15,12 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
 from scipy import fft
+from scipy.ndimage import uniform_filter
 
 from speckle3d.core.arrays import BoolArray, Complex64Array, Float32Array, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.grid import ImageGrid
 from speckle3d.core.sweep import BModeSettings, RFSettings
-from speckle3d.kernels.box_means import box_means
 
 _RATE_OVER_BAND = 100 / 27
 """Rate of the intensity's samples over the width of the pass-band, edges included, whatever the echoes were
@@ -146,10 +146,12 @@ class IntensityExtractor:
             return np.ones_like(intensity)
         sides = (self.grid.vector_pitch_mm, self.grid.sample_spacing_mm)
         wide, high = (2 * int(self.settings.equalise_mm / 2 / side) + 1 for side in sides)
-        mean, share = np.empty_like(intensity), np.ones_like(intensity)
-        box_means(intensity * counted, wide, high, mean)
+        mean, share = (
+            uniform_filter(intensity * counted, (wide, high), mode="nearest"),
+            np.ones_like(intensity),
+        )
         if not counted.all():
-            box_means(counted.astype(np.float32), wide, high, share)
+            share = uniform_filter(counted.astype(np.float32), (wide, high), mode="nearest")
         # Less than half a sample is rounding: nothing counts near.
         share[share <= 0.5 / (wide * high)] = 0.0
         return np.divide(share, np.maximum(mean, np.finfo(np.float32).tiny), out=share)

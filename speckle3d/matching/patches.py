@@ -11,8 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError, MismatchError
-from speckle3d.core.grid import ImageGrid
-from speckle3d.core.region import REGION_HELP, Region
+from speckle3d.core.grid import REGION_HELP, ImageGrid, Region
 
 
 class PatchSettings(BaseModel):

@@ -26,7 +26,6 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError
-from speckle3d.kernels.patch_statistics import patch_statistics
 from speckle3d.matching.patches import PatchGrid
 
 _CONSTANT = 1e-4
@@ -140,10 +139,15 @@ def inspect_frame(
         On the grid of the intensity images.
     """
     s = settings or QualitySettings()
-    inside, statistics, clipping = patches.inside, np.empty((len(patches), 5)), _clipping(frame, is_bmode, s)
-    step = max(1, int(patches.size[1]) // _SAMPLES)
-    patch_statistics(intensity, patches.first, patches.size, step, statistics)
-    mean, contrast, alike, across, along = statistics.T
+    inside, step = patches.inside, max(1, int(patches.size[1]) // _SAMPLES)
+    tiles = patches.tiles(intensity)[..., ::step]
+    wide, high = tiles.shape[1] // 2, tiles.shape[2] // 2
+    with np.errstate(divide="ignore", invalid="ignore"):  # Of flat patches.
+        mean = tiles.mean(axis=(1, 2))
+        tiles = tiles / mean[:, None, None] - np.float32(1.0)
+        contrast, alike = tiles.std(axis=(1, 2)), _correlation(tiles[:, :-1], tiles[:, 1:])
+        across = _correlation(tiles[:, :wide], tiles[:, -wide:])
+        along = _correlation(tiles[..., :high], tiles[..., -high:])
     # A sample that is not finite spoils its whole vector, and equalising then the others.
     echo = (contrast > s.least_contrast) & np.isfinite(intensity.sum())
     together = (alike > s.neighbour_correlation) | (patches.spacing_mm[0] > s.neighbour_pitch_mm)
@@ -157,11 +161,17 @@ def inspect_frame(
 
     usable, spread = echo & together & inside, np.full(len(patches), np.nan)
     if is_bmode:
-        grey = np.empty_like(statistics)
-        patch_statistics(np.asarray(frame, dtype=np.float32), patches.first, patches.size, 4 * step, grey)
-        with np.errstate(divide="ignore", invalid="ignore"):  # Black patches have none.
-            spread = np.log(grey[:, 0] * grey[:, 1])
+        with np.errstate(divide="ignore"):  # Black patches have none.
+            spread = np.log(patches.tiles(frame)[..., :: 4 * step].std(axis=(1, 2), dtype=np.float64))
+    clipping = _clipping(frame, is_bmode, s)
     return FrameFeatures(mean, clipping, share(together & fine), share(~together), spread, usable)
+
+
+def _correlation(a: Float32Array, b: Float32Array) -> FloatArray:
+    """Pearson's coefficient of each patch, shape (p, v, s), with the same of `b`; NaN where flat."""
+    a, b = (part - part.mean(axis=(1, 2), keepdims=True) for part in (a, b))
+    product, power, others = (np.einsum("pvs,pvs->p", *pair) for pair in ((a, b), (a, a), (b, b)))
+    return np.asarray(product / np.sqrt(power * others), dtype=float)
 
 
 def _clipping(frame: npt.NDArray[Any], is_bmode: bool, settings: QualitySettings) -> float:

@@ -39,7 +39,7 @@ from speckle3d.io.fileset import FileSet
 from speckle3d.io.hdf5 import PathLike
 from speckle3d.io.load import import_record, load_landmarks, load_sweep, recording_sha256
 from speckle3d.io.reconstructions import write_reconstruction
-from speckle3d.motion.direction import sensed_orientation
+from speckle3d.motion.sensors import sensed_orientation
 from speckle3d.scoring.displacements import score_row
 from speckle3d.scoring.lengths import TRACKER
 from speckle3d.scoring.modes import length_claims

@@ -22,7 +22,7 @@ from speckle3d.config import Config
 from speckle3d.corrections import correct
 from speckle3d.io.curves import read_curves
 from speckle3d.io.load import load_sweep
-from speckle3d.motion.direction import settle_direction
+from speckle3d.motion.sensors import settle_direction
 from speckle3d.phantom_curves import calibrate_curves
 from speckle3d.scoring.lengths import compare_modes, sum_motion
 from speckle3d.simulation.presets import SimulationSettings

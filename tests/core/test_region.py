@@ -6,8 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.core.grid import ImageGrid
-from speckle3d.core.region import Region
+from speckle3d.core.grid import ImageGrid, Region
 
 GRID = ImageGrid(
     vectors=31, samples=57, vector_pitch_mm=0.3, sample_spacing_mm=0.1, first_sample_depth_mm=0.7

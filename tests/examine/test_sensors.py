@@ -10,7 +10,7 @@ from speckle3d.core.errors import MismatchError
 from speckle3d.corrections import correct
 from speckle3d.examine.disagreements import differing_lengths, disagreements
 from speckle3d.examine.sensors import doubts_of_gyroscope, examine_sensors, jitter, repair_readings, rigid
-from speckle3d.motion.direction import settle_direction
+from speckle3d.motion.sensors import settle_direction
 
 AGAINST_THEMSELVES = {
     "tracker frozen": "frozen",

@@ -3,9 +3,6 @@ import oracles
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from patch_kernels import patch_coherences, patch_correlations
-from scipy.ndimage import uniform_filter
-
-from speckle3d.kernels.box_means import box_means
 
 SHAPE, SIZE = (14, 30), np.array([5, 8])
 CROSS = ([0, 1, 1, 1, 2], [1, 0, 1, 2, 1])
@@ -64,19 +61,3 @@ def test_flat_patches_have_no_correlation_nor_empty_ones_coherence():
     field, _ = echoes(2)
     assert np.isnan(correlate(np.full(SHAPE, 1e5), np.abs(field), [(4, 10)], [(0, 0)])).all()
     assert np.isnan(cohere(field, 0 * field, [(4, 10)], [(0, 0)])).all()
-
-
-@settings(deadline=None, max_examples=30)
-@given(
-    seed=st.integers(0, 2**32 - 1),
-    shape=st.tuples(st.integers(1, 9), st.integers(1, 30)),
-    half=st.tuples(st.integers(0, 5), st.integers(0, 20)),
-)
-def test_box_means_are_scipys_also_where_the_window_is_larger_than_the_image(seed, shape, half):
-    image = np.random.default_rng(seed).exponential(size=shape).astype(np.float32)
-    wide, high = (2 * n + 1 for n in half)
-    out = np.empty_like(image)
-    box_means(image, wide, high, out)
-    np.testing.assert_allclose(
-        out, uniform_filter(image.astype(float), (wide, high), mode="nearest"), rtol=1e-5
-    )

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from speckle3d.motion.direction import same_turns
+from speckle3d.motion.sensors import same_turns
 
 
 def slow(rng, frames, duration_s, highest_hz):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from pair_planes import AT
 
-from speckle3d.motion.subset import consistent_subset
+from speckle3d.motion.sensors import consistent_subset
 
 
 def agreement(distance, sigma, elevation, either_side=True):

@@ -22,7 +22,7 @@ from speckle3d.cli.common import (
 from speckle3d.core.progress import progress_bar
 
 if TYPE_CHECKING:
-    from speckle3d.core.region import Region
+    from speckle3d.core.grid import Region
     from speckle3d.imaging.voxels.settings import CompoundingSettings
     from speckle3d.io.import_settings import ImportSettings
     from speckle3d.study.posed import PosedSweep
@@ -74,7 +74,7 @@ def open_sweep_at(
     PLUS clips volumes.
     """
     from speckle3d.calibrating.recordings import require_unsaid
-    from speckle3d.core.region import Region
+    from speckle3d.core.grid import Region
     from speckle3d.io.import_settings import settings_for
     from speckle3d.study.posed import open_posed
 

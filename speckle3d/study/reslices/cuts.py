@@ -10,8 +10,7 @@ from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import Float32Array, FloatArray
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.core.grid import ImageGrid
-from speckle3d.core.region import Region
+from speckle3d.core.grid import ImageGrid, Region
 from speckle3d.core.volume import Volume
 from speckle3d.imaging.cuts.curved import CurvedSheet
 from speckle3d.imaging.cuts.outlines import crossings, frame_outlines

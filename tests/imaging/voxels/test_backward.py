@@ -6,8 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from speckle3d.core.grid import ImageGrid
-from speckle3d.core.region import Region
+from speckle3d.core.grid import ImageGrid, Region
 from speckle3d.imaging.images import PosedImages
 from speckle3d.imaging.voxels.grid import grid_around
 from speckle3d.imaging.voxels.volume import look_up_voxels

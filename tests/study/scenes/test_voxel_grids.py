@@ -2,7 +2,7 @@
 
 import pytest
 
-from speckle3d.core.region import Region
+from speckle3d.core.grid import Region
 from speckle3d.imaging.voxels.settings import CompoundingSettings
 from speckle3d.study.posed import open_posed
 from speckle3d.study.scenes.voxels import GridRequest, VolumeRequest, write_voxels
