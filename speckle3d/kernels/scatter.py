@@ -101,11 +101,14 @@ def scatter_echoes(
     strength: Float32Array,
     pitch_mm: float,
     image_from_medium: FloatArray,
+    array_from_image: FloatArray,
     table: FieldTable,
     echoes: EchoGrid,
     out: Float32Array,
 ) -> None:
     """Add each scatterer's echo to ``out[vector, sample]`` of every vector that it lies near.
+
+    Vectors lie in arrays of equally many that are parallel: all in one, or each of a fan's in one of its own.
 
     Fastest if neighbours in the list are of similar depth: the beam's table is long.
 
@@ -114,8 +117,10 @@ def scatter_echoes(
     position_mm, strength : ndarray, shape (n, 3) and (n,)
         Scatterers in the medium.
     pitch_mm : float
-        Of the vectors, of which the first is at zero.
+        Of an array's vectors, of which the first is at zero.
     image_from_medium : float64, shape (4, 4)
+    array_from_image : float64, shape (arrays, 2, 3)
+        Affine map from (x, y, 1) in the image to x and y in each array.
     out : float32, shape (vector, sample, nodes * 2)
         Real and imaginary parts in turn.
     """
@@ -124,7 +129,8 @@ def scatter_echoes(
     m = image_from_medium
     ny, nz = reached_vectors.shape[0], reached_vectors.shape[1]
     per_pitch = reach.shape[1]
-    vectors, samples, width = out.shape
+    samples, width = out.shape[1:]
+    vectors = out.shape[0] // array_from_image.shape[0]
     far_mm = reach.shape[2] * pitch_mm
     row = rows.shape[3]
     cell = (per_pitch + 1) * row
@@ -137,60 +143,69 @@ def scatter_echoes(
         z = m[2, 0] * a + m[2, 1] * b + m[2, 2] * c + m[2, 3]
         fz = abs(z) / grid[3]
         iz = int(fz)
-        y = m[1, 0] * a + m[1, 1] * b + m[1, 2] * c + m[1, 3]
-        fy = (y - grid[0]) / grid[1]
-        iy = int(np.floor(fy))
-        x = m[0, 0] * a + m[0, 1] * b + m[0, 2] * c + m[0, 3]
-        if iz >= nz - 1 or iy < 0 or iy >= ny - 1 or x <= -far_mm or x >= vectors * pitch_mm + far_mm:
+        if iz >= nz - 1:
             continue
-        wy, wz = np.float32(fy - iy), np.float32(fz - iz)
-        part = fy - iy
-        kx = (1.0 - part) * curvature_per_mm[iy, 0] + part * curvature_per_mm[iy + 1, 0]
-        kz = (1.0 - part) * curvature_per_mm[iy, 1] + part * curvature_per_mm[iy + 1, 1]
-        axis_mm = y + kz * z * z
-        w00 = strength[j] * (one - wy) * (one - wz)
-        w01 = strength[j] * (one - wy) * wz
-        w10 = strength[j] * wy * (one - wz)
-        w11 = strength[j] * wy * wz
-        right = int(np.ceil(x / pitch_mm))
-        for side in range(2):
-            # From the scatterer to the right, its nearest vector included, then to the left.
-            nearest = right - side
-            turn = 1 - 2 * side
-            steps = turn * (nearest * pitch_mm - x) / grid[2]
-            r = min(int(steps), per_pitch - 1)
-            if side == 0:
-                first, last = max(0, -nearest), vectors - nearest
-            else:
-                first, last = max(0, nearest - vectors + 1), nearest + 1
-            last = min(last, reached_vectors[iy, iz, r])
-            if first >= last:
+        wz = np.float32(fz - iz)
+        image_x = m[0, 0] * a + m[0, 1] * b + m[0, 2] * c + m[0, 3]
+        image_y = m[1, 0] * a + m[1, 1] * b + m[1, 2] * c + m[1, 3]
+        for array in range(array_from_image.shape[0]):
+            t = array_from_image[array]
+            x = t[0, 0] * image_x + t[0, 1] * image_y + t[0, 2]
+            if x <= -far_mm or x >= vectors * pitch_mm + far_mm:
                 continue
-            wx = np.float32(steps - r)
-            wl = one - wx
-            weights = (w00 * wl, w00 * wx, w01 * wl, w01 * wx, w10 * wl, w10 * wx, w11 * wl, w11 * wx)
-            b = ((iy * nz + iz) * (per_pitch + 1) + r) * row + first * width
-            corners = (b, b + cell, b + plane, b + plane + cell)
-            _interpolate(flat, row, corners, weights, value[first * width : last * width])
-            for n in range(first, last):
-                if iz >= reach[iy, r, n]:
+            y = t[1, 0] * image_x + t[1, 1] * image_y + t[1, 2]
+            fy = (y - grid[0]) / grid[1]
+            iy = int(np.floor(fy))
+            if iy < 0 or iy >= ny - 1:
+                continue
+            part = fy - iy
+            wy = np.float32(part)
+            kx = (1.0 - part) * curvature_per_mm[iy, 0] + part * curvature_per_mm[iy + 1, 0]
+            kz = (1.0 - part) * curvature_per_mm[iy, 1] + part * curvature_per_mm[iy + 1, 1]
+            axis_mm = y + kz * z * z
+            w00 = strength[j] * (one - wy) * (one - wz)
+            w01 = strength[j] * (one - wy) * wz
+            w10 = strength[j] * wy * (one - wz)
+            w11 = strength[j] * wy * wz
+            right = int(np.ceil(x / pitch_mm))
+            for side in range(2):
+                # From the scatterer to the right, its nearest vector included, then to the left.
+                nearest = right - side
+                turn = 1 - 2 * side
+                steps = turn * (nearest * pitch_mm - x) / grid[2]
+                r = min(int(steps), per_pitch - 1)
+                if side == 0:
+                    first, last = max(0, -nearest), vectors - nearest
+                else:
+                    first, last = max(0, nearest - vectors + 1), nearest + 1
+                last = min(last, reached_vectors[iy, iz, r])
+                if first >= last:
                     continue
-                across_mm = (steps + n * per_pitch) * grid[2]
-                echo_mm = axis_mm + kx * across_mm * across_mm
-                at = (echo_mm - first_depth_mm) / sample_mm
-                sample = int(np.floor(at))
-                if sample < 0 or sample >= samples - 1:
-                    continue
-                # The carrier's phase is exact; only the slow baseband is split between two samples.
-                late = np.float32(at - sample)
-                early = one - late
-                carrier = _unit_phasor(cycles_per_mm * echo_mm)
-                line = out[nearest + turn * n]
-                for k in range(width // 2):
-                    q = n * width + 2 * k
-                    re = carrier.real * value[q] - carrier.imag * value[q + 1]
-                    im = carrier.real * value[q + 1] + carrier.imag * value[q]
-                    line[sample, 2 * k] += early * re
-                    line[sample, 2 * k + 1] += early * im
-                    line[sample + 1, 2 * k] += late * re
-                    line[sample + 1, 2 * k + 1] += late * im
+                wx = np.float32(steps - r)
+                wl = one - wx
+                weights = (w00 * wl, w00 * wx, w01 * wl, w01 * wx, w10 * wl, w10 * wx, w11 * wl, w11 * wx)
+                b = ((iy * nz + iz) * (per_pitch + 1) + r) * row + first * width
+                corners = (b, b + cell, b + plane, b + plane + cell)
+                _interpolate(flat, row, corners, weights, value[first * width : last * width])
+                for n in range(first, last):
+                    if iz >= reach[iy, r, n]:
+                        continue
+                    across_mm = (steps + n * per_pitch) * grid[2]
+                    echo_mm = axis_mm + kx * across_mm * across_mm
+                    at = (echo_mm - first_depth_mm) / sample_mm
+                    sample = int(np.floor(at))
+                    if sample < 0 or sample >= samples - 1:
+                        continue
+                    # The carrier's phase is exact; only the slow baseband is split between two samples.
+                    late = np.float32(at - sample)
+                    early = one - late
+                    carrier = _unit_phasor(cycles_per_mm * echo_mm)
+                    line = out[array * vectors + nearest + turn * n]
+                    for k in range(width // 2):
+                        q = n * width + 2 * k
+                        re = carrier.real * value[q] - carrier.imag * value[q + 1]
+                        im = carrier.real * value[q + 1] + carrier.imag * value[q]
+                        line[sample, 2 * k] += early * re
+                        line[sample, 2 * k + 1] += early * im
+                        line[sample + 1, 2 * k] += late * re
+                        line[sample + 1, 2 * k + 1] += late * im

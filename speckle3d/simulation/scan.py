@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar
@@ -10,7 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 from scipy.fft import fft, irfft, next_fast_len
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import Complex64Array, Float32Array, FloatArray, IntArray
 from speckle3d.core.grid import ImageGrid
@@ -89,30 +88,28 @@ class SimulatedFrames:
         out = np.zeros((image.vectors, self._length, len(self.beam.components)), np.complex64)
         carrier = 2e-3 * float(self._frequency_hz[self._carrier_bin]) / probe.speed_of_sound_m_s
         grid = EchoGrid(image.first_sample_depth_mm, image.sample_spacing_mm, carrier)
-        for medium_from_array, array in self._arrays(index, out.view(np.float32)):
-            pose = medium_from_array.inv().as_matrix()
-            for block in self.medium.scatterers(medium_from_array, self._box):
-                scatter_echoes(*block, probe.pitch_mm, pose, self.beam.field, grid, array)
+        medium_from_image = self.medium_from_image[index]
+        pose, lines = medium_from_image.inv().as_matrix(), out.view(np.float32)
+        for block in self.medium.scatterers(medium_from_image, self._box):
+            scatter_echoes(*block, probe.pitch_mm, pose, self._array_from_image, self.beam.field, grid, lines)
         return out
 
-    def _arrays(self, index: int, echoes: Float32Array) -> Iterator[tuple[RigidTransform, Float32Array]]:
-        """Place in the medium, and echoes, of parallel vectors; of a fan's, each of which is an array."""
-        image, medium_from_image = self.image, self.medium_from_image[index]
-        if image.fan is None:
-            yield medium_from_image, echoes
-            return
-        number, depth_zero = np.arange(image.vectors), -image.first_sample_depth_mm / image.sample_spacing_mm
-        faces = np.pad(image.mm(number, depth_zero), ((0, 0), (0, 1)))
-        for n, (face, angle) in enumerate(zip(faces, image.angle_rad(number), strict=True)):
-            turn = Rotation.from_rotvec([0.0, 0.0, -angle])
-            yield medium_from_image * RigidTransform.from_components(face, turn), echoes[n : n + 1]
+    @cached_property
+    def _array_from_image(self) -> FloatArray:
+        """Affine maps of the image plane to parallel vectors; of a fan to each of its vectors."""
+        image, depth_zero = self.image, -self.image.first_sample_depth_mm / self.image.sample_spacing_mm
+        number = np.arange(1 if image.fan is None else image.vectors)
+        face, angle = image.mm(number, depth_zero), image.angle_rad(number)
+        axes = np.stack([np.cos(angle), -np.sin(angle), np.sin(angle), np.cos(angle)], axis=-1)
+        axes = axes.reshape(-1, 2, 2)
+        return np.concatenate([axes, -axes @ face[:, :, None]], axis=-1)
 
     @cached_property
     def _box(self) -> Box:
-        """Opposite corners of what the beam reaches, in the frame of an array."""
-        margin, thick = self.beam.lateral_extent_mm, self.beam.elevation_extent_mm.max()
-        depth, width_mm = self.beam.depth_mm, self.image.width_mm if self.image.fan is None else 0.0
-        return np.array([-margin, depth[0], -thick]), np.array([width_mm + margin, depth[-1], thick])
+        """Opposite corners of what the beam reaches, in the image."""
+        margin = self.beam.lateral_extent_mm, self.beam.lateral_extent_mm, self.beam.elevation_extent_mm.max()
+        low, high = np.pad(self.image.extent_mm, ((0, 0), (0, 1)))
+        return low - margin, high + margin
 
     @cached_property
     def _length(self) -> int:

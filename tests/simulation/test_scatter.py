@@ -34,6 +34,7 @@ def test_echoes_match_every_scatterer_for_every_vector(seed):
         strength,
         0.3,
         image_from_medium.as_matrix(),
+        np.eye(3)[None, :2],
         field_table(*beam, 3),
         EchoGrid(0.0, 0.0115, 9.7),
         out,
