@@ -100,8 +100,8 @@ def scatter_echoes(
     position_mm: FloatArray,
     strength: Float32Array,
     pitch_mm: float,
-    image_from_medium: FloatArray,
-    array_from_image: FloatArray,
+    face_from_medium: FloatArray,
+    array_from_face: FloatArray,
     table: FieldTable,
     echoes: EchoGrid,
     out: Float32Array,
@@ -118,19 +118,20 @@ def scatter_echoes(
         Scatterers in the medium.
     pitch_mm : float
         Of an array's vectors, of which the first is at zero.
-    image_from_medium : float64, shape (4, 4)
-    array_from_image : float64, shape (arrays, 2, 3)
-        Affine map from (x, y, 1) in the image to x and y in each array.
+    face_from_medium : float64, shape (4, 4)
+        Along the image's axes.
+    array_from_face : float64, shape (arrays, 2, 3)
+        Affine map from (x, y, 1) in the image plane to x and y in each array.
     out : float32, shape (vector, sample, nodes * 2)
         Real and imaginary parts in turn.
     """
     rows, reach, reached_vectors, curvature_per_mm, grid = table
     first_depth_mm, sample_mm, cycles_per_mm = echoes
-    m = image_from_medium
+    m = face_from_medium
     ny, nz = reached_vectors.shape[0], reached_vectors.shape[1]
     per_pitch = reach.shape[1]
     samples, width = out.shape[1:]
-    vectors = out.shape[0] // array_from_image.shape[0]
+    vectors = out.shape[0] // array_from_face.shape[0]
     far_mm = reach.shape[2] * pitch_mm
     row = rows.shape[3]
     cell = (per_pitch + 1) * row
@@ -146,14 +147,14 @@ def scatter_echoes(
         if iz >= nz - 1:
             continue
         wz = np.float32(fz - iz)
-        image_x = m[0, 0] * a + m[0, 1] * b + m[0, 2] * c + m[0, 3]
-        image_y = m[1, 0] * a + m[1, 1] * b + m[1, 2] * c + m[1, 3]
-        for array in range(array_from_image.shape[0]):
-            t = array_from_image[array]
-            x = t[0, 0] * image_x + t[0, 1] * image_y + t[0, 2]
+        face_x = m[0, 0] * a + m[0, 1] * b + m[0, 2] * c + m[0, 3]
+        face_y = m[1, 0] * a + m[1, 1] * b + m[1, 2] * c + m[1, 3]
+        for array in range(array_from_face.shape[0]):
+            t = array_from_face[array]
+            x = t[0, 0] * face_x + t[0, 1] * face_y + t[0, 2]
             if x <= -far_mm or x >= vectors * pitch_mm + far_mm:
                 continue
-            y = t[1, 0] * image_x + t[1, 1] * image_y + t[1, 2]
+            y = t[1, 0] * face_x + t[1, 1] * face_y + t[1, 2]
             fy = (y - grid[0]) / grid[1]
             iy = int(np.floor(fy))
             if iy < 0 or iy >= ny - 1:

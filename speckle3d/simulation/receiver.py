@@ -9,21 +9,18 @@ import numpy as np
 import numpy.typing as npt
 from scipy import signal as filters
 
-from speckle3d.core.errors import naming
+from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import BModeSettings, Frames, RFSettings, Sweep
 from speckle3d.simulation.scan import SPECKLE_RMS_COUNTS
-
-_GUARD = 0.1
-"""Kept on either side of the band, over its width."""
 
 _WHITE_DB = 20.0
 """Full white over the mean of fully developed speckle."""
 
-_ROOM = 1.25
-"""Sampling rate of I/Q over the width that they keep, by default at least."""
+_LEAST_RATE, _USUAL_RATE = 1.33, 1.5
+"""Sampling rate of I/Q over the width of their band: what the low-pass lets fold into it, and by default."""
 
 _WINDOW = ("kaiser", 8.0)
-"""Of the low-pass before decimation: what folds into the band is 80 dB down."""
+"""Of the low-pass before decimation, 80 dB down at five quarters of its cut-off."""
 _GREY_DECIMATION = 4
 """Rows of 0.046 mm from RF at 66.7 MHz: 860 in 40 mm."""
 
@@ -95,22 +92,26 @@ def received(
     frequency_hz : float, optional
         What the echoes are shifted down by, by default their centre frequency.
     decimation : int, optional
-        By default 4 of B-mode, and of I/Q the largest that leaves a quarter more than the band needs.
+        By default 4 of B-mode, and of I/Q the largest that leaves half more than the band needs.
 
     Raises
     ------
     InvalidInputError
-        If the rate that is left does not hold the band.
+        If echoes would fold into the band.
     """
     rf = sweep.signal
     assert isinstance(rf, RFSettings)
     (low, high), rate_hz = rf.bandwidth_hz, rf.sampling_rate_hz
     frequency_hz = frequency_hz or rf.centre_frequency_hz
-    width_hz = 2 * (max(high - frequency_hz, frequency_hz - low) + _GUARD * (high - low))
-    usual = max(1, int(rate_hz / (_ROOM * width_hz))) if dynamic_range_db is None else _GREY_DECIMATION
+    most = rate_hz / (2 * max(high - frequency_hz, frequency_hz - low))
+    usual = max(1, int(most / _USUAL_RATE)) if dynamic_range_db is None else _GREY_DECIMATION
     every = decimation or usual
-    with naming("decimation"):
-        signal = replace(rf, sampling_rate_hz=rate_hz / every, demodulation_frequency_hz=frequency_hz)
+    if every > most / _LEAST_RATE:
+        raise InvalidInputError(
+            f"decimation: expected at most {int(most / _LEAST_RATE)}, so that nothing folds into the band, "
+            f"got {every}"
+        )
+    signal = replace(rf, sampling_rate_hz=rate_hz / every, demodulation_frequency_hz=frequency_hz)
     frames = ReceivedFrames(sweep.frames, frequency_hz / rate_hz, every, dynamic_range_db)
     return replace(
         sweep,

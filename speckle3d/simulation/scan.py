@@ -12,10 +12,11 @@ from scipy.fft import fft, irfft, next_fast_len
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import Complex64Array, Float32Array, FloatArray, IntArray
+from speckle3d.core.geometry import rotation_from_fixed_angles
 from speckle3d.core.grid import ImageGrid
 from speckle3d.kernels.scatter import EchoGrid, scatter_echoes
 from speckle3d.simulation.beam import BeamTable
-from speckle3d.simulation.medium import Box, Medium
+from speckle3d.simulation.medium import Medium
 
 _FULL_SCALE = 8191
 """14 bits, signed."""
@@ -88,28 +89,19 @@ class SimulatedFrames:
         out = np.zeros((image.vectors, self._length, len(self.beam.components)), np.complex64)
         carrier = 2e-3 * float(self._frequency_hz[self._carrier_bin]) / probe.speed_of_sound_m_s
         grid = EchoGrid(image.first_sample_depth_mm, image.sample_spacing_mm, carrier)
-        medium_from_image = self.medium_from_image[index]
-        pose, lines = medium_from_image.inv().as_matrix(), out.view(np.float32)
-        for block in self.medium.scatterers(medium_from_image, self._box):
-            scatter_echoes(*block, probe.pitch_mm, pose, self._array_from_image, self.beam.field, grid, lines)
-        return out
-
-    @cached_property
-    def _array_from_image(self) -> FloatArray:
-        """Affine maps of the image plane to parallel vectors; of a fan to each of its vectors."""
-        image, depth_zero = self.image, -self.image.first_sample_depth_mm / self.image.sample_spacing_mm
+        # A fan's face lies deeper in the image at its middle than at its ends; reflectors see it as flat.
         number = np.arange(1 if image.fan is None else image.vectors)
-        face, angle = image.mm(number, depth_zero), image.angle_rad(number)
-        axes = np.stack([np.cos(angle), -np.sin(angle), np.sin(angle), np.cos(angle)], axis=-1)
-        axes = axes.reshape(-1, 2, 2)
-        return np.concatenate([axes, -axes @ face[:, :, None]], axis=-1)
-
-    @cached_property
-    def _box(self) -> Box:
-        """Opposite corners of what the beam reaches, in the image."""
-        margin = self.beam.lateral_extent_mm, self.beam.lateral_extent_mm, self.beam.elevation_extent_mm.max()
-        low, high = np.pad(self.image.extent_mm, ((0, 0), (0, 1)))
-        return low - margin, high + margin
+        face_mm = image.mm(number, -image.first_sample_depth_mm / image.sample_spacing_mm)
+        middle = np.array([0.0, face_mm[len(number) // 2, 1], 0.0])
+        medium_from_face = self.medium_from_image[index] * RigidTransform.from_translation(middle)
+        axes = rotation_from_fixed_angles(image.angle_rad(number), 0.0, 0.0).as_matrix()[:, :2, :2]
+        offsets = axes @ (middle[:2] - face_mm)[:, :, None]
+        place = medium_from_face.inv().as_matrix(), np.concatenate([axes, offsets], axis=-1)
+        low, high = np.pad(image.extent_mm, ((0, 0), (0, 1))) - middle
+        reach = np.array([*[self.beam.lateral_extent_mm] * 2, self.beam.elevation_extent_mm.max()])
+        for block in self.medium.scatterers(medium_from_face, (low - reach, high + reach)):
+            scatter_echoes(*block, probe.pitch_mm, *place, self.beam.field, grid, out.view(np.float32))
+        return out
 
     @cached_property
     def _length(self) -> int:

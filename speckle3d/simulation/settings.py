@@ -72,7 +72,7 @@ class SimulationSettings(BaseModel):
         None,
         ge=1,
         description="iq, bmode: samples of the echoes in one that is stored; by default as many as leave I/Q "
-        "a quarter more than they need, and rows of 0.05 mm.",
+        "half more than their band, and rows of 0.05 mm.",
     )
     dynamic_range_db: float = Field(
         60.0, gt=0, le=200, description="bmode: from black to white, which is 20 dB over the mean of speckle."
