@@ -154,10 +154,14 @@ class Recording:
     @property
     def notes(self) -> list[str]:
         """What a user should know of how the sweep was made."""
+        return self.notes_without()
+
+    def notes_without(self, *settings: str) -> list[str]:
+        """Notes, but for assumptions of settings that are not needed."""
         assumptions = [
             " ".join(number_row(name, value.value))
             for name, value in self.numbers.items()
-            if value.is_assumption and name not in self._options
+            if value.is_assumption and name not in (*self._options, *settings)
         ]
         assumptions += self.assumptions
         words = [f"assumed, as the file does not say: {', '.join(assumptions)}"] if assumptions else []

@@ -51,9 +51,8 @@ from speckle3d.scoring.references import (
     tracker_alone,
 )
 from speckle3d.study.details import details_of, doubted_modes
-from speckle3d.study.figures import RANGE_DB, figure_drift, save_figure
-from speckle3d.study.images import GreyImages
-from speckle3d.study.posed import PosedSweep, SweepModes, pose_mark
+from speckle3d.study.figures import figure_drift, save_figure
+from speckle3d.study.posed import PosedSweep, SweepModes, pose_mark, reach_of
 from speckle3d.study.reslices.cuts import length_words
 from speckle3d.study.reslices.reslice_figures import draw_along
 from speckle3d.study.results import SUMMARY_FILES, Summary, require_own, summary_text, write_summary
@@ -183,13 +182,10 @@ def run_job(
         )
         errors = {mode: ModeErrors(c.covariance, c.length_sigma) for mode, c in corrections.items()}
         trust = Trust(tracked.covariance, tracked.flags, tracked.shared, errors)
-        write_reconstruction(
-            part / RESULTS.primary,
-            Reconstruction(
-                sweep.frame_time_s, sweep.grid, poses, provenance, settings.to_toml(), trust=trust
-            ),
-            pairs,
+        reconstruction = Reconstruction(
+            sweep.frame_time_s, sweep.grid, poses, provenance, settings.to_toml(), trust=trust
         )
+        write_reconstruction(part / RESULTS.primary, reconstruction, pairs)
         # The tracker alone is shown beside the modes, but is none of the reconstruction's.
         credible = credible_sensors(sweep, tracked.doubts)
         tracker_poses, centre = tracker_alone(credible), sweep.grid.centre_mm
@@ -222,10 +218,10 @@ def run_job(
         panels, base = dict(estimates), "image"
         if reference_poses is not None and reference_poses.covered.all():
             panels[reference_poses.name], base = reference_poses.world_from_image, reference_poses.name
-        posed = PosedSweep(sweep, np.arange(len(sweep)), poses["image"], "image")
-        modes = SweepModes(posed, panels, base, {mode: pose_mark(path) for mode, path in panels.items()})
-        images = GreyImages(sweep, RANGE_DB, settings=settings.intensity)
-        draw_along(modes, images, length_words(rows, base), (part / PICTURES[1], part / PICTURES[2]))
+        posed = PosedSweep(sweep, np.arange(len(sweep)), poses["image"], "image", reconstruction)
+        marks = {mode: pose_mark(path) for mode, path in panels.items()}
+        modes = SweepModes(posed, panels, base, marks, reach_of(panels, centre))
+        draw_along(modes, length_words(rows, base), (part / PICTURES[1], part / PICTURES[2]))
         details["seconds"] = time.perf_counter() - start_s
         write_summary(part, summary)
     return JobResult(directory, summary, new_curves)

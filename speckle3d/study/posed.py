@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
 from hashlib import sha256
@@ -11,13 +11,12 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from speckle3d.core.arrays import IntArray
+from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
-from speckle3d.core.grid import ImageGrid
 from speckle3d.core.reconstruction import Reconstruction
 from speckle3d.core.shown import shown
 from speckle3d.core.sweep import BModeSettings, Sweep
-from speckle3d.imaging.images import ChosenImages, Images, PosedImages
+from speckle3d.imaging.images import ChosenImages, PosedImages
 from speckle3d.imaging.voxels.settings import Levels
 from speckle3d.io.calibrations import apply_calibrations, fitted_pixels, resized
 from speckle3d.io.hdf5 import PathLike
@@ -35,6 +34,7 @@ USUAL_RANGE_DB = 60.0
 """Dynamic range where nothing says another."""
 
 _RANGE = "dynamic_range_db"
+_LEAST_REACH_MM = 0.5
 
 
 @shown
@@ -67,20 +67,12 @@ class PosedSweep:
     has_range: bool = True
     remarks: Sequence[str] = ()
 
-    def images(self, dynamic_range_db: float = USUAL_RANGE_DB) -> tuple[Images, ImageGrid]:
-        """Images of the frames that have a pose, in the order of their poses, and their grid, for cuts.
-
-        Log-compressed; B-mode of unknown range as it is stored.
-        """
-        source, _ = self.source("log" if self.has_range else "stored", dynamic_range_db)
-        return source.images, source.grid
-
     def source(
         self,
         levels: Levels | None = None,
         dynamic_range_db: float = USUAL_RANGE_DB,
     ) -> tuple[PosedImages, str]:
-        """Images to compound with their poses, and what their grey levels are in words.
+        """Images with their poses, to compound or to cut, and what their grey levels are in words.
 
         A tracker's image calibration is used whole: columns and rows lie where it has them, also if they are
         not square.
@@ -204,8 +196,7 @@ def open_posed(
     recording, has_range = _open(path, settings.model_copy(update=sizes), dynamic_range_db)
     sweep, _ = apply_calibrations(resized(recording.sweep, sizes), calibrations)
     # Grey levels as stored need no dynamic range.
-    remarks = [line for line in recording.notes if not line.startswith("dynamic range")]
-    return replace(posed_at(sweep, mode), has_range=has_range, remarks=remarks)
+    return replace(posed_at(sweep, mode), has_range=has_range, remarks=recording.notes_without(_RANGE))
 
 
 def _open(path: Path, settings: ImportSettings, dynamic_range_db: float | None) -> tuple[Recording, bool]:
@@ -253,15 +244,30 @@ class SweepModes:
         One of the modes.
     marks : dict of str to str
         Of the poses of all frames, by `pose_mark`.
+    reach_mm : float
+        Frames farther from a pixel of a cut do not count.
     """
 
     posed: PosedSweep
     poses: dict[str, RigidTransform]
     reference: str
     marks: dict[str, str]
+    reach_mm: float
 
 
-def at_modes(first: PosedSweep, modes: Sequence[str] = (), reference: str | None = None) -> SweepModes:
+def reach_of(poses: Mapping[str, RigidTransform], centre_mm: FloatArray) -> float:
+    """Reach of frames in cuts that shows no gaps between them: twice the longest steps of any mode."""
+    paths = [path.apply(centre_mm) for path in poses.values()]
+    steps = np.linalg.norm(np.concatenate([np.diff(path, axis=0) for path in paths]), axis=1)
+    return max(_LEAST_REACH_MM, round(2.0 * float(np.percentile([0.0, *steps], 99)), 1))
+
+
+def at_modes(
+    first: PosedSweep,
+    modes: Sequence[str] = (),
+    reference: str | None = None,
+    reach_mm: float | None = None,
+) -> SweepModes:
     """Take an opened sweep at several modes.
 
     Parameters
@@ -272,6 +278,8 @@ def at_modes(first: PosedSweep, modes: Sequence[str] = (), reference: str | None
     reference : str, optional
         What to compare them with; by default the truth or a tracker that covers all frames, if there are
         several modes, else the first.
+    reach_mm : float, optional
+        By default `reach_of` the poses.
 
     Raises
     ------
@@ -293,4 +301,5 @@ def at_modes(first: PosedSweep, modes: Sequence[str] = (), reference: str | None
     poses = {mode: sweep.world_from_image[np.isin(sweep.frames, frames)] for mode, sweep in sweeps.items()}
     posed = replace(first, frames=frames, world_from_image=poses[modes[0]], mode=modes[0])
     marks = {mode: pose_mark(sweep.world_from_image) for mode, sweep in sweeps.items()}
-    return SweepModes(posed, poses, reference, marks)
+    reach_mm = reach_mm or reach_of(poses, first.sweep.grid.centre_mm)
+    return SweepModes(posed, poses, reference, marks, reach_mm)

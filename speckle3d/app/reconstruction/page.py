@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cached_property, lru_cache
 from html import escape
 from pathlib import Path
@@ -19,10 +20,9 @@ from speckle3d.app.reconstruction.commands import command
 from speckle3d.app.reconstruction.cut_plot import CutPlot
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import Speckle3DError
-from speckle3d.core.grid import ImageGrid
 from speckle3d.core.reconstruction import Reconstruction
 from speckle3d.core.sweep import Sweep
-from speckle3d.imaging.images import Images
+from speckle3d.imaging.images import PosedImages
 from speckle3d.report.figures import plot_curves, plot_outlines
 from speckle3d.scoring.references import find_reference, sweep_curves
 from speckle3d.study.figures import RANGE_DB, label_of
@@ -35,7 +35,6 @@ KEPT_BYTES = 600_000_000
 """Of images that are kept; those of a longer sweep are made again when they are needed."""
 _DIGITS = 4
 """Of points' coordinates in mm: those that are measured are the ones that a command is given."""
-_LEAST_REACH_MM = 0.5
 _SIDE_PX = 250
 _COLOURS = {"frame": "#ffd700", "lateral_mm": "#4fc3ff", "depth_mm": "#8de04f"}
 """Of sliders, and of the lines of the cross hair that they move."""
@@ -86,9 +85,6 @@ class ReconstructionPage:
         self.reference = find_reference(sweep)
         whole = self.reference is not None and self.reference.covered.all()
         self.modes = (*reconstruction.poses, *([self.reference.name] if self.reference and whole else []))
-        # Images reach twice as far as the sweep's longest steps, so that no gaps show.
-        steps = np.linalg.norm(np.diff(poses.apply(reconstruction.grid.centre_mm), axis=0), axis=1)
-        self.reach_mm = max(_LEAST_REACH_MM, round(2.0 * float(np.percentile(steps, 99)), 1))
         self.calibrations = [source.path for source in reconstruction.provenance.calibrations]
         self.posed = lru_cache(self._at_modes)
 
@@ -100,11 +96,11 @@ class ReconstructionPage:
         return at_modes(self._sweep, [mode, *([overlay] if overlay else [])], mode)
 
     @cached_property
-    def images(self) -> tuple[Images, ImageGrid]:
-        """Images to cut, log-compressed, and their grid."""
-        images, grid = self._sweep.images(RANGE_DB)
-        read = images if callable(images) else images.__getitem__
-        return lru_cache(max(KEPT_BYTES // (4 * grid.vectors * grid.samples), 1))(read), grid
+    def images(self) -> PosedImages:
+        """Images to cut."""
+        source, _ = self._sweep.source(None, RANGE_DB)
+        size = 4 * source.grid.vectors * source.grid.samples
+        return replace(source, images=lru_cache(max(KEPT_BYTES // size, 1))(source.read))
 
 
 class _Viewer(param.Parameterized):  # type: ignore[misc]
@@ -247,12 +243,9 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
     def _cut(self, name: str) -> None:
         posed, plot = self._page.posed(*self._pair), self._plots[name]
         try:
-            (images, grid), reach_mm = self._page.images, self._page.reach_mm
-            if name == "frame":
-                place = in_frame(posed, grid, self.frame, reach_mm=reach_mm)
-            else:
-                place = along_sweep(posed, grid, **self._slider(name))
-            picture = cut_at_modes(posed, place, images, grid, RANGE_DB, reach_mm=reach_mm)
+            source, slider = self._page.images, self._slider(name)
+            place = (in_frame if name == "frame" else along_sweep)(posed, source.grid, **slider)
+            picture = cut_at_modes(posed, place, source)
         except Speckle3DError as error:
             plot.plot.title.text = str(error).split(";")[0]
             return
@@ -265,13 +258,14 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
 
     def _go(self, point_mm: FloatArray) -> None:
         """Put the cross hair where the nearest frame has a point; beside the images, leave it."""
-        inside = self._poses.inv().apply(point_mm)
+        posed = self._page.posed(*self._pair)
+        inside = posed.poses[self.mode].inv().apply(point_mm)
         away = np.abs(inside[:, 2])
         away[self.frame] -= 1e-6  # of frames that lie as near, the one that is shown
         frame = int(np.argmin(away))
         lateral, depth, _ = np.round(inside[frame], 2).tolist()
         (left, top), (right, bottom) = self._grid.extent_mm
-        if left <= lateral <= right and top <= depth <= bottom and away[frame] <= self._page.reach_mm:
+        if left <= lateral <= right and top <= depth <= bottom and away[frame] <= posed.reach_mm:
             self.param.update(frame=frame, lateral_mm=lateral, depth_mm=depth)
 
     @batch_changes
@@ -282,7 +276,7 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
         for plot in self._plots.values():
             plot.show_points(self._cross_mm, points)
         options: list[tuple[str, object]]
-        options = [*(("mode", mode) for mode in self._pair if mode), ("reach_mm", page.reach_mm)]
+        options = [("mode", mode) for mode in self._pair if mode]
         options += [("difference_to", self.mode)] if self._pair[1] else []
         options += [("sweep", page.sweep_file)] if page.sweep_file else []
         self._commands.object = "".join(

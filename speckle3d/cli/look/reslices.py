@@ -31,7 +31,7 @@ def reslice(
     on: MaybePath = None,
     straight: bool = False,
     pixel_mm: Positive = 0.2,
-    reach_mm: Positive = 0.5,
+    reach_mm: MaybePositive = None,
     choice: SweepOptions,
     dynamic_range_db: MaybePositive = None,
     recording: ImportOptions,
@@ -72,9 +72,9 @@ def reslice(
     pixel_mm
         Side of a pixel.
     reach_mm
-        Frames farther from a pixel do not count.
+        Frames farther from a pixel do not count; by default twice the longest steps, at least 0.5.
     dynamic_range_db
-        Range of log-compressed grey levels (60).
+        Range of the grey levels of RF and I/Q (50).
     region, sweep_file, calibration, tracker_transform
 
     Examples
@@ -98,20 +98,21 @@ def reslice(
         plane = spanned_plane(corners[0], *(corners[1:] - corners[0]))
     first_mode = mode[:1] if mode else [None]
     (first,), part = open_sweep_at(first_mode, input_file, recording, choice, dynamic_range_db)
-    modes = at_modes(first, mode or (), difference_to)
+    modes = at_modes(first, mode or (), difference_to, reach_mm)
     range_db = dynamic_range_db or RANGE_DB
-    images, grid = modes.posed.images(range_db)
+    source, _ = modes.posed.source(None, range_db)
+    grid = source.grid
     if curve is not None:
         points_mm = _curve(curve, on, modes)
         place = along_curve(modes, grid, points_mm, down, not straight, pixel_mm)
     elif plane is not None:
-        place = in_world(modes, grid, plane, pixel_mm, reach_mm)
+        place = in_world(modes, grid, plane, pixel_mm)
     elif frame is not None:
-        place = in_frame(modes, grid, frame, angle_deg, lateral_mm, pixel_mm, reach_mm)
+        place = in_frame(modes, grid, frame, angle_deg, lateral_mm, pixel_mm)
     else:
         place = along_sweep(modes, grid, lateral_mm, depth_mm, pixel_mm)
     with progress_bar(f"reslicing {out.name}"):
-        picture = cut_at_modes(modes, place, images, grid, range_db, part, reach_mm)
+        picture = cut_at_modes(modes, place, source, range_db, part)
     if out.suffix.lower() == ".png":
         save_reslices(picture, out)
     else:

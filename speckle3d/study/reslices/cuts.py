@@ -11,16 +11,17 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.core.arrays import Float32Array, FloatArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.grid import ImageGrid, Region
+from speckle3d.core.sweep import BModeSettings
 from speckle3d.core.volume import Volume
 from speckle3d.imaging.cuts.curved import CurvedSheet
 from speckle3d.imaging.cuts.outlines import crossings, frame_outlines
 from speckle3d.imaging.cuts.reslice import reslice_at
-from speckle3d.imaging.images import Images
+from speckle3d.imaging.images import PosedImages
 from speckle3d.scoring.lengths import ModeError
 from speckle3d.scoring.references import Reference, error_rows
 from speckle3d.study.figures import RANGE_DB
 from speckle3d.study.posed import SweepModes
-from speckle3d.study.reslices.places import REACH_MM, AnyCut, Place
+from speckle3d.study.reslices.places import AnyCut, Place
 
 
 @dataclass(frozen=True)
@@ -56,7 +57,7 @@ class CutPicture:
     place : str
         Where the cut is.
     unit : str
-        Of the images: dB below the maximum, or "level".
+        Of the images: dB below the maximum, or the grey level of B-mode.
     levels : tuple of float
         Black and white.
     name : str
@@ -80,11 +81,9 @@ class CutPicture:
 def cut_at_modes(
     modes: SweepModes,
     place: Place,
-    images: Images,
-    grid: ImageGrid,
+    source: PosedImages,
     dynamic_range_db: float = RANGE_DB,
     region: Region | None = None,
-    reach_mm: float = REACH_MM,
 ) -> CutPicture:
     """Cut a sweep at the poses of every mode, straight from its frames.
 
@@ -93,30 +92,27 @@ def cut_at_modes(
     modes : SweepModes
     place : Place
         Of these modes.
-    images, grid
-        As `modes.posed.images` gives them.
+    source : PosedImages
+        As `modes.posed.source` gives them: B-mode as stored, echoes log-compressed.
     dynamic_range_db : float
-        Of the images.
+        Of the images of echoes.
     region : Region, optional
         Of the images; samples outside it do not count.
-    reach_mm : float
-        Frames farther from a pixel do not count.
 
     Raises
     ------
     InvalidInputError
         If the cut shows nothing.
     """
-    poses = modes.poses
-    unit, limits = "dB, 0: maximum", (-dynamic_range_db, 0.0)
+    poses, grid, signal = modes.poses, source.grid, modes.posed.sweep.signal
     mask = None if region is None else region.mask(grid)
-    levels = reslice_at(
-        images, grid, [(poses[mode], cut) for mode, cut in place.cuts.items()], reach_mm, mask
-    )
-    if modes.posed.has_range:
-        levels = [((image - 255) * (dynamic_range_db / 255)).astype(np.float32) for image in levels]
+    cuts_at = [(poses[mode], cut) for mode, cut in place.cuts.items()]
+    levels = reslice_at(source.images, grid, cuts_at, modes.reach_mm, mask)
+    if isinstance(signal, BModeSettings):
+        unit, limits = "grey level", (0.0, float(signal.full_scale))
     else:
-        unit, limits = "level", (0.0, getattr(modes.posed.sweep.signal, "full_scale", 255.0))
+        unit, limits = "dB, 0: maximum", (-dynamic_range_db, 0.0)
+        levels = [((image - 255) * (dynamic_range_db / 255)).astype(np.float32) for image in levels]
     if not any(np.isfinite(image).any() for image in levels):
         raise InvalidInputError("cut: expected one that meets the sweep, got one that shows nothing")
     cuts = {

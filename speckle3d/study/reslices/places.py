@@ -26,9 +26,6 @@ from speckle3d.study.posed import SweepModes
 AnyCut = ReslicePlane | CurvedSheet
 Vector = FloatArray | tuple[float, float, float]
 
-REACH_MM = 0.5
-"""Frames farther from a pixel do not count."""
-
 _LARGEST_MM = (1000.0, 200.0)
 """Of a cut along the sweep, however far a mode runs away."""
 
@@ -81,7 +78,6 @@ def in_frame(
     angle_deg: float = 0.0,
     lateral_mm: float | None = None,
     pixel_mm: float = DEFAULT_PIXEL_MM,
-    reach_mm: float = REACH_MM,
 ) -> Place:
     """Cut in a frame, or turned out of it about its depth line at a lateral position: 90 is along the sweep.
 
@@ -98,7 +94,7 @@ def in_frame(
     index = int(np.searchsorted(numbers, frame))
     lateral = float(grid.extent_mm[:, 0].mean()) if lateral_mm is None else lateral_mm
     world_from_plane = turned_frame_plane(poses[index], lateral_line(grid, lateral)[0, 0], angle_deg)
-    plane = covering_plane(world_from_plane, grid, poses, reach_mm, pixel_mm)
+    plane = covering_plane(world_from_plane, grid, poses, modes.reach_mm, pixel_mm)
     # In a frame itself x counts from the first vector.
     left = 0.0 if angle_deg else lateral
     plane = replace(plane, first_mm=(plane.first_mm[0] + left, plane.first_mm[1]))
@@ -106,15 +102,9 @@ def in_frame(
     return _move_to_modes(modes, plane, f"plane of frame {frame}{turn}", index)
 
 
-def in_world(
-    modes: SweepModes,
-    grid: ImageGrid,
-    plane: RigidTransform,
-    pixel_mm: float,
-    reach_mm: float,
-) -> Place:
+def in_world(modes: SweepModes, grid: ImageGrid, plane: RigidTransform, pixel_mm: float) -> Place:
     """Cut in a plane of the reference's world: x and y of the picture are its own."""
-    cut = covering_plane(plane, grid, modes.poses[modes.reference], reach_mm, pixel_mm)
+    cut = covering_plane(plane, grid, modes.poses[modes.reference], modes.reach_mm, pixel_mm)
     return _move_to_modes(modes, cut, f"plane from {vector_words(plane.translation)} mm")
 
 

@@ -18,6 +18,7 @@ from scipy.ndimage import uniform_filter1d
 from speckle3d.core.arrays import Float32Array
 from speckle3d.core.sweep import spread_frames
 from speckle3d.study.figures import (
+    RANGE_DB,
     UNSEEN,
     colour_of,
     label_of,
@@ -25,7 +26,6 @@ from speckle3d.study.figures import (
     new_figure,
     save_figure,
 )
-from speckle3d.study.images import GreyImages
 from speckle3d.study.posed import SweepModes
 from speckle3d.study.reslices.cut_geometry import KEYWORD, picture_text
 from speckle3d.study.reslices.cuts import CutPicture, cut_at_modes
@@ -43,9 +43,7 @@ _ACROSS_IN, _DOWN_IN = 11.0, 6.0
 """Width and height that the cuts share."""
 
 
-def draw_along(
-    modes: SweepModes, images: GreyImages, lengths: Mapping[str, str], paths: tuple[Path, Path]
-) -> None:
+def draw_along(modes: SweepModes, lengths: Mapping[str, str], paths: tuple[Path, Path]) -> None:
     """Cut a sweep along its middle at the poses of every mode; write the whole cut and a part enlarged.
 
     As in figures 7 and 8 of Housden et al., BioMedical Engineering OnLine 7:5, 2008.
@@ -54,19 +52,14 @@ def draw_along(
     ----------
     modes : SweepModes
         Of all frames.
-    images : GreyImages
-        Over `RANGE_DB`.
     lengths : mapping of str to str
         Length of each mode, in words.
     paths : tuple of path
         Of the two PNGs.
     """
-    # A reach of two of the longest steps, so that no gaps show between frames.
-    elevations = [(path[0].inv() * path).translation[:, 2] for path in modes.poses.values()]
-    reach_mm = max(0.3, *(2.0 * float(np.percentile(np.abs(np.diff(z)), 99)) for z in elevations))
-    place = along_sweep(modes, images.grid, pixel_mm=_PIXEL_MM)
-    picture = cut_at_modes(modes, place, images, images.grid, reach_mm=reach_mm)
-    picture = replace(picture, lengths=lengths)
+    source, _ = modes.posed.source(None, RANGE_DB)
+    place = along_sweep(modes, source.grid, pixel_mm=_PIXEL_MM)
+    picture = replace(cut_at_modes(modes, place, source), lengths=lengths)
     save_reslices(picture, paths[0])
     panel = picture.cuts[modes.reference]
     left, right, bottom, top = panel.cut.extent_mm
@@ -124,7 +117,8 @@ def draw_cuts(picture: CutPicture, part_mm: Extent | None = None) -> Figure:
         axes.remove()
     for axes in places[: len(cuts) : across]:
         axes.set_ylabel(f"{picture.axes[1]} / mm")
-    figure.supxlabel(f"{picture.axes[0]} / mm", fontsize="medium")
+    legend = " (yellow: where frames cross the cut)" if any(len(cut.frames) for cut in cuts.values()) else ""
+    figure.supxlabel(f"{picture.axes[0]} / mm{legend}", fontsize="medium")
     figure.colorbar(image, ax=list(places[: len(cuts)]), label=picture.unit, shrink=0.8)
     name_figure(figure, ": ".join(filter(None, [picture.name, picture.place])))
     return figure
