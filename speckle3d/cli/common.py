@@ -40,9 +40,8 @@ Out = Annotated[Path, typer.Option("-o", "--output", writable=True)]
 OptionalOut = Annotated[MaybePath, typer.Option("-o", "--output", writable=True)]
 OutArgument = Annotated[Path, typer.Argument(writable=True)]
 WritablePath = Annotated[MaybePath, typer.Option(writable=True)]
-Positive = Annotated[float, typer.Option(min=1e-6)]
-MaybePositive = Annotated[MaybeNumber, typer.Option(min=1e-6)]
 PixelMm = tuple[float, float] | None
+Json = Annotated[bool, typer.Option("--json")]
 Result = tuple[Any, str]
 """What a command prints: numbers for --json, else text."""
 

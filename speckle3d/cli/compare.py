@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-import json
 from typing import Annotated
 
 import typer
 
 from speckle3d.cli.common import (
     Drift,
+    Json,
     MaybePath,
     MaybeText,
     Out,
     Paths,
     Reference,
-    Result,
     Sweeps,
+    emit,
     load_settings,
     note,
 )
@@ -35,7 +35,8 @@ def compare(
     scheduler: MaybeText = None,
     workers: Annotated[int | None, typer.Option(min=1)] = None,
     paper: bool = False,
-) -> Result:
+    as_json: Json = False,
+) -> None:
     """Compare drift-correction modes over sweeps with a reference: tables, curves, a report.
 
     One of SWEEPS or --paper. A sweep that fails is a row that says why; the exit code is 2 only if all do.
@@ -91,6 +92,6 @@ def compare(
     for outcome in study.failures:
         note(f"{outcome.name}: failed: {outcome.reason}")
     note(f"results in {out}; the report is {out / 'report.html'}")
+    emit((out / "study.json").read_text(encoding="utf-8") if as_json else table or study.table)
     if not study.successes:
         raise InsufficientDataError(f"{out}: expected a sweep that can be compared, got none")
-    return json.loads((out / "study.json").read_text(encoding="utf-8")), table or study.table

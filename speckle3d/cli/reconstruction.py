@@ -5,11 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-import typer
-
 from speckle3d.cli.calibrations import mount
 from speckle3d.cli.common import (
     Drift,
+    Json,
     MaybePath,
     MaybeText,
     Out,
@@ -50,7 +49,7 @@ def reconstruct(
     volume: Annotated[WritablePath, "volume"] = None,
     calibration: Paths = None,
     config_file: MaybePath = None,
-    as_json: Annotated[bool, typer.Option("--json")] = False,
+    as_json: Json = False,
 ) -> None:
     """Reconstruct a sweep: trajectory, drift-corrected trajectories, table, figures.
 

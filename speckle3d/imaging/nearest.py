@@ -48,7 +48,7 @@ class NearestImages:
         self, source: PosedImages, lines: FloatArray, points: int, hull_mm: FloatArray, reach_mm: float
     ) -> None:
         if not 0 < reach_mm < np.inf:
-            raise InvalidInputError(f"max_distance_mm: expected a value above zero, got {reach_mm}")
+            raise InvalidInputError(f"reach_mm: expected a value above zero, got {reach_mm}")
         self.source, self._lines, self._reach_mm = source, lines, reach_mm
         image_from_world = source.world_from_image.inv().as_matrix()
         normals = image_from_world[:, 2, :3]

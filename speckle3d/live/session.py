@@ -167,6 +167,8 @@ class Session:
             If the recording cannot be written, or images or curves do not fit. What was recorded until then
             can be read. What goes wrong while frames are placed is no reason to end: see `failure`.
         """
+        if duration_s is not None and duration_s <= 0.0:
+            raise InvalidInputError(f"duration_s: expected seconds above zero, got {duration_s:g}")
         until_s = None if duration_s is None else time.monotonic() + duration_s
         # Readings from before the first frame are kept: that frame lies between two of them.
         waiting: deque[Received] = deque()

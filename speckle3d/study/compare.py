@@ -17,7 +17,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 from speckle3d.config import Config, config_from_toml
-from speckle3d.core.errors import InsufficientDataError, Speckle3DError
+from speckle3d.core.errors import Speckle3DError
 from speckle3d.core.printable import printable
 from speckle3d.core.progress import Progress
 from speckle3d.io.calibrations import apply_calibrations
@@ -137,8 +137,8 @@ def compare_sweeps(
 
     Raises
     ------
-    InvalidInputError, InsufficientDataError
-        If a setting is wrong for all sweeps, or none can be compared.
+    InvalidInputError
+        If the folder holds something else.
     FileError
         If the folder cannot be written.
     """
@@ -162,9 +162,6 @@ def compare_sweeps(
         outcomes[name] = plan
     # The longest first, so that no worker is left with it while the others have nothing to do.
     todo = sorted((plan for plan in outcomes.values() if plan.folder), key=lambda plan: -plan.frames)
-    if not todo:
-        why = "; ".join(f"{plan.name}: {plan.reason}" for plan in outcomes.values())
-        raise InsufficientDataError(f"expected a sweep that can be compared, got none: {why or 'no file'}")
     make_folder(directory / "sweeps")
     frames, total, tell = 0, sum(plan.frames for plan in todo), progress or (lambda frames, total: None)
     tell(frames, total)

@@ -52,7 +52,7 @@ from speckle3d.scoring.references import (
 )
 from speckle3d.study.details import details_of, doubted_modes
 from speckle3d.study.figures import figure_drift, save_figure
-from speckle3d.study.posed import PosedSweep, SweepModes, pose_mark, reach_of
+from speckle3d.study.posed import PosedSweep, SweepModes, pose_mark
 from speckle3d.study.reslices.cuts import length_words
 from speckle3d.study.reslices.reslice_figures import draw_along
 from speckle3d.study.results import SUMMARY_FILES, Summary, require_own, summary_text, write_summary
@@ -219,8 +219,7 @@ def run_job(
         if reference_poses is not None and reference_poses.covered.all():
             panels[reference_poses.name], base = reference_poses.world_from_image, reference_poses.name
         posed = PosedSweep(sweep, np.arange(len(sweep)), poses["image"], "image", reconstruction)
-        marks = {mode: pose_mark(path) for mode, path in panels.items()}
-        modes = SweepModes(posed, panels, base, marks, reach_of(panels, centre))
+        modes = SweepModes(posed, panels, base, {mode: pose_mark(path) for mode, path in panels.items()})
         draw_along(modes, length_words(rows, base), (part / PICTURES[1], part / PICTURES[2]))
         details["seconds"] = time.perf_counter() - start_s
         write_summary(part, summary)

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import reduce
+from functools import cached_property, reduce
 from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from speckle3d.core.arrays import FloatArray, IntArray
+from speckle3d.core.arrays import IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
 from speckle3d.core.reconstruction import Reconstruction
 from speckle3d.core.shown import shown
@@ -244,30 +244,22 @@ class SweepModes:
         One of the modes.
     marks : dict of str to str
         Of the poses of all frames, by `pose_mark`.
-    reach_mm : float
-        Frames farther from a pixel of a cut do not count.
     """
 
     posed: PosedSweep
     poses: dict[str, RigidTransform]
     reference: str
     marks: dict[str, str]
-    reach_mm: float
+
+    @cached_property
+    def reach_mm(self) -> float:
+        """Distance within which frames count in cuts: twice the longest steps, so that no gaps show."""
+        paths = [path.apply(self.posed.sweep.grid.centre_mm) for path in self.poses.values()]
+        steps = np.linalg.norm(np.concatenate([np.diff(path, axis=0) for path in paths]), axis=1)
+        return max(_LEAST_REACH_MM, round(2.0 * float(np.percentile([0.0, *steps], 99)), 1))
 
 
-def reach_of(poses: Mapping[str, RigidTransform], centre_mm: FloatArray) -> float:
-    """Reach of frames in cuts that shows no gaps between them: twice the longest steps of any mode."""
-    paths = [path.apply(centre_mm) for path in poses.values()]
-    steps = np.linalg.norm(np.concatenate([np.diff(path, axis=0) for path in paths]), axis=1)
-    return max(_LEAST_REACH_MM, round(2.0 * float(np.percentile([0.0, *steps], 99)), 1))
-
-
-def at_modes(
-    first: PosedSweep,
-    modes: Sequence[str] = (),
-    reference: str | None = None,
-    reach_mm: float | None = None,
-) -> SweepModes:
+def at_modes(first: PosedSweep, modes: Sequence[str] = (), reference: str | None = None) -> SweepModes:
     """Take an opened sweep at several modes.
 
     Parameters
@@ -278,8 +270,6 @@ def at_modes(
     reference : str, optional
         What to compare them with; by default the truth or a tracker that covers all frames, if there are
         several modes, else the first.
-    reach_mm : float, optional
-        By default `reach_of` the poses.
 
     Raises
     ------
@@ -301,5 +291,4 @@ def at_modes(
     poses = {mode: sweep.world_from_image[np.isin(sweep.frames, frames)] for mode, sweep in sweeps.items()}
     posed = replace(first, frames=frames, world_from_image=poses[modes[0]], mode=modes[0])
     marks = {mode: pose_mark(sweep.world_from_image) for mode, sweep in sweeps.items()}
-    reach_mm = reach_mm or reach_of(poses, first.sweep.grid.centre_mm)
-    return SweepModes(posed, poses, reference, marks, reach_mm)
+    return SweepModes(posed, poses, reference, marks)

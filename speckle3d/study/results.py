@@ -275,10 +275,9 @@ def require_own(directory: Path, files: FileSet) -> None:
     InvalidInputError
         Naming the first such file.
     """
-    if directory.is_file():
-        raise InvalidInputError(f"{directory}: expected a folder or a new name, got a file")
-    resolved = directory.resolve()
-    base = next(path for path in (resolved, *resolved.parents) if path.exists())
+    base = next(path for path in (directory, *directory.absolute().parents) if path.exists())
+    if not base.is_dir():
+        raise InvalidInputError(f"{directory}: expected a folder or a new name, got the file {base.name}")
     require_target(base / files.primary)
     names = [name for name in files.names if (directory / name).exists()]
     if names and files.primary not in names:

@@ -77,7 +77,7 @@ def test_every_setting_is_printed_with_its_default(run):
             "expected --reference with",
         ),
         (("calibrate", "clock", "{sweep}", "-o", "t.h5"), "--output: expected --calibration with it"),
-        (("compare", "{sweep}", "-o", "{sweep}"), "expected a folder or a new name, got a file"),
+        (("compare", "{sweep}", "-o", "{sweep}"), "expected a folder or a new name, got the file"),
         (("reslice", "{sweep}", "-o", "c.png", "--state=s.nrrd"), "--state=s.nrrd was removed: "),
         (("calibrate", "images", "a", "b", "-o", "c.h5", "--scales"), "--pixel-mm takes them"),
     ],

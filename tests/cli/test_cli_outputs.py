@@ -37,7 +37,7 @@ def test_other_files_and_inputs_stay_as_they_are(refuse, calls, bench, tmp_path)
     out = tmp_path / "in.h5" / "out"
     curves = bench / "curves.h5"
     line = refuse("reconstruct", tmp_path / "in.h5", "-o", out, "--curves", curves)
-    assert "expected an existing folder" in line
+    assert "out: expected a folder or a new name, got the file in.h5" in line
 
 
 @pytest.mark.parametrize("name", ["v.nrrd", "r.png", "o.csv", "p.tum"])

@@ -38,7 +38,7 @@ def test_along_a_curve_and_along_one_picked_in_a_picture(run, bench, curve, tmp_
     cut, top, picks = ("reslice", bench / "sweep.h5", "-o"), tmp_path / "top.png", tmp_path / "picked.csv"
     picks.write_text("x_mm,y_mm\n0.2,1.0\n1.0,2.0\n2.0,2.5\n")
     for out, *options in (
-        (tmp_path / "a.png", "--curve", curve, "--straight"),
+        (tmp_path / "a.png", "--curve", curve),
         (top, "--depth-mm", "10"),
         (tmp_path / "b.png", "--curve", picks, "--on", top),
     ):

@@ -8,10 +8,11 @@ import numpy as np
 from bokeh.events import Tap
 from bokeh.models import ColumnDataSource
 from bokeh.models.annotations import Span
+from scipy.spatial.transform import RigidTransform
 
 from speckle3d.app.plots import ImagePlot, greys
 from speckle3d.core.arrays import FloatArray
-from speckle3d.imaging.cuts.planes import ReslicePlane
+from speckle3d.imaging.cuts.planes import Cut
 from speckle3d.study.reslices.cuts import CutPicture
 
 _OVERLAY_PERCENTILES = (5.0, 99.5)
@@ -35,7 +36,8 @@ class CutPlot(ImagePlot):
 
     def __init__(self, name: str, colours: tuple[str, str], on_tap: Callable[[FloatArray], None]) -> None:
         super().__init__("", "", name=f"cut-{name}", title=" ", active_drag=None)
-        self.plane: ReslicePlane | None = None
+        self.plane: Cut | None = None
+        self._world_from_picture = RigidTransform.identity()
         self.plot.title.update(text_font_size="12px", text_font_style="normal")
         self._lines = tuple(
             Span(dimension=dimension, line_color=colour, line_width=1.5)
@@ -52,7 +54,7 @@ class CutPlot(ImagePlot):
     def show_cut(self, picture: CutPicture, mode: str, overlay: str | None) -> None:
         """Show a cut at the poses of one mode, or of another (magenta) laid over it (green)."""
         image, plane = picture.cuts[mode].image, picture.cuts[mode].cut
-        assert isinstance(plane, ReslicePlane)  # only along a curve there is another kind
+        assert plane.world_from_picture is not None  # as only along a curve
         if overlay is None:
             colours = greys(image, *picture.levels)
         else:
@@ -63,7 +65,7 @@ class CutPlot(ImagePlot):
             alpha = np.isfinite(layers).any(axis=0)
             colours = np.rint(255 * np.dstack([magenta, green, magenta, alpha])).astype(np.uint8)
         self.show(colours, plane.first_mm, (plane.pixel_mm,) * 2)
-        self.plane = plane
+        self.plane, self._world_from_picture = plane, plane.world_from_picture
         self.plot.title.text = picture.place.split(", seen")[0]
         self.plot.xaxis.axis_label, self.plot.yaxis.axis_label = (f"{name} / mm" for name in picture.axes)
 
@@ -71,8 +73,8 @@ class CutPlot(ImagePlot):
         """Put the cross hair at a point of the world, shape (3,), and draw others, shape (k, 3), mm."""
         if self.plane is None:
             return
-        inside = self.plane.world_from_plane.inv().apply(np.vstack([cross_mm, points_mm]))
-        x, y = inside[:, :2].T + np.array(self.plane.first_mm)[:, None]
+        inside = self._world_from_picture.inv().apply(np.vstack([cross_mm, points_mm]))
+        x, y = inside[:, :2].T
         for line, place in zip(self._lines, (x[0], y[0]), strict=True):
             line.location = float(place)
         x[np.abs(inside[:, 2]) > _NEAR_MM] = np.nan
@@ -81,4 +83,4 @@ class CutPlot(ImagePlot):
 
     def _tell(self, on_tap: Callable[[FloatArray], None], event: Tap) -> None:
         if self.plane is not None and event.x is not None and event.y is not None:
-            on_tap(self.plane.world_from_mm(event.x, event.y))
+            on_tap(self._world_from_picture.apply([event.x, event.y, 0.0]))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from speckle3d.cli.common import MaybeNumber, MaybePath, MaybePositive, MaybeText, Out, Positive
+from speckle3d.cli.common import MaybeNumber, MaybePath, MaybeText, Out
 from speckle3d.cli.look.volumes import ImportOptions, SweepOptions, open_sweep_at
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.progress import progress_bar
@@ -26,14 +26,11 @@ def reslice(
     frame: int | None = None,
     angle_deg: float = 0.0,
     points: MaybeText = None,
-    down: tuple[float, float, float] | None = None,
     curve: MaybePath = None,
     on: MaybePath = None,
-    straight: bool = False,
-    pixel_mm: Positive = 0.2,
-    reach_mm: MaybePositive = None,
+    pixel_mm: float = 0.2,
     choice: SweepOptions,
-    dynamic_range_db: MaybePositive = None,
+    dynamic_range_db: float = 50.0,
     recording: ImportOptions,
 ) -> None:
     """Cut a plane or along a curve, straight from the frames at the poses of one or more modes.
@@ -65,16 +62,10 @@ def reslice(
         What modes are compared with (truth or tracker if known, else the first).
     angle_deg
         With --frame: turn out of it about its depth line; 90 is along the sweep.
-    down
-        With --curve: direction of the picture's columns (depth).
-    straight
-        Join the curve's points by straight lines, not by a spline.
     pixel_mm
         Side of a pixel.
-    reach_mm
-        Frames farther from a pixel do not count; by default twice the longest steps, at least 0.5.
     dynamic_range_db
-        Range of the grey levels of RF and I/Q (50).
+        Range of the grey levels of RF and I/Q.
     region, sweep_file, calibration, tracker_transform
 
     Examples
@@ -84,7 +75,6 @@ def reslice(
     from speckle3d.imaging.cuts.oblique import spanned_plane
     from speckle3d.io.points import parse_places
     from speckle3d.io.voxels.volume_writer import write_volume
-    from speckle3d.study.figures import RANGE_DB
     from speckle3d.study.posed import at_modes
     from speckle3d.study.reslices.cuts import cut_as_volume, cut_at_modes
     from speckle3d.study.reslices.places import along_curve, along_sweep, in_frame, in_world
@@ -97,14 +87,12 @@ def reslice(
             raise InvalidInputError(f"--points: expected three, got {len(corners)}")
         plane = spanned_plane(corners[0], *(corners[1:] - corners[0]))
     first_mode = mode[:1] if mode else [None]
-    (first,), part = open_sweep_at(first_mode, input_file, recording, choice, dynamic_range_db)
-    modes = at_modes(first, mode or (), difference_to, reach_mm)
-    range_db = dynamic_range_db or RANGE_DB
-    source, _ = modes.posed.source(None, range_db)
+    (first,), part = open_sweep_at(first_mode, input_file, recording, choice)
+    modes = at_modes(first, mode or (), difference_to)
+    source, _ = modes.posed.source(None, dynamic_range_db)
     grid = source.grid
     if curve is not None:
-        points_mm = _curve(curve, on, modes)
-        place = along_curve(modes, grid, points_mm, down, not straight, pixel_mm)
+        place = along_curve(modes, grid, _curve(curve, on, modes), pixel_mm)
     elif plane is not None:
         place = in_world(modes, grid, plane, pixel_mm)
     elif frame is not None:
@@ -112,7 +100,7 @@ def reslice(
     else:
         place = along_sweep(modes, grid, lateral_mm, depth_mm, pixel_mm)
     with progress_bar(f"reslicing {out.name}"):
-        picture = cut_at_modes(modes, place, source, range_db, part)
+        picture = cut_at_modes(modes, place, source, dynamic_range_db, part)
     if out.suffix.lower() == ".png":
         save_reslices(picture, out)
     else:

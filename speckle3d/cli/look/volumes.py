@@ -66,7 +66,7 @@ def open_sweep_at(
     source: Path,
     settings: ImportSettings,
     choice: SweepChoice,
-    range_db: float | None,
+    range_db: float | None = None,
 ) -> tuple[list[PosedSweep], Region | None]:
     """Open a sweep at the poses of each mode (None: the best), and note on stderr what it says of itself.
 

@@ -12,7 +12,6 @@ from speckle3d.cli.commands import Fields
 from speckle3d.cli.common import (
     MaybeNumber,
     MaybePath,
-    MaybePositive,
     OptionalOut,
     OutArgument,
     Result,
@@ -232,7 +231,7 @@ def record(
     port: str,
     out: OutArgument,
     settings: Annotated[Any, Fields("xsens.live.device:DeviceSettings")],
-    duration_s: MaybePositive = None,
+    duration_s: float = math.inf,
     append: bool = False,
 ) -> None:
     """Record a sensor on a serial port; every byte is in the file as soon as it has come.
@@ -248,7 +247,7 @@ def record(
     rate_hz
         Samples per second; by default as set.
     duration_s
-        Stop after so long; by default at Ctrl-C.
+        Stop after so long; inf: at Ctrl-C.
 
     Other Parameters
     ----------------
@@ -270,7 +269,7 @@ def record(
     console, state = Console(stderr=True), None
     try:
         with Live(Text("connecting"), console=console, refresh_per_second=8, transient=True) as live:
-            for state in record_port(port, out, settings, append, duration_s=duration_s or float("inf")):
+            for state in record_port(port, out, settings, append, duration_s=duration_s):
                 live.update(Text(state.line()))
     except KeyboardInterrupt:
         note("stopped")

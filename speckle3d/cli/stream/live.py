@@ -16,8 +16,8 @@ import typer
 from speckle3d.cli.commands import Fields
 from speckle3d.cli.common import (
     Drift,
+    MaybeNumber,
     MaybePath,
-    MaybePositive,
     MaybeText,
     Out,
     Paths,
@@ -77,7 +77,7 @@ def live(
     crossing_file: MaybePath = None,
     region: MaybeText = None,
     drift: list[Drift] | None = None,
-    duration_s: MaybePositive = None,
+    duration_s: MaybeNumber = None,
     config_file: MaybePath = None,
 ) -> None:
     """Reconstruct a sweep while it is made: receive, record, place each frame, send its pose back.

@@ -11,7 +11,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.grid import ImageGrid
 from speckle3d.imaging.cuts.outlines import crossings, frame_outlines
-from speckle3d.imaging.cuts.planes import DEFAULT_PIXEL_MM, ReslicePlane, plane_part
+from speckle3d.imaging.cuts.planes import Cut, plane_cut
 
 _LEAST_SINE = 1e-4
 """Of the angle between two directions that span a plane: six thousandths of a degree."""
@@ -52,8 +52,8 @@ def covering_plane(
     grid: ImageGrid,
     world_from_image: RigidTransform,
     reach_mm: float,
-    pixel_mm: float = DEFAULT_PIXEL_MM,
-) -> ReslicePlane:
+    pixel_mm: float,
+) -> Cut:
     """Plane placed anywhere, as large as what the sweep's frames show of it.
 
     Parameters
@@ -82,7 +82,7 @@ def covering_plane(
             f"plane: expected one that meets a frame within {reach_mm:g} mm, all between {vector_words(low)} "
             f"and {vector_words(high)} mm, got one {away.min():.1f} mm from there"
         )
-    return plane_part(world_from_plane, points.min(axis=0), points.max(axis=0), pixel_mm)
+    return plane_cut(world_from_plane, points.min(axis=0), points.max(axis=0), pixel_mm)
 
 
 def vector_words(vector: Iterable[float]) -> str:

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from functools import cached_property
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -19,20 +17,18 @@ from speckle3d.imaging.axes import line_along
 MAX_PIXELS = 100_000_000
 """Largest reslice, to catch wrong units: 100 mm x 100 mm at 0.01 mm."""
 
-DEFAULT_PIXEL_MM = 0.2
-"""Between the axial and the lateral resolution of a 5-10 MHz probe."""
-
 _LEAST_ACROSS = 1e-3
 """Sine of the angle between the travel and the line to show that spans a plane."""
 
 
+@dataclass(frozen=True)
 class Cut:
-    """Straight columns of square pixels side by side in the world: a plane, or a sheet that is laid flat.
+    """Straight columns of square pixels side by side in the world: a plane, or a curved sheet laid flat.
 
     Attributes
     ----------
     base_mm : ndarray, shape (columns, 3)
-        Centre of every column's first pixel, in the world.
+        Centre of every column's first pixel, in the world; neighbours are one pixel apart.
     down : ndarray, shape (3,)
         Unit vector along which columns run.
     height_mm, pixel_mm : float
@@ -40,21 +36,16 @@ class Cut:
         and of neighbours.
     first_mm : tuple of float
         What the axes of a picture say at the centre of the first pixel: x and y.
+    world_from_picture : RigidTransform, optional
+        Of a plane: from what the axes say, x, y and 0, mm.
     """
 
+    base_mm: FloatArray
+    down: FloatArray
     height_mm: float
     pixel_mm: float
     first_mm: tuple[float, float]
-
-    if TYPE_CHECKING:
-
-        @property
-        def base_mm(self) -> FloatArray:
-            """Of the first pixels."""
-
-        @property
-        def down(self) -> FloatArray:
-            """Along the columns."""
+    world_from_picture: RigidTransform | None = None
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -79,62 +70,41 @@ class Cut:
         below = (self.shape[0] - 1) * self.pixel_mm * self.down
         return np.concatenate([self.base_mm, self.base_mm + below])
 
+    def moved(self, move: RigidTransform) -> Cut:
+        """The same cut elsewhere in the world."""
+        plane = self.world_from_picture
+        return replace(
+            self,
+            base_mm=move.apply(self.base_mm),
+            down=move.rotation.apply(self.down),
+            world_from_picture=None if plane is None else move * plane,
+        )
 
-@dataclass(frozen=True)
-class ReslicePlane(Cut):
-    """A rectangle in the world and the pixels it is cut into.
 
-    Parameters
-    ----------
-    world_from_plane : RigidTransform, single
-        The plane's origin is the centre of its first pixel, x runs along a row (columns grow), y down a
-        column (rows grow), z is the normal. Translation in mm.
-    width_mm, height_mm : float
-        Distance between the centres of the first and the last pixel of a row and of a column, to the
-        nearest whole pixel.
-    pixel_mm : float
-        Spacing of the square pixels.
-    first_mm : tuple of float
-        What the axes of a picture say at the centre of the first pixel: x and y.
+def plane_cut(
+    world_from_picture: RigidTransform, low: npt.ArrayLike, high: npt.ArrayLike, pixel_mm: float
+) -> Cut:
+    """Cut a plane, its x and y, from one point of its axes to another, mm.
 
     Raises
     ------
     InvalidInputError
-        If a size is not positive and finite, or the plane has more than `MAX_PIXELS` pixels.
+        If a size is not positive and finite, or there are more than `MAX_PIXELS` pixels.
     """
-
-    world_from_plane: RigidTransform
-    width_mm: float
-    height_mm: float
-    pixel_mm: float
-    first_mm: tuple[float, float] = (0.0, 0.0)
-
-    def __post_init__(self) -> None:
-        require_pixels(self.width_mm, self.height_mm, self.pixel_mm)
-
-    @cached_property
-    def base_mm(self) -> FloatArray:
-        """Centre of every column's first pixel."""
-        columns = np.arange(round(self.width_mm / self.pixel_mm) + 1)
-        return self.world_from_plane.apply(np.outer(columns * self.pixel_mm, [1.0, 0.0, 0.0]))
-
-    @cached_property
-    def down(self) -> FloatArray:
-        """Unit vector along the columns."""
-        return self.world_from_plane.rotation.apply([0.0, 1.0, 0.0])
-
-    def world_from_mm(self, x_mm: npt.ArrayLike, y_mm: npt.ArrayLike) -> FloatArray:
-        """Points of the world by what the picture's axes say, shape (..., 3), mm."""
-        x, y = np.broadcast_arrays(np.asarray(x_mm, dtype=float), np.asarray(y_mm, dtype=float))
-        inside = np.stack([x - self.first_mm[0], y - self.first_mm[1], np.zeros_like(x)], axis=-1)
-        return self.world_from_plane.apply(inside.reshape(-1, 3)).reshape(inside.shape)
+    left, top = np.asarray(low, dtype=float).tolist()
+    width, height = np.maximum(np.subtract(high, low), pixel_mm).tolist()
+    require_pixels(width, height, pixel_mm)
+    columns = left + np.arange(round(width / pixel_mm) + 1) * pixel_mm
+    base = world_from_picture.apply(np.insert(np.outer(columns, [1.0, 0.0]), 1, top, axis=1))
+    down = world_from_picture.rotation.apply([0.0, 1.0, 0.0])
+    return Cut(base, down, height, pixel_mm, (left, top), world_from_picture)
 
 
 def require_pixels(width_mm: float, height_mm: float, pixel_mm: float) -> None:
     """Raise `InvalidInputError` unless sizes are positive and there are at most `MAX_PIXELS` pixels."""
     sizes = width_mm, height_mm, pixel_mm
     if not 0 < min(sizes) <= max(sizes) < np.inf:
-        raise InvalidInputError(f"width, height and pixel: expected values above zero, got {sizes} mm")
+        raise InvalidInputError(f"pixel_mm: expected width, height and pixels above zero, got {sizes} mm")
     if (width_mm / pixel_mm + 1) * (height_mm / pixel_mm + 1) > MAX_PIXELS:
         raise InvalidInputError(
             f"reslice of {width_mm:g} x {height_mm:g} mm: expected at most {MAX_PIXELS} pixels, got "
@@ -142,11 +112,10 @@ def require_pixels(width_mm: float, height_mm: float, pixel_mm: float) -> None:
         )
 
 
-def image_plane(world_from_image: RigidTransform, grid: ImageGrid, pixel_mm: float) -> ReslicePlane:
+def image_plane(world_from_image: RigidTransform, grid: ImageGrid, pixel_mm: float) -> Cut:
     """The plane of one image, as large as the image: what another sweep shows there."""
-    first, (width, height) = grid.extent_mm[0].tolist(), np.ptp(grid.extent_mm, axis=0).tolist()
-    corner = RigidTransform.from_translation([*first, 0.0])
-    return ReslicePlane(world_from_image * corner, width, height, pixel_mm, (first[0], first[1]))
+    low, high = grid.extent_mm
+    return plane_cut(world_from_image, low, high, pixel_mm)
 
 
 def lateral_line(grid: ImageGrid, lateral_mm: float) -> FloatArray:
@@ -173,9 +142,9 @@ def _line(grid: ImageGrid, axis: int, name: str, value: float) -> FloatArray:
 def planes_from_first_frame(
     poses: Mapping[str, RigidTransform],
     line_mm: FloatArray,
-    pixel_mm: float = DEFAULT_PIXEL_MM,
+    pixel_mm: float,
     largest_mm: tuple[float, float] = (np.inf, np.inf),
-) -> dict[str, ReslicePlane]:
+) -> dict[str, Cut]:
     """Planes along one sweep at different poses, one size, with the first frame's line in one place of all.
 
     What differs between such pictures is where the sweep went after its first frame.
@@ -199,23 +168,7 @@ def planes_from_first_frame(
     ends = np.concatenate([points for _, points in planes.values()])
     low = np.maximum(ends.min(axis=0), np.negative(largest_mm))
     high = np.min([ends.max(axis=0), largest_mm, low + largest_mm], axis=0)
-    # Depth counts from the probe, lateral from the first vector.
-    begin = line_mm[0] @ (line_mm[1] != line_mm[0])
-    return {mode: plane_part(axes, low, high, pixel_mm, begin) for mode, (axes, _) in planes.items()}
-
-
-def plane_part(
-    world_from_plane: RigidTransform,
-    low: FloatArray,
-    high: FloatArray,
-    pixel_mm: float,
-    begin_mm: float = 0.0,
-) -> ReslicePlane:
-    """Rectangle of a plane; its axes count from the plane's origin, y with `begin_mm` there."""
-    start = RigidTransform.from_translation([*low, 0.0])
-    width, height = np.maximum(high - low, pixel_mm).tolist()
-    first_mm = (float(low[0]), float(low[1] + begin_mm))
-    return ReslicePlane(world_from_plane * start, width, height, pixel_mm, first_mm)
+    return {mode: plane_cut(axes, low, high, pixel_mm) for mode, (axes, _) in planes.items()}
 
 
 def _plane_of_travel(
@@ -223,7 +176,7 @@ def _plane_of_travel(
 ) -> tuple[RigidTransform, FloatArray]:
     """Place a plane in the first frame's line and the mean travel; also where on it all lines' ends are.
 
-    Its origin is where the first frame's line begins, and its y is that line.
+    Its y is the first frame's line, with depth counted from the probe, lateral from the first vector.
 
     Returns
     -------
@@ -239,5 +192,6 @@ def _plane_of_travel(
     if length < _LEAST_ACROSS:
         raise InsufficientDataError("the poses move along the line to show: expected travel across it")
     axes = Rotation.from_matrix(np.column_stack([right / length, down, np.cross(right / length, down)]))
-    world_from_plane = RigidTransform.from_components(ends[0, 0], axes)
+    begin = line_mm[0] @ (line_mm[1] != line_mm[0])
+    world_from_plane = RigidTransform.from_components(ends[0, 0] - begin * down, axes)
     return world_from_plane, world_from_plane.inv().apply(ends.reshape(-1, 3))[:, :2]

@@ -36,7 +36,7 @@ def reslice_at(
     images : indexable or callable
         Grey images by frame number, shape (vector, sample); see `speckle3d.imaging.images.Images`.
     grid : ImageGrid
-    cuts : sequence of RigidTransform, length n, and ReslicePlane or CurvedSheet
+    cuts : sequence of RigidTransform, length n, and Cut
         World from image of every frame, and what is cut there.
     max_distance_mm : float
         Images this far from a pixel or farther do not count: about the distance between frames.

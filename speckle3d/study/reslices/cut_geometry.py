@@ -17,9 +17,8 @@ from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.files import PathLike, open_regular
 from speckle3d.core.geometry import transforms_from_matrices
-from speckle3d.imaging.cuts.planes import ReslicePlane
+from speckle3d.imaging.cuts.planes import Cut
 from speckle3d.io.hdf5 import reading
-from speckle3d.study.reslices.places import AnyCut
 
 KEYWORD = "speckle3d.reslice"
 
@@ -47,13 +46,13 @@ class PicturedPlane:
         return self.world_from_picture.apply(np.column_stack([picked_mm, np.zeros(len(picked_mm))]))
 
 
-def picture_text(cuts: Mapping[str, AnyCut], marks: Mapping[str, str]) -> str:
+def picture_text(cuts: Mapping[str, Cut], marks: Mapping[str, str]) -> str:
     """Where the planes of a picture lie, by mode; `read_plane` reads it back. Of curved sheets nothing."""
     planes = [
-        {"mode": mode, "kind": "plane", "mark": marks.get(mode, ""), "first_mm": cut.first_mm}
-        | {"world_from_plane": cut.world_from_plane.as_matrix().tolist()}
+        {"mode": mode, "kind": "plane", "mark": marks.get(mode, ""), "first_mm": (0.0, 0.0)}
+        | {"world_from_plane": cut.world_from_picture.as_matrix().tolist()}
         for mode, cut in cuts.items()
-        if isinstance(cut, ReslicePlane)
+        if cut.world_from_picture is not None
     ]
     return json.dumps({"version": 1, "cuts": planes})
 

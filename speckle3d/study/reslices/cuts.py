@@ -13,15 +13,15 @@ from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.grid import ImageGrid, Region
 from speckle3d.core.sweep import BModeSettings
 from speckle3d.core.volume import Volume
-from speckle3d.imaging.cuts.curved import CurvedSheet
 from speckle3d.imaging.cuts.outlines import crossings, frame_outlines
+from speckle3d.imaging.cuts.planes import Cut
 from speckle3d.imaging.cuts.reslice import reslice_at
 from speckle3d.imaging.images import PosedImages
 from speckle3d.scoring.lengths import ModeError
 from speckle3d.scoring.references import Reference, error_rows
 from speckle3d.study.figures import RANGE_DB
 from speckle3d.study.posed import SweepModes
-from speckle3d.study.reslices.places import AnyCut, Place
+from speckle3d.study.reslices.places import Place
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class DrawnCut:
     ----------
     image : ndarray of float32, shape (rows, columns)
         dB or levels; NaN where nothing was seen.
-    cut : ReslicePlane or CurvedSheet
+    cut : Cut
         Where it is.
     frames : ndarray, shape (n, m, 2)
         Line in which each frame crosses the cut, by the picture's axes, mm; NaN where it does not. Empty for
@@ -40,7 +40,7 @@ class DrawnCut:
     """
 
     image: Float32Array
-    cut: AnyCut
+    cut: Cut
     frames: FloatArray = field(default_factory=lambda: np.empty((0, 2, 2)))
 
 
@@ -125,12 +125,11 @@ def cut_at_modes(
     return CutPicture(cuts, place.axes, place.words, unit, limits, name, modes.marks, lengths)
 
 
-def frame_lines(cut: AnyCut, grid: ImageGrid, world_from_image: RigidTransform) -> FloatArray:
+def frame_lines(cut: Cut, grid: ImageGrid, world_from_image: RigidTransform) -> FloatArray:
     """Lines in which frames cross a plane, by its axes, (n, 2, 2), mm; NaN for none; none on a sheet."""
-    if isinstance(cut, CurvedSheet):
+    if cut.world_from_picture is None:
         return np.empty((0, 2, 2))
-    lines = crossings(frame_outlines(grid, world_from_image), cut.world_from_plane)
-    return np.asarray(lines + np.array(cut.first_mm))
+    return crossings(frame_outlines(grid, world_from_image), cut.world_from_picture)
 
 
 def length_words(rows: Sequence[ModeError], reference: str) -> dict[str, str]:
@@ -156,7 +155,7 @@ def cut_as_volume(picture: CutPicture) -> Volume:
     if len(picture.cuts) > 1:
         raise InvalidInputError(f"expected one mode for a volume file, got {', '.join(picture.cuts)}")
     ((mode, panel),) = picture.cuts.items()
-    if isinstance(panel.cut, CurvedSheet):
+    if panel.cut.world_from_picture is None:
         raise InvalidInputError("expected a picture (.png) of a curved cut, which lies in no one plane")
     low, high = picture.levels
     level = 1 + np.rint(254 * np.clip((panel.image - low) / (high - low), 0, 1))
@@ -164,4 +163,5 @@ def cut_as_volume(picture: CutPicture) -> Volume:
     unit = picture.unit.partition(",")[0]
     fields["levels"] = f"1 to 255: {low:g} to {high:g} {unit}; 0 where nothing was seen"
     voxels = np.nan_to_num(level, nan=0.0).astype(np.uint8)
-    return Volume(voxels[None].T, (panel.cut.pixel_mm,) * 3, panel.cut.world_from_plane, fields)
+    place = RigidTransform.from_components(panel.cut.base_mm[0], panel.cut.world_from_picture.rotation)
+    return Volume(voxels[None].T, (panel.cut.pixel_mm,) * 3, place, fields)

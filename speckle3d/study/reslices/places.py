@@ -11,20 +11,14 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.grid import ImageGrid
-from speckle3d.imaging.cuts.curved import CurvedSheet, curved_sheet
+from speckle3d.imaging.cuts.curved import curved_sheet
 from speckle3d.imaging.cuts.oblique import covering_plane, turned_frame_plane, vector_words
 from speckle3d.imaging.cuts.outlines import frame_outlines
-from speckle3d.imaging.cuts.planes import (
-    DEFAULT_PIXEL_MM,
-    ReslicePlane,
-    depth_line,
-    lateral_line,
-    planes_from_first_frame,
-)
+from speckle3d.imaging.cuts.planes import Cut, depth_line, lateral_line, planes_from_first_frame
 from speckle3d.study.posed import SweepModes
 
-AnyCut = ReslicePlane | CurvedSheet
-Vector = FloatArray | tuple[float, float, float]
+DEFAULT_PIXEL_MM = 0.2
+"""Between the axial and the lateral resolution of a 5-10 MHz probe."""
 
 _LARGEST_MM = (1000.0, 200.0)
 """Of a cut along the sweep, however far a mode runs away."""
@@ -39,7 +33,7 @@ class Place:
 
     Attributes
     ----------
-    cuts : mapping of str to ReslicePlane or CurvedSheet
+    cuts : mapping of str to Cut
         By mode.
     axes : tuple of str
         Names of x and y, without the unit.
@@ -47,7 +41,7 @@ class Place:
         Where it is.
     """
 
-    cuts: Mapping[str, AnyCut]
+    cuts: Mapping[str, Cut]
     axes: tuple[str, str]
     words: str
 
@@ -92,13 +86,12 @@ def in_frame(
             f"--frame: expected one with a pose, of {numbers[0]} to {numbers[-1]}, got {frame}"
         )
     index = int(np.searchsorted(numbers, frame))
-    lateral = float(grid.extent_mm[:, 0].mean()) if lateral_mm is None else lateral_mm
-    world_from_plane = turned_frame_plane(poses[index], lateral_line(grid, lateral)[0, 0], angle_deg)
+    world_from_plane, turn = poses[index], ""
+    if angle_deg:
+        lateral = float(grid.extent_mm[:, 0].mean()) if lateral_mm is None else lateral_mm
+        world_from_plane = turned_frame_plane(poses[index], lateral_line(grid, lateral)[0, 0], angle_deg)
+        turn = f", turned by {angle_deg:g}°"
     plane = covering_plane(world_from_plane, grid, poses, modes.reach_mm, pixel_mm)
-    # In a frame itself x counts from the first vector.
-    left = 0.0 if angle_deg else lateral
-    plane = replace(plane, first_mm=(plane.first_mm[0] + left, plane.first_mm[1]))
-    turn = f", turned by {angle_deg:g}°" if angle_deg else ""
     return _move_to_modes(modes, plane, f"plane of frame {frame}{turn}", index)
 
 
@@ -112,47 +105,29 @@ def along_curve(
     modes: SweepModes,
     grid: ImageGrid,
     curve_mm: FloatArray,
-    down: Vector | None = None,
-    smooth: bool = True,
-    pixel_mm: float = DEFAULT_PIXEL_MM,
+    pixel_mm: float,
 ) -> Place:
-    """Cut along a curve through points of the reference's world, shape (n, 3), and down into the depth.
-
-    Parameters
-    ----------
-    down : tuple of float, optional
-        In place of the depth.
-    smooth : bool
-        Join the points by a spline.
-    """
+    """Cut along a curve through points of the reference's world, shape (n, 3), and down into the depth."""
     poses = modes.poses[modes.reference]
-    axis = np.asarray(_mean_directions(poses)[1] if down is None else down)
+    down = _mean_directions(poses)[1]
     # As far along its columns as there is something.
-    along = (frame_outlines(grid, poses) - curve_mm[0]) @ axis / max(float(np.linalg.norm(axis)), 1e-9)
-    sheet = curved_sheet(curve_mm, axis, (along.min(), along.max()), pixel_mm, smooth)
-    if down is None:
-        # Depth counts from the probe where the curve begins, as the nearest frame has it.
-        at = poses.inv().apply(curve_mm[0])
-        depth = float(at[np.argmin(np.abs(at[:, 2])), 1])
-        sheet = replace(sheet, first_mm=(0.0, sheet.first_mm[1] + depth))
+    along = (frame_outlines(grid, poses) - curve_mm[0]) @ down
+    sheet = curved_sheet(curve_mm, down, (along.min(), along.max()), pixel_mm)
+    # Depth counts from the probe where the curve begins, as the nearest frame has it.
+    at = poses.inv().apply(curve_mm[0])
+    depth = float(at[np.argmin(np.abs(at[:, 2])), 1])
+    sheet = replace(sheet, first_mm=(0.0, sheet.first_mm[1] + depth))
     return _move_to_modes(modes, sheet, f"along a curve through {len(curve_mm)} points")
 
 
-def _move_to_modes(modes: SweepModes, cut: AnyCut, words: str, frame: int = 0) -> Place:
+def _move_to_modes(modes: SweepModes, cut: Cut, words: str, frame: int = 0) -> Place:
     """Take a cut of the reference's world to the poses of every mode, by the frame it hangs on."""
     poses = modes.poses[modes.reference]
-    moves = {mode: path[frame] * poses[frame].inv() for mode, path in modes.poses.items()}
-    if isinstance(cut, CurvedSheet):
-        sheets = {
-            mode: replace(cut, base_mm=move.apply(cut.base_mm), down=move.rotation.apply(cut.down))
-            for mode, move in moves.items()
-        }
-        return Place(sheets, ("along the curve", _name(cut.down, poses)), words)
-    planes = {
-        mode: replace(cut, world_from_plane=move * cut.world_from_plane) for mode, move in moves.items()
-    }
-    right, down = cut.world_from_plane.rotation.as_matrix().T[:2]
-    return Place(planes, (_name(right, poses), _name(down, poses)), words)
+    cuts = {mode: cut.moved(path[frame] * poses[frame].inv()) for mode, path in modes.poses.items()}
+    plane, along = cut.world_from_picture, "along the curve"
+    if plane is not None:
+        along = _name(plane.rotation.apply([1.0, 0.0, 0.0]), poses)
+    return Place(cuts, (along, _name(cut.down, poses)), words)
 
 
 def _mean_directions(world_from_image: RigidTransform) -> FloatArray:

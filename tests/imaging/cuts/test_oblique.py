@@ -19,12 +19,10 @@ def test_a_covering_plane_is_as_large_as_what_frames_show():
     # Across all frames at depth 4, of a sweep 8 long and 5 wide.
     world_from_plane = RigidTransform.from_components([-20.0, 4.0, 3.0], Rotation.from_euler("X", np.pi / 2))
     plane = covering_plane(world_from_plane, GRID, poses, 0.5, 0.1)
-    assert (plane.width_mm, plane.height_mm) == pytest.approx((5.0, 8.0))
-    # Axes count from where the plane was placed.
-    np.testing.assert_allclose(plane.world_from_mm(22.0, 1.0), world_from_plane.apply([22.0, 1.0, 0.0]))
-    np.testing.assert_allclose(plane.world_from_plane.translation, [0, 4, 0], atol=1e-9)
+    assert (plane.shape, plane.first_mm) == ((81, 51), pytest.approx((20.0, -3.0)))
+    np.testing.assert_allclose(plane.base_mm[0], [0, 4, 0], atol=1e-9)
     with pytest.raises(InvalidInputError, match=r"49\.0 mm"):
-        covering_plane(RigidTransform.from_translation([0, 0, 57.0]), GRID, poses, 0.5)
+        covering_plane(RigidTransform.from_translation([0, 0, 57.0]), GRID, poses, 0.5, 0.1)
 
 
 def test_planes_of_several_modes_begin_with_one_line_and_show_what_became_longer():
@@ -42,10 +40,9 @@ def test_planes_of_several_modes_begin_with_one_line_and_show_what_became_longer
     assert planes["image"].first_mm == planes["truth"].first_mm
     lengths = []
     for mode, plane in planes.items():
-        first = plane.world_from_mm([0, 0], line[:, 1])
+        first = plane.world_from_picture.apply(np.column_stack([[0, 0], line[:, 1], [0, 0]]))
         np.testing.assert_allclose(first, poses[mode][0].apply(line), atol=1e-9)
-        far = poses[mode][way.size].apply(line[0])
-        lengths.append(np.linalg.norm(far - plane.world_from_mm(0.0, 1.0)))
+        lengths.append(np.linalg.norm(poses[mode][way.size].apply(line[0]) - first[0]))
     assert lengths[0] / lengths[1] == pytest.approx(1.06)
     # Large enough for the longer one.
-    assert planes["truth"].width_mm == pytest.approx(1.06 * 19.5 * np.hypot(1.0, 0.1), rel=1e-9)
+    assert len(planes["truth"].base_mm) == round(1.06 * 19.5 * np.hypot(1.0, 0.1) / 0.1) + 1

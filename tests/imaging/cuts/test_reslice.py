@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.grid import ImageGrid
-from speckle3d.imaging.cuts.planes import ReslicePlane
+from speckle3d.imaging.cuts.planes import plane_cut
 from speckle3d.imaging.cuts.reslice import reslice_at
 
 GRID = ImageGrid(vectors=9, samples=14, vector_pitch_mm=0.5, sample_spacing_mm=0.3, first_sample_depth_mm=0.7)
@@ -26,7 +26,7 @@ def pixel_points(plane):
     rows, columns = plane.shape
     y, x = np.mgrid[:rows, :columns] * plane.pixel_mm
     local = np.stack([x, y, np.zeros_like(x)], axis=-1)
-    return plane.world_from_plane.apply(local.reshape(-1, 3)).reshape(rows, columns, 3)
+    return plane.world_from_picture.apply(local.reshape(-1, 3)).reshape(rows, columns, 3)
 
 
 @settings(max_examples=40, deadline=None)
@@ -37,7 +37,8 @@ def test_matches_brute_force_for_any_plane(seed, max_distance_mm, moderate):
     images = rng.normal(size=(7, GRID.vectors, GRID.samples)).astype(np.float32)
     images[rng.integers(7), :3, :3] = np.nan
     turn = Rotation.from_rotvec(rng.normal(0, 0.3, 3)) if moderate else Rotation.random(rng=rng)
-    plane = ReslicePlane(RigidTransform.from_components(rng.uniform(-1, 3, 3), turn), 4.0, 3.0, 0.21)
+    pose = RigidTransform.from_components(rng.uniform(-1, 3, 3), turn)
+    plane = plane_cut(pose, (0.0, 0.0), (4.0, 3.0), 0.21)
     (cut,) = reslice_at(images, GRID, [(poses, plane)], max_distance_mm)
     expected, _ = oracles.between_images(
         images, GRID, poses, pixel_points(plane).reshape(-1, 3), max_distance_mm

@@ -8,7 +8,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.imaging.cuts.curved import curved_sheet
-from speckle3d.imaging.cuts.planes import ReslicePlane
+from speckle3d.imaging.cuts.planes import plane_cut
 from speckle3d.scoring.lengths import ModeError
 from speckle3d.study.reslices.cut_geometry import read_plane
 from speckle3d.study.reslices.cuts import CutPicture, DrawnCut, length_words
@@ -17,7 +17,7 @@ from speckle3d.study.reslices.reslice_figures import draw_cuts, save_reslices
 WORLD_FROM_PLANE = RigidTransform.from_components(
     [3.0, -40.0, 12.0], Rotation.from_euler("ZYX", [0.4, -0.7, 1.0])
 )
-PLANE = ReslicePlane(WORLD_FROM_PLANE, 15.0, 20.0, 0.5, (-1.0, 2.5))
+PLANE = plane_cut(WORLD_FROM_PLANE, (-1.0, 2.5), (14.0, 22.5), 0.5)
 
 
 def picture_of(modes, **words):
@@ -58,14 +58,16 @@ def test_lengths_over_narrow_cuts_do_not_overlap():
 
 
 def test_where_a_plane_lies_comes_back_from_the_file(tmp_path):
-    sheet = curved_sheet([[0, 0, 0], [5, 0, 0], [5, 7, 0]], [0, 0, 2.0], (-1.0, 4.0), 0.5, smooth=False)
+    sheet = curved_sheet(np.eye(3), np.array([0, 0, 1.0]), (-1.0, 4.0), 0.5)
     cuts = {"truth": sheet, "pose": PLANE}
     panels = {mode: DrawnCut(np.zeros(cut.shape, np.float32), cut) for mode, cut in cuts.items()}
     path = save_reslices(CutPicture(panels, marks={"pose": "a mark"}), tmp_path / "cut.png")
     plane = read_plane(path)
     assert (plane.mode, plane.mark) == ("pose", "a mark")
     picks = np.array([[-1.0, 2.5], [2.0, 3.5]])
-    np.testing.assert_allclose(plane.world_mm(picks), PLANE.world_from_mm(*picks.T), atol=1e-9)
+    np.testing.assert_allclose(
+        plane.world_mm(picks), WORLD_FROM_PLANE.apply(np.insert(picks, 2, 0, axis=1)), atol=1e-9
+    )
     with pytest.raises(InvalidInputError):
         read_plane(path, "truth")
     path.write_bytes(b"no picture")
