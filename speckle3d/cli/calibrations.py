@@ -32,8 +32,7 @@ def clip_of(config: str | None, grid: ImageGrid, skew_rad: float) -> str | None:
     """Region to which a device set of PLUS clips volumes."""
     from speckle3d.io.plus.device_set import read_device_set
 
-    clip = None if config is None else read_device_set(config).clip
-    return None if clip is None else clip.region_text(replace(grid, skew_rad=skew_rad))
+    return None if config is None else read_device_set(config).clip_region(replace(grid, skew_rad=skew_rad))
 
 
 def mount(sweep: Sweep, paths: Sequence[Path]) -> Sweep:

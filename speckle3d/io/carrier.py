@@ -13,12 +13,15 @@ _LEAST_SIGMAS = 4.0
 """Of the mean of so many phases of noise, below which coherence tells nothing either: of few samples."""
 _FASTEST = 0.85 * np.pi
 """Turn of a carrier from sample to sample, above which it may seem to turn backwards."""
-_BASEBAND, CARRIER, _MIRROR = (-0.5, 0.3), (0.5, 1.15), (-1.15, -0.7)
+_BASEBAND, _CARRIER, _MIRROR = (-0.5, 0.3), (0.5, 1.15), (-1.15, -0.7)
 """Measured over nominal turn. Attenuation lowers a carrier, by a fifth in 40 mm of tissue and more below."""
 
 
 def demodulation_of(frames: Frames, frequency_hz: float, sampling_rate_hz: float) -> float | None:
     """Frequency that complex samples were shifted down by: `frequency_hz`, or 0 where they still carry it.
+
+    The phase between neighbouring samples is the mean turn of what they carry, the first moment of the
+    spectrum [1]_: nothing, or 2 pi f / fs. The first, the middle and the last frame are looked at.
 
     Returns
     -------
@@ -29,30 +32,6 @@ def demodulation_of(frames: Frames, frequency_hz: float, sampling_rate_hz: float
     ------
     InvalidInputError
         If the carrier turns backwards: Q has the other sign.
-    """
-    share = carrier_share(frames, frequency_hz, sampling_rate_hz)
-    if share is None:
-        return None
-    if _MIRROR[0] <= share <= _MIRROR[1]:
-        raise InvalidInputError(
-            f"expected I/Q that carry {frequency_hz:g} Hz or nothing, got {share * frequency_hz:g} Hz: Q has "
-            "the other sign"
-        )
-    if CARRIER[0] <= share <= CARRIER[1]:
-        return 0.0
-    return frequency_hz if _BASEBAND[0] <= share <= _BASEBAND[1] else None
-
-
-def carrier_share(frames: Frames, frequency_hz: float, sampling_rate_hz: float) -> float | None:
-    """Mean phase step between samples, divided by that of a carrier of `frequency_hz`.
-
-    The phase between neighbouring samples is the mean turn of what they carry, the first moment of the
-    spectrum [1]_: nothing, or 2 pi f / fs. The first, the middle and the last frame are looked at.
-
-    Returns
-    -------
-    float or None
-        None where the phase does not tell: noise, or samples too far apart for the frequency.
 
     References
     ----------
@@ -60,8 +39,6 @@ def carrier_share(frames: Frames, frequency_hz: float, sampling_rate_hz: float) 
        technique", IEEE Trans. Sonics Ultrason. 32, 1985.
     """
     turn = 2.0 * np.pi * frequency_hz / sampling_rate_hz
-    if turn > _FASTEST:
-        return None
     lag, count = 0j, 0
     for i in sorted({0, frames.shape[0] // 2, frames.shape[0] - 1}):
         frame = np.asarray(frames[i], dtype=np.complex128)
@@ -69,6 +46,14 @@ def carrier_share(frames: Frames, frequency_hz: float, sampling_rate_hz: float) 
         # Each pair counts the same: a near field may be a thousand times as strong as the rest.
         turns = pairs[pairs != 0] / np.abs(pairs[pairs != 0])
         lag, count = lag + turns.sum(), count + turns.size
-    if not abs(lag) > max(_LEAST_COHERENCE * count, _LEAST_SIGMAS * count**0.5):
+    if turn > _FASTEST or not abs(lag) > max(_LEAST_COHERENCE * count, _LEAST_SIGMAS * count**0.5):
         return None
-    return float(np.angle(lag)) / turn
+    share = float(np.angle(lag)) / turn
+    if _MIRROR[0] <= share <= _MIRROR[1]:
+        raise InvalidInputError(
+            f"expected I/Q that carry {frequency_hz:g} Hz or nothing, got {share * frequency_hz:g} Hz: Q has "
+            "the other sign"
+        )
+    if _CARRIER[0] <= share <= _CARRIER[1]:
+        return 0.0
+    return frequency_hz if _BASEBAND[0] <= share <= _BASEBAND[1] else None

@@ -11,8 +11,8 @@ References
 from __future__ import annotations
 
 import re
-from codecs import BOM_UTF8
 from collections.abc import Iterator
+from itertools import takewhile
 from typing import Any, BinaryIO
 
 import nrrd
@@ -21,6 +21,7 @@ import numpy as np
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.io.text import numbers
 
+_START = re.compile(rb"(?:\xef\xbb\xbf)?(?:NRRD000|(?:ObjectType|NDims|Comment|ObjectSubType)\s*=)")
 _FRAME_FIELD = re.compile(r"Seq_Frame0*(\d{1,7})_(\w+)")
 _MM_PER = {
     "": 1.0, "?": 1.0, "none": 1.0, "unknown": 1.0, "mm": 1.0, "millimeter": 1.0, "cm": 10.0,
@@ -51,28 +52,21 @@ NRRD_NAMES = {
 
 def is_image(start: bytes) -> bool:
     """Whether a file's first bytes are those of a MetaImage or NRRD header."""
-    first = start.removeprefix(BOM_UTF8).split(b"\n", 1)[0].partition(b"=")[0].strip()
-    return start.startswith(b"NRRD000") or first in (b"ObjectType", b"NDims", b"Comment", b"ObjectSubType")
+    return _START.match(start) is not None
 
 
 def nrrd_fields(stream: BinaryIO) -> dict[str, Any]:
     """Fields of NRRD by their names, numbers as numbers; the stream is left behind them."""
-    lines, is_whole = dict[str, str](), False
-    magic = stream.readline().decode()
-    for line in _lines(stream):
-        if is_whole := not line.strip():
-            break
+    lines = [stream.readline().decode()]
+    for line in takewhile(str.strip, _lines(stream)):
         name, sign, value = line.partition(":")
-        if not sign:  # names of files below "data file: LIST"
-            continue
         if not value.startswith("="):
             # Fields of the format itself, unlike those of its users, may be in letters of any size.
-            name = re.sub("^(data|byte|line)(?=file|skip)", r"\1 ", name.strip().lower())
-        lines[name] = f"{NRRD_NAMES.get(name, name)}{sign}{value}"
+            name = re.sub("^(data|byte)(?=file|skip)", r"\1 ", name.strip().lower())
+        # Without a sign: names of files below "data file: LIST".
+        lines += [f"{NRRD_NAMES.get(name, name)}{sign}{value}"] if sign else []
     fields: dict[str, Any] = {"sizes": (), "type": "", "encoding": ""}
-    fields |= nrrd.read_header([magic, *lines.values()])
-    if not (is_whole or "data file" in fields):
-        raise InvalidInputError("expected an NRRD header up to an empty line, got a truncated one")
+    fields |= nrrd.read_header(lines)
     return fields
 
 
@@ -80,12 +74,10 @@ def meta_fields(stream: BinaryIO) -> dict[str, Any]:
     """Fields of a MetaImage by its own and by NRRD's names; the stream is left behind them."""
     fields: dict[str, Any] = {}
     for line in _lines(stream):
-        name, _, value = line.partition("=")
-        fields[name.strip()] = value.strip()
-        if "ElementDataFile" in fields:
+        name, _, value = map(str.strip, line.partition("="))
+        fields[name] = value
+        if name == "ElementDataFile":
             break
-    else:
-        raise InvalidInputError("expected a MetaImage header up to ElementDataFile, got a truncated one")
 
     def first(*names: str) -> str:
         return next((fields[name] for name in names if fields.get(name)), "")
@@ -93,21 +85,18 @@ def meta_fields(stream: BinaryIO) -> dict[str, Any]:
     def is_set(*names: str) -> bool:
         return first(*names)[:1] in ("T", "t", "1")
 
-    file, header_bytes = first("ElementDataFile"), int(first("HeaderSize") or "0")
-    is_text = "BinaryData" in fields and not is_set("BinaryData")
+    file, is_text = first("ElementDataFile"), "BinaryData" in fields and not is_set("BinaryData")
     words: dict[str, Any] = {
         "sizes": numbers(first("DimSize"), None, "DimSize"),
         "kinds": first("Kinds").split(),
         "type": first("ElementType"),
         "endian": "big" if is_set("BinaryDataByteOrderMSB", "ElementByteOrderMSB") else "little",
         "encoding": "gzip" if is_set("CompressedData") else "text" if is_text else "raw",
-        "data file": file,
-        "byte skip": header_bytes,
+        "data file": file if file.upper() != "LOCAL" else "",
+        "byte skip": int(first("HeaderSize") or "0"),
         "channels": int(first("ElementNumberOfChannels") or "1"),
         "space units": [first("DistanceUnits")],
     }
-    if file.upper() == "LOCAL":
-        words |= {"data file": "", "byte skip": min(header_bytes, 0)}
     if steps := first("ElementSpacing", "ElementSize"):
         axes = np.diag(np.array(numbers(steps, len(words["sizes"]), "ElementSpacing")))
         if rotation := first("TransformMatrix", "Rotation", "Orientation"):

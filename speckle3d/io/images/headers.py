@@ -10,9 +10,10 @@ import bz2
 import math
 import zlib
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import nrrd
 import numpy as np
@@ -30,6 +31,7 @@ from speckle3d.io.images.header_fields import (
     number_type,
     s_per,
 )
+from speckle3d.io.text import numbers
 
 DEFLATE: Any = zlib
 try:
@@ -44,8 +46,6 @@ ZLIB, GZIP, _EITHER = 15, 31, 47
 
 _ENCODINGS = {"ra": "raw", "gz": "deflate", "bz": "bzip2", "tx": "text", "te": "text", "as": "text"}
 """By how NRRD's words for them begin, as bzip2 or bz2."""
-_BYTES_OF_ONE = {"text": 8, "deflate": 1032, "bzip2": 2**20}
-"""Bytes of numbers that a byte of the file may stand for: of deflate and bzip2, where all are zero."""
 _SPACE, _TIME = ("domain", "space", "", "???", "none", "?"), ("list", "time")
 
 
@@ -85,7 +85,7 @@ class SequenceHeader:
     data : path
         Of the file that holds the pixels: the header's own, or one in its folder.
     start : int
-        First byte of the pixels, or of `text_lines` lines before them; -1 where they are last.
+        First byte of the pixels; -1 where they are last.
     encoding : str
         ``"raw"``, ``"deflate"``, ``"bzip2"`` or ``"text"``.
     """
@@ -107,50 +107,30 @@ class SequenceHeader:
     data: Path
     start: int
     encoding: str
-    text_lines: int
+
+    @property
+    def has_images(self) -> bool:
+        """Whether images have more than a line; a tracker's recording has none, or a pixel a frame."""
+        return 0 not in self.size and max(self.size[:2]) > 1
 
     @property
     def frame_count(self) -> int:
-        """Frames, from the third axis; a plane image is one frame."""
-        return self.size[2] if len(self.size) > 2 else 1
-
-    @property
-    def number_count(self) -> int:
-        """How many numbers all pixels have."""
-        return math.prod(self.size) * self.channels
+        """Frames, from the third axis, and of a tracker's recording at least those with fields."""
+        count = (*self.size, 1)[2]
+        return count if self.has_images else max(count, len(self.frames))
 
     def column(self, name: str) -> Iterator[tuple[int, str]]:
         """Number and text of each frame that has a field of this name."""
         rows = self.frames.items()
         return ((i, frame[name]) for i, frame in rows if i < self.frame_count and name in frame)
 
-    def require_bytes(self) -> None:
-        """Raise if the file is too short for its images, before anything of their number is allocated.
-
-        Raises
-        ------
-        FileError
-        """
-        with open_regular(self.data) as stream:
-            length = self._seek(stream)
-        if self.encoding == "raw":
-            self._require_numbers(length // self.dtype.itemsize)
-        elif self.number_count * self.dtype.itemsize > _BYTES_OF_ONE[self.encoding] * length:
-            raise FileError(f"{self.path}: ends early: {self.frame_count} frames are not in {length} bytes")
-
-    def _seek(self, stream: BinaryIO) -> int:
-        """Go to the first byte of the pixels, and tell how many bytes there are from it on."""
-        length = stream.seek(0, 2)
-        size = self.number_count * self.dtype.itemsize
-        stream.seek(max(length - size, 0) if self.start < 0 else self.start)
-        for _ in range(self.text_lines):
-            stream.readline()
-        return length - stream.tell()
-
-    def _require_numbers(self, count: int) -> None:
-        if count < self.number_count:
-            whole = max(count, 0) * self.frame_count // self.number_count
-            raise FileError(f"{self.path}: ends early: {whole} of {self.frame_count} frames")
+    def values(self, name: str, count: int) -> FloatArray:
+        """Numbers of a field of each frame, shape (n, count); NaN where there are none that make sense."""
+        values = np.full((self.frame_count, count), np.nan)
+        for i, text in self.column(name):
+            with suppress(InvalidInputError):
+                values[i] = numbers(text, count, name)
+        return values
 
     def images(self) -> AnyArray:
         """Map or unpack all images, shape (frame, y, x).
@@ -173,20 +153,22 @@ class SequenceHeader:
         FileError
             If the file cannot be read, is damaged, or holds fewer.
         """
-        count, item_bytes = self.number_count, self.dtype.itemsize
+        count = math.prod(self.size) * self.channels
+        size, values = count * self.dtype.itemsize, np.zeros(0, self.dtype)
         with reading(self.path, DEFLATE.error), open_regular(self.data) as stream:
-            length = self._seek(stream)
+            length = stream.seek(0, 2)
+            start = max(length - size, 0) if self.start < 0 else self.start
+            stream.seek(start)
             if self.encoding == "text":
                 values = np.array(stream.read().split(), dtype=np.float64).astype(self.dtype)
-            elif self.encoding == "raw":
-                whole = min(length // item_bytes, count)
-                values = np.zeros(0, self.dtype)
-                if whole > 0:
-                    values = np.memmap(self.data, self.dtype, "r", stream.tell(), (whole,))
-            else:
+            elif self.encoding != "raw":
                 content = _unpack(stream.read(), self.encoding)
-                values = np.frombuffer(content, self.dtype, len(content) // item_bytes)
-        self._require_numbers(values.size)
+                values = np.frombuffer(content, self.dtype, len(content) // self.dtype.itemsize)
+            elif (whole := min(length - start, size) // self.dtype.itemsize) > 0:
+                values = np.memmap(self.data, self.dtype, "r", start, (whole,))
+        if values.size < count:
+            whole = values.size * self.frame_count // count
+            raise FileError(f"{self.path}: ends early: {whole} of {self.frame_count} frames")
         return values[:count].astype(self.dtype.newbyteorder("="), copy=False)
 
 
@@ -211,10 +193,9 @@ def read_header(path: PathLike) -> SequenceHeader:
         If it is neither, the header does not make sense, or its pixels lie outside its folder.
     """
     with reading(path, nrrd.NRRDError), open_regular(path) as stream, naming(str(path)):
-        start = stream.read(512)
+        start = stream.peek()
         if not is_image(start):
             raise InvalidInputError("expected a MetaImage or NRRD header, got something else")
-        stream.seek(0)
         is_nrrd = start.startswith(b"NRRD")
         return _header(Path(path), (nrrd_fields if is_nrrd else meta_fields)(stream), is_nrrd, stream.tell())
 
@@ -223,8 +204,7 @@ def _header(path: Path, words: dict[str, Any], is_nrrd: bool, start: int) -> Seq
     """Assign axes to image, frames and colours by their kinds; without kinds, as PLUS orders them."""
     sizes = tuple(map(int, words["sizes"]))
     kinds = [kind.lower() for kind in words.get("kinds", ())]
-    is_spatial = len(kinds) == 3 == len(sizes) and {*kinds} <= {"domain", "space"}
-    kinds = kinds if len(kinds) == len(sizes) else ["domain"] * len(sizes)
+    kinds = kinds if len(kinds) == len(sizes) else [""] * len(sizes)
     sides = [i for i, kind in enumerate(kinds) if kind in _SPACE]
     frame_axis = next((i for i, kind in enumerate(kinds) if kind in _TIME), None)
     colours = {*range(len(sizes))} - {*sides, frame_axis}
@@ -252,13 +232,13 @@ def _header(path: Path, words: dict[str, Any], is_nrrd: bool, start: int) -> Seq
         raise InvalidInputError(f"encoding: expected raw, gzip, bzip2 or text, got {words['encoding']!r}")
     file, byte_skip = words.get("data file", ""), words.get("byte skip", 0)
     data, start = (_data_file(path, file), 0) if file else (path, start)
-    times = None if frame_axis is None else _axis_times(words, frame_axis, sizes[frame_axis])
     return SequenceHeader(
         str(path), "NrrdImage" if is_nrrd else "MetaImage", fields, frames, size, spacing, sizes, frame_axis,
-        is_spatial and len(frames) < size[2],
-        math.prod(sizes[i] for i in colours if i is not None) * words.get("channels", 1), times, axes, origin,
+        len(sizes) == 3 and {*kinds} <= {"domain", "space"} and len(frames) < size[2],
+        math.prod(sizes[i] for i in colours if i is not None) * words.get("channels", 1),
+        None if frame_axis is None else _axis_times(words, frame_axis, sizes[frame_axis]), axes, origin,
         number_type(type_word, words.get("endian", "").lower() == "big"), data,
-        -1 if byte_skip < 0 else start + byte_skip, encoding, words.get("line skip", 0),
+        -1 if byte_skip < 0 else start + byte_skip, encoding,
     )  # fmt: skip
 
 
@@ -266,18 +246,17 @@ def _placement(words: Mapping[str, Any], count: int) -> tuple[FloatArray | None,
     """Steps along the axes and the place of the first pixel, where they are said; see `SequenceHeader`."""
     units = words.get("units", [])
     space_units = words.get("space units") or [unit for unit in units if s_per(unit) is None]
+    space = words.get("space", "").lower()  # as left-posterior-superior or LPS
+    is_against = [space.startswith("r"), "anterior" in space or space[1:2] == "a"]
     scale: FloatArray = mm_per("".join(space_units[:1])) * np.ones(max(count, 3))
-    space = words.get("space", "").lower()
-    letters = "".join(word[0] for word in space.split("-")) if "-" in space else space
-    scale[:2] *= [-1.0 if letters[:1] == "r" else 1.0, -1.0 if letters[1:2] == "a" else 1.0]
+    scale[:2] *= np.where(is_against, -1.0, 1.0)
     axes, origin = words.get("space directions"), words.get("space origin")
     if (steps := words.get("spacings")) is not None:
-        factors = [mm_per(unit) if s_per(unit) is None else 1.0 for unit in units]
-        axes = np.diag(steps * np.array(factors or 1.0))
+        axes = np.diag(
+            steps * np.array([mm_per(unit) if s_per(unit) is None else 1.0 for unit in units] or 1.0)
+        )
     elif axes is not None:
         axes = axes * scale[: axes.shape[1]]
-    if axes is not None and len(axes) != count:
-        raise InvalidInputError(f"expected a spacing for each of {count} axes, got {len(axes)}")
     if origin is not None:
         origin = origin * scale[: len(origin)]
     return axes, origin

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -17,7 +16,6 @@ from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.files import PathLike
 from speckle3d.core.streams import TimedPoses, TimedRotations
 from speckle3d.core.sweep import OrientationSensor, Tracker
-from speckle3d.io.carrier import CARRIER, carrier_share
 from speckle3d.io.frames import FileFrames, ReadFrame
 from speckle3d.io.hdf5 import reading
 from speckle3d.io.images.header_fields import is_image
@@ -40,11 +38,9 @@ from speckle3d.io.plus.transforms import (
 from speckle3d.io.plus.write import own_values
 from speckle3d.io.pose_paths import timed_poses
 from speckle3d.io.readers import Reader
-from speckle3d.io.recordings import CONTRADICTION, Facts, Recording, Value, differs
-from speckle3d.io.text import numbers
+from speckle3d.io.recordings import Facts, Recording, Value, differs
 
 _DEVICE, _PIXELS = "the device set", ("column_pitch_mm", "row_spacing_mm")
-_FREQUENCIES = ("demodulation_frequency_hz", "centre_frequency_hz", "sampling_rate_hz")
 
 
 def read_poses(path: PathLike, settings: ImportSettings | None = None) -> Tracker:
@@ -85,17 +81,13 @@ def open_sequence(path: Path, settings: ImportSettings) -> Facts:
     """
     sequence = _Sequence.of(path, settings)
     header, layout = sequence.header, sequence.layout
-    kinds = {"UltrasoundImageType": layout.kind, "UltrasoundImageOrientation": layout.orientation}
-    kind, orientation = (
-        word if name in header.fields else f"{word} (assumed)" for name, word in kinds.items()
-    )
     yield "container", header.container, ""
-    yield "size", _length_text(header.size), ""
-    yield "image type", kind, ""
-    yield "image orientation", orientation, ""
+    yield "size", _length_text(header.size) if header.has_images else "no images", ""
+    kinds = {"UltrasoundImageType": layout.kind, "UltrasoundImageOrientation": layout.orientation}
+    for name, word in kinds.items() if header.has_images else ():
+        words = name.removeprefix("Ultrasound").replace("Image", "image ").lower()
+        yield words, word if name in header.fields else f"{word} (assumed)", ""
     yield "transforms", ", ".join(names_of(header)) or "none", ""
-    if settings.plus_config is not None:
-        yield "device set", settings.plus_config, ""
     sequence.require_images()
     return sequence.recording()
 
@@ -135,7 +127,7 @@ class _Sequence:
         """Transform of this image's pixels to mm on the tracked tool."""
         names, poses = self.device.names, self.poses
         if (matrix := self.settings.image_to_probe) is not None:
-            return Value(np.asarray(matrix, dtype=float), "image_to_probe", "image_to_probe")
+            return Value(np.reshape(matrix, (4, 4)), "image_to_probe", "image_to_probe")
         if poses is not None and poses.pixels is not None:
             return Value(poses.pixels, f"{poses.chain[0]}Transform")
         tool = names.probe if poses is None else poses.tool
@@ -149,17 +141,19 @@ class _Sequence:
     def require_images(self) -> None:
         """Raise unless these are ultrasound images and the file is long enough for them."""
         header, path = self.header, self.header.path
-        if 0 in header.size or max(header.size[:2]) == 1:
-            use = ": the recording of a tracker, for --poses" if names_of(header) else ""
-            size = _length_text(header.size)
-            raise InvalidInputError(f"{path}: expected pixels of images, got images of size {size}{use}")
+        if not header.has_images:
+            use = f"a tracker's recording of {header.frame_count} frames, for --poses"
+            raise InvalidInputError(
+                f"{path}: expected pixels of images, got {use if names_of(header) else 'none'}"
+            )
         if header.is_volume and not self.settings.frame_rate_hz:
             raise InvalidInputError(
                 f"{path}: expected a sequence of images, got a volume, whose third axis is in space "
                 "by its Kinds; if it is time, say so by --frame-rate-hz"
             )
         self.layout.require_lines(header)
-        header.require_bytes()
+        if header.encoding == "raw":  # of packed ones the number shows when they are unpacked
+            header.numbers()
 
     def recording(self) -> Recording:
         """The recording, with all that header, settings and device set say."""
@@ -167,7 +161,7 @@ class _Sequence:
         return Recording(
             Path(header.path),
             settings,
-            _file_frames(header, self.frame_layout),
+            _file_frames(header, self.layout),
             self.values,
             time_s=self._times(),
             faults=self._image_faults(),
@@ -176,36 +170,18 @@ class _Sequence:
             chain=self._chain(),
             probe=settings.probe or own.get("probe") or self.device.text("TransducerName"),
             full_scale=own.get("full_scale", 255.0),
-            substitutes=dict.fromkeys(_PIXELS, "tracker_transform") if self.image_poses else {},
+            substitutes=dict.fromkeys(_PIXELS, "tracker_transform") if self.image_pose else {},
             assumptions=("parallel lines",) if self.layout.is_rf and not own else (),
             remarks=tuple(self._remarks()),
         )
 
     @cached_property
-    def image_poses(self) -> Poses | None:
-        """Poses by the file's own transform of the image in the world of the tool's."""
-        poses, names = self.poses, self.device.names
-        name = "none" if poses is None else f"{names.image}To{ends(poses.chain[-1])[1]}"
-        with suppress(InvalidInputError):  # where there is none that makes sense
-            return tracked_poses(self.header, name, "none", names)
-        return None
-
-    def _image_pose_remarks(self) -> Iterator[str]:
-        """Tell where the file's own transform of the image contradicts the chain that is used."""
-        poses, place, direct = self.poses, self.image_to_probe, self.image_poses
-        if poses is None or direct is None or direct.pixels is None:
-            return
-        name = f"{direct.tool}To{ends(direct.chain[-1])[1]}"
-        if place is None:
-            yield f"no place of the image on {poses.tool}: --transform {name} takes the file's own"
-            return
-        corners = np.array([[0.0, 0.0, 0.0, 1.0], [*self.header.size[:2], 0.0, 1.0]]).T
-        used, other = poses.matrices @ place.value @ corners, direct.matrices @ direct.pixels @ corners
-        is_valid = [not (a or b) for a, b in zip(poses.faults, direct.faults, strict=True)]
-        off_mm = np.linalg.norm(used - other, axis=1)[is_valid].max(initial=0.0)
-        if off_mm > CONTRADICTION * np.linalg.norm(np.diff(used)[0]):
-            words = f"{self._chain()}, which is used: --transform {name} takes the other"
-            yield f"{name} places images up to {off_mm:.3g} mm away from {words}"
+    def image_pose(self) -> str:
+        """The file's own transform of the image in the tool's world; empty where the tool's are enough."""
+        if self.poses is None or self.image_to_probe is not None:
+            return ""
+        name = f"{self.device.names.image}To{ends(self.poses.chain[-1])[1]}"
+        return name if name in names_of(self.header) else ""
 
     @cached_property
     def readings(self) -> tuple[TimedPoses | None, list[str]]:
@@ -224,21 +200,15 @@ class _Sequence:
 
         Stamps all the same are none.
         """
-        count = self.header.frame_count
-        stamps = np.full(count, np.nan)
-        for i, text in self.header.column("Timestamp"):
-            with suppress(InvalidInputError):
-                (stamps[i],) = numbers(text, 1, "Timestamp")
-        is_clock = np.unique(stamps[np.isfinite(stamps)]).size >= min(2, count)
+        stamps = self.header.values("Timestamp", 1)[:, 0]
+        is_clock = np.unique(stamps[np.isfinite(stamps)]).size >= min(2, stamps.size)
         return stamps if is_clock else self.header.axis_times_s
 
     def _image_faults(self) -> list[str]:
         """Why each image is of no use; older files of PLUS tell it in Status alone."""
-        faults = [""] * self.header.frame_count
-        for name in ("ImageStatus", "Status"):
-            for i, status in self.header.column(name):
-                faults[i] = faults[i] if status == "OK" else "not valid by their status"
-        return faults
+        statuses = dict(self.header.column("Status")) | dict(self.header.column("ImageStatus"))
+        is_valid = (statuses.get(i, "OK") == "OK" for i in range(self.header.frame_count))
+        return ["" if valid else "not valid by their status" for valid in is_valid]
 
     @cached_property
     def spacing_mm(self) -> tuple[float, ...] | None:
@@ -282,18 +252,6 @@ class _Sequence:
         own = {name: Value(number, "as this package wrote it") for name, number in self.own_values.items()}
         return values | own
 
-    @cached_property
-    def frame_layout(self) -> Layout:
-        """Layout by which frames are turned: with the other sign of Q where their phase runs backwards."""
-        demodulation, centre, rate = (
-            getattr(self.settings, name) or self.values.get(name, Value()).value for name in _FREQUENCIES
-        )
-        if not self.layout.is_complex or demodulation or not (centre and rate):
-            return self.layout
-        # Depth runs backwards in lines that are stored from the far end on, and so does their phase.
-        share = carrier_share(_file_frames(self.header, self.layout), centre, rate)
-        return replace(self.layout, conjugate=share is not None and share <= -CARRIER[0])
-
     def _chain(self) -> str:
         """Transforms that lead from the image, or the tool, to the world."""
         if (poses := self.poses) is None:
@@ -304,8 +262,8 @@ class _Sequence:
 
     def _tracker(self) -> Tracker | None:
         """The tracker, with the image's place on it."""
-        readings, _ = self.readings
-        if readings is None or (transform := self.image_to_probe) is None:
+        readings, transform = self.readings[0], self.image_to_probe
+        if readings is None or transform is None:
             return None if readings is None else Tracker(readings)
         first_mm = self.settings.first_sample_depth_mm
         if first_mm is None:
@@ -334,10 +292,11 @@ class _Sequence:
         if size.value and spacing and not self.own_values and differs(size.value, spacing):
             text = f"{_length_text(size.value)} mm, {size.source}"
             yield f"pixels of {text}: the file says {_length_text(spacing)}"
-        if self.frame_layout.conjugate:
-            yield "Q has the other sign in the file, as its phase tells: turned"
+        if " -" in f" {header.fields.get('ElementSpacing')}":
+            yield "ElementSpacing: a negative one is read by its size"
         yield from self.readings[1]
-        yield from self._image_pose_remarks()
+        if self.image_pose:
+            yield f"no place of the image on the tool: --transform {self.image_pose} takes the file's own"
         if self.poses is None and names_of(header) and self.settings.tracker_transform is None:
             yield f"no tracker: the header's transforms are {lacking_poses(header.path)}"
         if len(header.frames) not in (0, header.frame_count):
@@ -346,18 +305,13 @@ class _Sequence:
             is_picture = not (layout.is_rf or layout.has_lines_in_rows)
             meaning = "images are taken for scan-converted" if is_picture else "its lines spread"
             yield f"the device set calls the transducer {device.geometry}: {meaning}"
-        if device.clip is not None and device.clip.is_part_of(header.size):
-            yield f"the device set clips images for volumes, as `speckle3d volume` does: {device.clip}"
-        if header.is_volume:
-            yield "third axis is time, as the frame rate that is given says: by its Kinds it is in space"
 
 
 def _file_frames(header: SequenceHeader, layout: Layout) -> FileFrames:
     """Frames of the pixels' type; RF of wider numbers than int16 as float32."""
     dtype, narrow = header.dtype.newbyteorder("="), None
     if layout.is_complex:
-        is_narrow = dtype == np.int16 and not layout.conjugate  # the opposite of -32768 is none
-        dtype, narrow = np.dtype(np.complex64), dtype if is_narrow else None
+        dtype, narrow = np.dtype(np.complex64), dtype if dtype == np.int16 else None
     elif layout.is_rf and dtype != np.int16:
         dtype = np.dtype(np.float32)
     shape = (header.frame_count, *layout.shape(header.size))

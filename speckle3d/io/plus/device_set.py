@@ -11,7 +11,6 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property, reduce
 from pathlib import Path
@@ -52,16 +51,10 @@ def read_xml(path: PathLike) -> Element:
     Raises
     ------
     FileError
-        If the file cannot be read.
-    InvalidInputError
-        If it is no XML.
+        If the file cannot be read, or is no XML.
     """
-    with reading(path), open_regular(path) as stream:
-        text = stream.read()
-    try:
-        return ElementTree.fromstring(text)
-    except (ElementTree.ParseError, ValueError, LookupError) as error:
-        raise InvalidInputError(f"{path}: expected well-formed XML, got: {error}") from error
+    with reading(f"{path}: as XML", ElementTree.ParseError), open_regular(path) as stream:
+        return ElementTree.parse(stream).getroot()
 
 
 def vector(element: Element, attribute: str, count: int) -> tuple[float, ...]:
@@ -69,58 +62,6 @@ def vector(element: Element, attribute: str, count: int) -> tuple[float, ...]:
     label = element.get("Name") or element.get("From") or ""
     where = f"{element.tag}{f' {label}' if label else ''}: {attribute}"
     return numbers(element.get(attribute, ""), count, where)
-
-
-@dataclass(frozen=True)
-class Clip:
-    """The part of the images that PLUS puts into volumes, in pixels of the standard orientation.
-
-    Attributes
-    ----------
-    rectangle : tuple of float, optional
-        Left, top, right and bottom.
-    fan : tuple of float, optional
-        Column and row of the apex, the radii, and the angles in degrees from straight down.
-    """
-
-    rectangle: tuple[float, ...] | None = None
-    fan: tuple[float, ...] | None = None
-
-    def __str__(self) -> str:
-        parts = {
-            "columns {0:g} to {2:g}, rows {1:g} to {3:g}": self.rectangle,
-            "fan about {:g}, {:g} from {:g} to {:g} pixels, {:g} to {:g} degrees": self.fan,
-        }
-        return "; ".join(text.format(*part) for text, part in parts.items() if part is not None)
-
-    def is_part_of(self, size: tuple[int, ...]) -> bool:
-        """Whether something of images of a size (x, y) is left out."""
-        left, top, right, bottom = self.rectangle or (0, 0, *size[:2])
-        return self.fan is not None or max(left, top, size[0] - 1 - right, size[1] - 1 - bottom) > 0
-
-    def region_text(self, grid: ImageGrid) -> str | None:
-        """The part as a region of images in mm; None where it is all of them."""
-        if not self.is_part_of((grid.vectors, grid.samples)):
-            return None
-        matrix = grid.image_from_sample[:2]
-        outlines = (pixels @ matrix[:, :2].T + matrix[:, 2] for pixels in self._outlines())
-        return " and ".join(
-            "polygon " + " ".join(f"{x:.6f},{y:.6f}" for x, y in outline) for outline in outlines
-        )
-
-    def _outlines(self) -> Iterator[FloatArray]:
-        """Polygons in pixels, shape (corner, 2), whose common part it is."""
-        if self.rectangle is not None:
-            left, top, right, bottom = np.add(self.rectangle, [-_HAIR, -_HAIR, _HAIR, _HAIR])
-            yield np.array([(left, top), (right, top), (right, bottom), (left, bottom)])
-        if self.fan is not None:
-            x, y, inner, outer, first, stop = self.fan
-            angles = np.deg2rad(np.linspace(first, stop, _ARC_POINTS))
-            arc = np.column_stack([np.sin(angles), np.cos(angles)])
-            outline = np.concatenate([outer * arc, inner * arc[::-1]])
-            # PLUS moves both halves a pixel towards the middle (vtkIGSIOPasteSliceIntoVolume).
-            outline[:, 0] -= (1 - _HAIR) * np.sign(outline[:, 0])
-            yield np.add(outline, [x, y])
 
 
 @dataclass(frozen=True)
@@ -187,24 +128,37 @@ class DeviceSet:
         values = [self.numbers("ScanConversion", 1, name) or () for name in names]
         return sum(values, ()) if all(values) else None
 
-    @cached_property
-    def clip(self) -> Clip | None:
-        """Clip and fan of a volume reconstruction; names without a unit are those of older versions [1]_."""
+    def clip_region(self, grid: ImageGrid) -> str | None:
+        """Clip and fan of a volume reconstruction as a region of images in mm; None where it is all of them.
+
+        Names without a unit are those of older versions [1]_.
+        """
 
         def numbers(count: int, *names: str) -> tuple[float, ...] | None:
             return self.numbers("VolumeReconstruction", count, *names)
 
-        rectangle = fan = None
+        outlines = list[FloatArray]()
         corner, size = numbers(2, "ClipRectangleOrigin"), numbers(2, "ClipRectangleSize")
         if corner is not None and size is not None and min(size) > 0:
             # PLUS counts the pixel behind the rectangle, too (vtkIGSIOPasteSliceIntoVolume).
-            rectangle = (*corner, *np.add(corner, size).tolist())
+            (left, top), (right, bottom) = corner, np.add(corner, size)
+            if max(left, top, grid.vectors - 1 - right, grid.samples - 1 - bottom) > 0:
+                corners = np.array([(left, top), (right, top), (right, bottom), (left, bottom)])
+                outlines.append(corners + _HAIR * np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]))
         angles, apex = numbers(2, "FanAnglesDeg", "FanAngles"), numbers(2, "FanOriginPixel", "FanOrigin")
         outer = numbers(1, "FanRadiusStopPixel", "FanDepth")
         if angles and apex and outer and angles[0] != angles[1]:
             inner = numbers(1, "FanRadiusStartPixel", "FanRadiusStart") or (0.0,)
-            fan = (*apex, *inner, *outer, *sorted(angles))
-        return None if rectangle is fan is None else Clip(rectangle, fan)
+            turns = np.deg2rad(np.linspace(min(angles), max(angles), _ARC_POINTS))
+            arc = np.column_stack([np.sin(turns), np.cos(turns)])
+            outline = np.concatenate([outer * arc, inner * arc[::-1]])
+            # PLUS moves both halves a pixel towards the middle.
+            outline[:, 0] -= (1 - _HAIR) * np.sign(outline[:, 0])
+            outlines.append(apex + outline)
+        matrix = grid.image_from_sample[:2]
+        polygons = (pixels @ matrix[:, :2].T + matrix[:, 2] for pixels in outlines)
+        texts = (" ".join(f"{x:.6f},{y:.6f}" for x, y in polygon) for polygon in polygons)
+        return " and ".join(f"polygon {text}" for text in texts) or None
 
     def transform(self, start: str, end: str) -> FloatArray | None:
         """Product of the transforms, or their inverses, on the shortest way between two frames, if any."""
@@ -245,12 +199,8 @@ def read_device_set(path: PathLike) -> DeviceSet:
 def _open(path: Path, _: ImportSettings) -> Facts:
     """Describe a document; it holds no sweep."""
     device = DeviceSet(str(path), read_xml(path))
-    root = device.root
-    if root.tag not in _DOCUMENTS:
-        tags = ", ".join(_DOCUMENTS)
-        raise InvalidInputError(f"{path}: expected a document of PLUS ({tags}), got {root.tag}")
-    content, use = _DOCUMENTS[root.tag]
-    pixel, clip = device.pixel_mm(), str(device.clip or "none")  # a fault in them is one of the document
+    root, pixel = device.root, device.pixel_mm()
+    content, use = _DOCUMENTS.get(root.tag, (root.tag, "nothing here"))
     yield "content", content, ""
     if root.tag == "TemporalCalibrationResults":  # whose sign is the other way round: a lag is negative there
         yield "time offset of the tracker", f"{-vector(root, 'TrackerLagSec', 1)[0]:+.4f}", "s"
@@ -260,7 +210,6 @@ def _open(path: Path, _: ImportSettings) -> Facts:
             yield f"{a} to {b}", "transform", ""
         yield "pixel", "unknown" if pixel is None else " x ".join(f"{mm:.5f} mm" for mm in pixel), ""
         yield "transducer", transducer.strip() or "not said", ""
-        yield "clip of volumes", clip, ""
         if root.find(".//PhantomDefinition/Geometry/Pattern/Wire") is not None:
             use += ", --phantom of calibrate wires"
     yield "for", use, ""

@@ -33,13 +33,10 @@ class Layout:
         (a line of I, a line of Q).
     orientation : str
         As MF: columns to the marked side, rows away from the probe.
-    conjugate : bool
-        Whether Q has the other sign in the file.
     """
 
     kind: str
     orientation: str
-    conjugate: bool = False
 
     @classmethod
     def of(cls, header: SequenceHeader, machine: str | None = None) -> Layout:
@@ -78,12 +75,11 @@ class Layout:
         InvalidInputError
         """
         path, size, dtype = header.path, header.size, header.dtype.newbyteorder("=")
-        if header.channels > 1 or self.kind not in (*RF_TYPES, "BRIGHTNESS"):
-            kind = (
-                f"colour, {header.channels} numbers a pixel" if header.channels > 1 else f"type {self.kind}"
-            )
+        colours = f"colour, {header.channels} numbers a pixel" if header.channels > 1 else ""
+        if colours or self.kind not in (*RF_TYPES, "BRIGHTNESS"):
             raise InvalidInputError(
-                f"{path}: expected grey B-mode or RF images, got {kind}: export them as grey"
+                f"{path}: expected grey B-mode or RF images, got {colours or f'type {self.kind}'}: "
+                "export them as grey"
             )
         if self.kind == "BRIGHTNESS" and dtype != np.uint8:
             raise InvalidInputError(f"{path}: expected B-mode of type uint8, got {dtype}")
@@ -100,9 +96,7 @@ class Layout:
         lines = pixels if self.has_lines_in_rows else pixels.T
         if self.is_complex:
             pairs = np.moveaxis(lines, self._pair_axis, 0)
-            analytic = pairs[0::2].astype(np.complex64)
-            analytic.imag = pairs[1::2]
-            lines = np.moveaxis(analytic.conj() if self.conjugate else analytic, 0, self._pair_axis)
+            lines = np.moveaxis(pairs[0::2] + np.complex64(1j) * pairs[1::2], 0, self._pair_axis)
         lines = lines[:, ::-1] if "N" in self.orientation[:2] else lines
         return lines[::-1] if "U" in self.orientation[:2] else lines
 

@@ -17,7 +17,6 @@ from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.geometry import nearest_rotation
 from speckle3d.io.images.headers import SequenceHeader
-from speckle3d.io.pose_paths import rigid
 from speckle3d.io.text import numbers
 
 Pair: TypeAlias = tuple[str, str]
@@ -28,7 +27,7 @@ SKEW_TOLERANCE = 0.1
 published calibrations reach 0.05, an error of the calibration and not of the image."""
 
 _FIXED_TOLERANCE = 1e-4
-"""How far entries of a transform that all frames share may differ: six written digits of tens of mm."""
+"""How far entries of a transform that all frames share may differ, mm and share: six written digits."""
 
 IMAGE = "Image"
 ORIENTATION = "OrientationSensor"
@@ -111,7 +110,7 @@ def tracked_poses(
         raise InvalidInputError(f"{header.path}: expected a chain of transforms for {wanted}, got {listing}")
     matrices, faults = np.eye(4), [""] * header.frame_count
     for pair in chain:
-        step, reasons = _column(header, *pair, is_rigid=names.image not in pair)
+        step, reasons = _column(header, *pair)
         matrices, faults = step @ matrices, [a or b for a, b in zip(faults, reasons, strict=True)]
     pixels = None
     if tool == names.image:
@@ -144,15 +143,9 @@ def fixed_transform(header: SequenceHeader, name: str) -> FloatArray | None:
         return np.reshape(numbers(header.fields[key], 16, f"{header.path}: {key}"), (4, 4))
     matrices, faults = _column(header, *ends(name))
     matrices = matrices[[not fault for fault in faults]]
-    if not len(matrices):
-        return None
-    off = np.ptp(matrices, axis=0).max()
-    if off > _FIXED_TOLERANCE * max(1.0, np.abs(matrices).max()):
-        raise InvalidInputError(
-            f"{header.path}: {key}: expected one for all frames, got some {off:.3g} apart"
-        )
-    first: FloatArray = matrices[0]
-    return first
+    if not np.allclose(matrices, matrices[:1], _FIXED_TOLERANCE, _FIXED_TOLERANCE):
+        raise InvalidInputError(f"{header.path}: {key}: expected one for all frames, got others")
+    return next(iter(matrices), None)
 
 
 def pixel_axes(matrix: FloatArray, where: str) -> tuple[float, float]:
@@ -163,8 +156,6 @@ def pixel_axes(matrix: FloatArray, where: str) -> tuple[float, float]:
     InvalidInputError
         If the matrix is no such transform.
     """
-    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
-        raise InvalidInputError(f"{where}: expected a finite 4x4 matrix, got shape {matrix.shape}")
     column, row = np.linalg.norm(matrix[:3, :2], axis=0).tolist()
     if not min(column, row) > 0:
         raise InvalidInputError(f"{where}: expected axes of some length, got zero")
@@ -255,24 +246,15 @@ def _usual_pose(transforms: Sequence[str], names: Names) -> str | None:
     return None
 
 
-def _column(
-    header: SequenceHeader, start: str, end: str, is_rigid: bool = False
-) -> tuple[FloatArray, list[str]]:
+def _column(header: SequenceHeader, start: str, end: str) -> tuple[FloatArray, list[str]]:
     """Read one transform of every frame, either way round; the identity where it is not valid, and why."""
     key, back = (f"{_joined(pair)}Transform" for pair in ((start, end), (end, start)))
     is_back = not any(header.column(key))
     key = back if is_back else key
-    matrices = np.tile(np.eye(4), (header.frame_count, 1, 1))
-    faults, statuses = ["without a valid pose"] * len(matrices), dict(header.column(f"{key}Status"))
-    for i, text in header.column(key):
-        if statuses.get(i, "OK") == "OK":
-            try:
-                matrices[i], faults[i] = np.reshape(numbers(text, 16, key), (4, 4)), ""
-            except InvalidInputError:
-                faults[i] = "whose pose is not 16 finite numbers"
-    if is_rigid:
-        matrices, reasons = rigid(matrices)
-        faults = [a or b for a, b in zip(faults, reasons, strict=True)]
+    matrices, statuses = header.values(key, 16).reshape(-1, 4, 4), dict(header.column(f"{key}Status"))
+    is_valid = np.isfinite(matrices[:, 0, 0]) & [statuses.get(i, "OK") == "OK" for i in range(len(matrices))]
+    matrices[~is_valid] = np.eye(4)
+    faults = np.where(is_valid, "", "without a valid pose").tolist()
     return np.asarray(np.linalg.pinv(matrices)) if is_back else matrices, faults
 
 
@@ -290,8 +272,12 @@ def _image_poses(
     usual = matrices[valid[np.argsort(widths)[widths.size // 2]]]
     _, skew_rad = sensor_from_image(usual, 0.0, where)  # refuses what is no calibration
     pixels = image_matrix(RigidTransform.identity(), *pixel_axes(usual, where), 0.0, skew_rad)
-    poses = matrices.copy()
-    across = np.cross(poses[:, :3, 0], poses[:, :3, 1])
-    # The third column, which may be anything, becomes that of a plane's pixels.
-    poses[:, :3, 2] = across * (pixels[2, 2] / np.linalg.norm(np.cross(pixels[:3, 0], pixels[:3, 1])))
-    return poses @ np.linalg.inv(pixels), pixels
+    return _in_space(matrices) @ np.linalg.inv(_in_space(pixels)), pixels
+
+
+def _in_space(matrices: FloatArray) -> FloatArray:
+    """Transforms of pixels whose third column, which may be anything, is across the other two."""
+    across = np.cross(matrices[..., :3, 0], matrices[..., :3, 1])
+    result = matrices.copy()
+    result[..., :3, 2] = across
+    return result

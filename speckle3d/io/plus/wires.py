@@ -23,8 +23,7 @@ from speckle3d.core.geometry import transforms_from_matrices
 from speckle3d.core.wires import WirePhantom
 from speckle3d.io.plus.device_set import DeviceSet, read_xml, vector
 
-_PATTERN_WIRES = {"NWire": 3, "CoplanarParallelWires": None}
-"""How many wires a pattern of each type has."""
+_PATTERNS = ("NWire", "CoplanarParallelWires")
 
 
 @dataclass(frozen=True)
@@ -69,15 +68,13 @@ def read_wire_phantom(path: PathLike) -> WireConfig:
 
 
 def _phantom(device: DeviceSet) -> WirePhantom:
-    names: list[str] = []
-    ends, patterns = [], []
+    names, ends, patterns = list[str](), [], []
     for number, pattern in enumerate(device.root.iterfind(".//PhantomDefinition/Geometry/Pattern")):
         kind, wires = pattern.get("Type", ""), pattern.findall("Wire")
-        count = _PATTERN_WIRES.get(kind) or len(wires) or "some"
-        if kind not in _PATTERN_WIRES or len(wires) != count:
+        if kind not in _PATTERNS or (kind == "NWire" and len(wires) != 3):
             raise InvalidInputError(
-                f"Pattern[{number}]: expected Type {' or '.join(_PATTERN_WIRES)} with {count} elements "
-                f"Wire, got {kind!r} with {len(wires)}"
+                f"Pattern[{number}]: expected an NWire of three elements Wire, or CoplanarParallelWires, got "
+                f"{kind!r} with {len(wires)}"
             )
         patterns.append(tuple(range(len(names), len(names) + len(wires))))
         for i, wire in enumerate(wires):

@@ -50,15 +50,13 @@ def test_spacing_of_rf_gives_pitch_and_sampling_rate(tmp_path):
     np.testing.assert_array_equal(frames_of(sweep), rf)
 
 
-@pytest.mark.parametrize(
-    ("orientation", "kind", "sign"), [("FM", "RF_I_LINE_Q_LINE", -1), ("NM", "RF_IQ_LINE", 1)]
-)
-def test_i_and_q_become_an_analytic_signal_of_positive_frequency(tmp_path, orientation, kind, sign):
+@pytest.mark.parametrize(("orientation", "kind"), [("FM", "RF_I_LINE_Q_LINE"), ("NM", "RF_IQ_LINE")])
+def test_i_and_q_become_an_analytic_signal(tmp_path, orientation, kind):
     settings = given_over(RF, demodulation_frequency_hz=0.0)
     signal = np.round(1000 * np.exp(0.6j * np.arange(64)) * np.arange(1, 4)[:, None])
     lines = signal[:, ::-1] if orientation == "NM" else signal
     axis = 1 if kind == "RF_I_LINE_Q_LINE" else 2
-    pairs = np.stack([lines.real, sign * lines.imag], axis)
+    pairs = np.stack([lines.real, lines.imag], axis)
     pixels = pairs.reshape(1, *((6, 64) if axis == 1 else (3, 128))).astype(np.int16)
     fields = {"UltrasoundImageOrientation": orientation, "UltrasoundImageType": kind}
     sweep = load_sweep(write_mha(tmp_path / "a.mha", pixels, fields), settings)
@@ -142,10 +140,9 @@ def test_the_tool_is_what_the_image_is_on(tmp_path):
     for frame, pose in zip(frames, true.as_matrix(), strict=True):
         frame["ArmToTrackerTransform"] = frame.pop("ProbeToTrackerTransform")
         frame["ImageToArmTransform"] = text_of(pixels)
-        frame["ImageToTrackerTransform"] = text_of(matrix_at(7) @ pose @ pixels)
+        frame["ImageToTrackerTransform"] = text_of(pose @ pixels)
     recording = recording_of(tmp_path, frames)
     assert recording.chain == "ImageToArm * ArmToTracker"
-    assert "up to 7 mm away" in "".join(recording.notes)
     np.testing.assert_allclose(pose_matrices(recording.sweep), true.as_matrix(), atol=1e-9)
 
 

@@ -135,5 +135,5 @@ def test_the_clip_of_volumes_is_that_of_plus(tmp_path):
     for text, angles in (("", None), (fan, (380, 20, 120, 360, -45, 45))):
         device = read_device_set(write_set(tmp_path / "set.xml", scan=clip.format(text)))
         expected = Clip((192, 612), (16, 596), angles).mask(820, 616).T
-        mask = Region(device.clip.region_text(grid)).mask(grid)
+        mask = Region(device.clip_region(grid)).mask(grid)
         assert (mask != expected).mean() < (0.0003 if angles else 1e-9)
