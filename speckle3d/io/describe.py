@@ -12,7 +12,6 @@ from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.files import PathLike
 from speckle3d.core.labels import LabelMap
-from speckle3d.core.printable import printable
 from speckle3d.core.sweep import BModeSettings, RFSettings, Sweep, stored_dtype
 from speckle3d.io import calibrations, curves, reconstructions
 from speckle3d.io.calibrations import read_calibration
@@ -152,7 +151,7 @@ def _volume_rows(path: PathLike) -> Iterator[Row]:
     for axis, direction in zip("ijk", volume.world_from_grid.rotation.as_matrix().T, strict=True):
         yield f"direction of {axis} (LPS)", _list_text(direction), ""
     for name, text in volume.fields.items():
-        yield printable(name), text, ""
+        yield name, text, ""
     if isinstance(volume, LabelMap):
         for segment in volume.segments:
             count = np.count_nonzero(volume.voxels == segment.value)

@@ -33,7 +33,6 @@ from scipy.integrate import cumulative_trapezoid
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import FileError, InvalidInputError, naming
-from speckle3d.core.printable import printable
 from speckle3d.io.clarius.imu import SensorSamples, read_samples
 from speckle3d.io.clarius.package import find_files, is_package
 from speckle3d.io.clarius.raw import SAMPLES, open_frames, open_raw
@@ -69,7 +68,7 @@ def open_package(path: Path, settings: ImportSettings) -> Facts:
     files = find_files(path)
     if path.suffix == ".tgc":  # which tells nothing without samples
         files.require_samples()
-    yield "recording", printable(files.name) or "without a name", ""
+    yield "recording", files.name or "without a name", ""
     sensor, remarks = None, list[str]()
     if "imu" in files.yml:
         try:
@@ -81,7 +80,7 @@ def open_package(path: Path, settings: ImportSettings) -> Facts:
     fields = {kind: yml_fields(file.text(), file.where) for kind, file in files.yml.items() if kind != "imu"}
     for kind, texts in fields.items():
         facts = ((name, texts[name]) for name in _FACTS if texts.get(name))
-        yield from ((f"{kind}: {name}", printable(str(text)[:60]), "") for name, text in facts)
+        yield from ((f"{kind}: {name}", str(text)[:60], "") for name, text in facts)
     files.require_samples()
     descriptions = {kind: validated(fields[kind], files.yml[kind].where, Description) for kind in files.raw}
     kind = min(files.raw, key=lambda kind: _ORDER.index(descriptions[kind].kind))

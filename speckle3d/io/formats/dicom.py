@@ -22,7 +22,6 @@ from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.extras import extra_module
 from speckle3d.core.files import open_regular
-from speckle3d.core.printable import printable
 from speckle3d.io.frames import FileFrames, ReadFrame
 from speckle3d.io.hdf5 import reading
 from speckle3d.io.import_settings import ImportSettings
@@ -95,12 +94,12 @@ def open_dicom(path: Path, settings: ImportSettings) -> Facts:
         for _ in header.iterall():  # elements are read from their bytes when first asked for
             pass
     machine = " ".join(str(header[name].value) for name in _MACHINE if name in header)
-    yield "scanner", printable(machine) or "not named", ""
-    yield "transfer syntax", printable(syntax), ""
+    yield "scanner", machine or "not named", ""
+    yield "transfer syntax", syntax, ""
     for name, expected in _EXPECTED.items():
         if (value := header.get(name)) not in expected:
             words = " or ".join(map(str, expected))
-            raise InvalidInputError(f"{name}: expected {words}, got {printable(str(value))}")
+            raise InvalidInputError(f"{name}: expected {words}, got {value}")
     count = int(_numbers(header, "NumberOfFrames")[0]) if "NumberOfFrames" in header else 1
     if count < 2:
         raise InvalidInputError("NumberOfFrames: expected several frames, got a single image")
@@ -226,7 +225,7 @@ def _numbers(item: Any, *names: str) -> list[float]:
         except (TypeError, ValueError):
             numbers.append(np.nan)
         if not np.isfinite(numbers).all():
-            raise InvalidInputError(f"{name}: expected numbers, got {printable(str(item.get(name)))}")
+            raise InvalidInputError(f"{name}: expected numbers, got {item.get(name)}")
     return numbers
 
 

@@ -31,7 +31,6 @@ import numpy as np
 from speckle3d.core.arrays import AnyArray, FloatArray
 from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.geometry import require_finite
-from speckle3d.core.printable import printable
 from speckle3d.core.sweep import Frames
 from speckle3d.io.formats.hdf5_values import Turn, frame_of, text_of
 from speckle3d.io.frames import HDF5Slices
@@ -64,7 +63,7 @@ def open_matlab(path: Path, settings: ImportSettings) -> Facts:
     """Read the arrays that a mapping names; without one, list the arrays and what to write."""
     variables: Any = open_hdf5(path) if _is_new(first_bytes(path)) else _variables(path)
     largest = sorted(_arrays(variables), key=lambda row: -int(np.prod(row[1].shape)))[:_MOST_ARRAYS]
-    rows = [(printable(name), _size(node), _kind(node)) for name, node in largest]
+    rows = [(name, _size(node), _kind(node)) for name, node in largest]
     yield from ((f"array {name}", size, kind) for name, size, kind in rows)
     arrays, where = settings.arrays, f"{path}: arrays"
     if unknown := sorted({*arrays} - {*_ROLES, *_POSITIONS, *ImportSettings.model_fields, "axes"}):
@@ -116,8 +115,8 @@ def _array(variables: Any, name: str) -> Any:
     for target in (plain, re.sub(r"[({]1[)}]", "", plain)):
         if (node := dict(_arrays(variables, target)).get(target)) is not None:
             return node
-    names = ", ".join(printable(label) for label, _ in _arrays(variables)) or "none"
-    raise InvalidInputError(f"expected an array {printable(name)}, got {names}")
+    names = ", ".join(label for label, _ in _arrays(variables)) or "none"
+    raise InvalidInputError(f"expected an array {name}, got {names}")
 
 
 def _arrays(node: Any, target: str = "", name: str = "") -> Iterator[tuple[str, Any]]:
@@ -198,7 +197,7 @@ def _axes(text: str, node: Any) -> tuple[dict[str, int], list[str]]:
     if not has_all or len(sizes) > len(names) or any(name == "-" and size > 1 for name, size in axes):
         raise InvalidInputError(
             f"axes: expected sample, vector, frame once each, and - for axes of length 1, of {_size(node)}, "
-            f"got {printable(text) or 'none'}"
+            f"got {text or 'none'}"
         )
     return {"frame": 1} | dict(axes), names[: node.ndim][::-1]
 
@@ -256,10 +255,10 @@ def _product(variables: Any, name: str, text: str) -> FloatArray:
     parts = _TERM.fullmatch(text.strip())
     factor = float(parts["factor"] or 1.0) if parts else 0.0
     if parts is None or not factor:
-        raise InvalidInputError(f"{name}: expected as NAME, NAME * 1e6 or NAME / 2, got {printable(text)}")
+        raise InvalidInputError(f"{name}: expected as NAME, NAME * 1e6 or NAME / 2, got {text}")
     values = np.asarray(_array(variables, parts["name"])[()])
     if values.dtype.kind not in "fiu" or (name != "time_s" and not np.isfinite(values).all()):
-        raise InvalidInputError(f"{name} = {printable(text)}: expected finite numbers, got others")
+        raise InvalidInputError(f"{name} = {text}: expected finite numbers, got others")
     flat = values.astype(np.float64).ravel()
     return flat / factor if parts["sign"] == "/" else flat * factor
 

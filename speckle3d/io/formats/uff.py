@@ -24,7 +24,6 @@ import h5py
 import numpy as np
 
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.core.printable import printable
 from speckle3d.io.carrier import demodulation_of
 from speckle3d.io.formats.hdf5_values import (
     band_about,
@@ -61,7 +60,7 @@ def is_uff(file: h5py.File) -> bool:
 
 def _objects(file: h5py.File) -> dict[str, str]:
     """Classes of the root's groups, by their names."""
-    nodes = {printable(str(name)): find_member(file, name) for name in file}
+    nodes = {str(name): find_member(file, name) for name in file}
     kinds = {name: text_of(node.attrs.get("class")) for name, node in nodes.items() if node is not None}
     return {name: kind for name, kind in kinds.items() if kind}
 

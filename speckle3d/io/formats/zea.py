@@ -28,7 +28,6 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import FileError, InvalidInputError
-from speckle3d.core.printable import printable
 from speckle3d.core.sweep import Tracker
 from speckle3d.io.carrier import demodulation_of
 from speckle3d.io.formats.hdf5_values import (
@@ -88,7 +87,7 @@ def _arrays(file: h5py.File, kinds: Sequence[str]) -> list[tuple[str, str, str]]
 def open_zea(file: h5py.File, settings: ImportSettings) -> Facts:
     """Read beamformed RF or I/Q, else an envelope, else images; with the probe's poses."""
     path = Path(file.filename)
-    members = [f"{home}data/{printable(name)}" for home in _homes(file) for name in file[f"{home}data"]]
+    members = [f"{home}data/{name}" for home in _homes(file) for name in file[f"{home}data"]]
     contents = ", ".join(members)
     if any(name.endswith(_CHANNEL_DATA) for name in members):
         contents += ": channel data need beamforming, by zea's Pipeline, and its result written"
