@@ -52,16 +52,14 @@ def require_own_place(out: Path, kind: str, *inputs: Path) -> None:
     InvalidInputError
         If it is taken.
     """
-    from speckle3d.io.hdf5 import require_suffix, require_target
+    from speckle3d.io.hdf5 import LABELS_ALONE, require_suffix, require_target
     from speckle3d.io.shapes import SUFFIXES as SURFACES
     from speckle3d.io.voxels.volume_writer import SUFFIXES as VOLUMES
-    from speckle3d.io.voxels.volume_writer import volume_suffix
 
     target, kinds = require_target(out), kind.split()
-    suffixes = {"picture": (".png",), "surface": SURFACES, "volume": VOLUMES}
-    endings = [suffix for name in kinds for suffix in suffixes.get(name, ())]
-    if endings and require_suffix(out, endings) in VOLUMES:
-        volume_suffix(out, "labels" in kinds)
+    suffixes = {"picture": (".png",), "surface": SURFACES, "volume": VOLUMES, "labels": (LABELS_ALONE,)}
+    if endings := [suffix for name in kinds for suffix in suffixes.get(name, ())]:
+        require_suffix(out, endings)
     targets = [target]
     if kind == "calibration":
         from speckle3d.calibrating.written import BESIDE

@@ -61,7 +61,9 @@ class FileFrames:
     def __len__(self) -> int:
         return self.shape[0]
 
-    def __getitem__(self, index: int) -> AnyArray:
+    def __getitem__(self, index: int | slice) -> AnyArray:
+        if isinstance(index, slice):
+            return np.stack([self[i] for i in range(*index.indices(len(self)))])
         i = self.numbers[operator.index(index)]
         where = f"{self.path}: frame {i}"
         with self._lock, reading(where), naming(where):

@@ -52,6 +52,9 @@ _READ_ATTEMPTS = 20
 _CHUNK_CACHE_BYTES = 32 * 2**20
 """Room for files whose chunks span several frames."""
 
+LABELS_ALONE = ".seg.nrrd"
+"""Suffix of labels with their segments, which nothing else may have."""
+
 _KINDS = {"f": "fiu", "i": "iu", "b": "biu"}
 """Kinds in a file that may become a kind of result."""
 
@@ -98,9 +101,11 @@ def require_suffix(path: PathLike, suffixes: Sequence[str]) -> str:
     InvalidInputError
         If it is none of them.
     """
-    suffix = next((suffix for suffix in suffixes if Path(path).name.lower().endswith(suffix)), None)
-    if suffix is None:
-        raise InvalidInputError(f"{path}: expected a name ending in {', '.join(suffixes)}")
+    name = Path(path).name.lower()
+    suffix = next((suffix for suffix in (LABELS_ALONE, *suffixes) if name.endswith(suffix)), None)
+    if suffix is None or suffix not in suffixes:
+        others = f", not in {suffix}, of labels alone" if suffix else ""
+        raise InvalidInputError(f"{path}: expected a name ending in {', '.join(suffixes)}{others}")
     return suffix
 
 
@@ -235,8 +240,7 @@ def require_dataset(group: h5py.Group, name: str) -> h5py.Dataset:
 def _require_kind(group: h5py.Group, name: str, kind: type[Node]) -> Any:
     node = find_member(group, name)
     if not isinstance(node, kind):
-        expected, actual = kind.__name__.lower(), "none" if node is None else type(node).__name__.lower()
-        raise InvalidInputError(f"{locate(group, name)}: expected a {expected}, got {actual}")
+        raise InvalidInputError(f"{locate(group, name)}: expected a {kind.__name__.lower()}, got {node}")
     return node
 
 
@@ -304,8 +308,7 @@ def read_vector_attribute(node: Node, name: str, size: int) -> FloatArray:
     raw = node.attrs.get(name)
     value = np.asarray(raw)
     if value.dtype.kind not in "fiu" or value.size != size or np.isnan(value).any():
-        where = f"{locate(node)} attribute {name}"
-        raise InvalidInputError(f"{where}: expected {size} number(s), got {_excerpt(raw)}")
+        raise InvalidInputError(f"{locate(node)} attribute {name}: expected {size} number(s), got {raw!r:.60}")
     return value.astype(np.float64).ravel()
 
 
@@ -313,9 +316,8 @@ def read_text(node: Node, name: str, default: str | None = None) -> str:
     """Read a text attribute; `default` stands in for what is none unless it is None."""
     raw = node.attrs.get(name)
     text = raw.decode("utf-8", errors="replace") if isinstance(raw, bytes) else raw
-    text = text if isinstance(text, str) else default
-    if text is None:
-        raise InvalidInputError(f"{locate(node)} attribute {name}: expected a text, got {_excerpt(raw)}")
+    if not isinstance(text, str) and (text := default) is None:
+        raise InvalidInputError(f"{locate(node)} attribute {name}: expected a text, got {raw!r:.60}")
     return str(text)
 
 
@@ -329,8 +331,3 @@ def one_line(error: BaseException) -> str:
     """Return the first line of an error's own words."""
     text = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
     return (text.strip() or type(error).__name__).splitlines()[0]
-
-
-def _excerpt(raw: object) -> str:
-    text = "none" if raw is None else " ".join(repr(raw).split())
-    return text if len(text) <= 60 else f"{text[:57]}..."

@@ -40,8 +40,7 @@ def numbers(text: str, count: int | None, where: str) -> tuple[float, ...]:
     except ValueError:
         values = ()
     if not values or (count is not None and len(values) != count) or not np.isfinite(values).all():
-        start = text if len(text) <= 40 else f"{text[:37]}..."
-        raise InvalidInputError(f"{where}: expected {count or 'some'} finite number(s), got {start!r}")
+        raise InvalidInputError(f"{where}: expected {count or 'some'} finite number(s), got {text!r:.40}")
     return values
 
 

@@ -21,20 +21,18 @@ import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import AnyArray
-from speckle3d.core.errors import InvalidInputError, MismatchError
+from speckle3d.core.errors import MismatchError
 from speckle3d.core.files import PathLike
 from speckle3d.core.labels import LabelMap, Segment
 from speckle3d.core.printable import printable
 from speckle3d.core.volume import Volume
-from speckle3d.io.hdf5 import atomic_path, require_suffix
+from speckle3d.io.hdf5 import LABELS_ALONE, atomic_path, require_suffix
 from speckle3d.io.images.image_writer import write_image
 from speckle3d.io.text import number_text
 from speckle3d.io.voxels.segments import segment_fields
 
 SUFFIXES = (".nrrd", ".mha", ".nii.gz", ".nii")
-"""Of files that are written; .seg.nrrd is one of them, for labels alone."""
-
-LABELS_ALONE = ".seg.nrrd"
+"""Of files that are written; labels may have .seg.nrrd, too."""
 
 PREFIX = "Speckle3D_"
 """Before the names of a volume's fields, so that none is taken for one of the format's own."""
@@ -79,7 +77,7 @@ def write_volume(path: PathLike, volume: Volume, compress: bool = True) -> None:
     (4, 3, 2)
     """
     is_labels = isinstance(volume, LabelMap)
-    suffix = volume_suffix(path, is_labels)
+    suffix = require_suffix(path, (LABELS_ALONE, *SUFFIXES) if is_labels else SUFFIXES)
     plain = segment_fields(volume.segments, volume.shape) if isinstance(volume, LabelMap) else {}
     with atomic_path(path) as part:
         if ".nii" in suffix:
@@ -87,7 +85,7 @@ def write_volume(path: PathLike, volume: Volume, compress: bool = True) -> None:
             return
         fields = {f"{PREFIX}{name}": value for name, value in volume.fields.items()} | plain
         fields = {name: _escape(value) for name, value in fields.items()}
-        axes = (_nrrd_axes if suffix == ".nrrd" else _meta_axes)(volume)
+        axes = (_meta_axes if suffix == ".mha" else _nrrd_axes)(volume)
         write_image(part, volume.voxels.T, volume.shape, volume.voxels.dtype, axes, fields, compress)
 
 
@@ -207,21 +205,6 @@ TransformMatrix = {number_text(pose.rotation.as_matrix().T)}
 Offset = {number_text(pose.translation)}
 CenterOfRotation = 0 0 0
 ElementSpacing = {number_text(volume.spacing_mm)}"""
-
-
-def volume_suffix(path: PathLike, is_labels: bool = False) -> str:
-    """Suffix of a volume's name, which chooses the format.
-
-    Raises
-    ------
-    InvalidInputError
-        If it is none of `SUFFIXES`, or is of labels where there are none.
-    """
-    if not is_labels and Path(path).name.lower().endswith(LABELS_ALONE):
-        raise InvalidInputError(
-            f"{path}: {LABELS_ALONE} is of labels with their segments: take another name ending in .nrrd"
-        )
-    return require_suffix(path, SUFFIXES)
 
 
 def _escape(text: str) -> str:

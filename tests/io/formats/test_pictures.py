@@ -37,6 +37,9 @@ def test_an_array_file_is_read(tmp_path):
     assert set(error.value.settings) == {*PIXELS, "frame_rate_hz"}
     sweep = load_sweep(tmp_path / "grey.npy", ImportSettings(**PIXELS, frame_rate_hz=20))
     np.testing.assert_array_equal(frames_of(sweep), GREY.transpose(0, 2, 1))
+    np.savez(tmp_path / "grey.npz", time=np.arange(12), images=GREY)
+    packed = load_sweep(tmp_path / "grey.npz", ImportSettings(**PIXELS, frame_rate_hz=20))
+    np.testing.assert_array_equal(frames_of(packed), frames_of(sweep))
     np.save(tmp_path / "rf.npy", GREY.astype(np.int16))
     names = ("sampling_rate_hz", "centre_frequency_hz", "bandwidth_hz")
     echoes = {name: getattr(RF, name) for name in names}
@@ -56,7 +59,7 @@ def test_a_folder_of_pictures_is_read_in_the_order_of_its_numbers(tmp_path, suff
         frames_of(load_sweep(tmp_path, settings)).astype(int), flat.transpose(0, 2, 1), atol=2
     )
     Image.fromarray(flat[0, :, :4]).save(tmp_path / f"frame12{suffix}")
-    with pytest.raises(InvalidInputError, match="frame12"):
+    with pytest.raises(InvalidInputError, match="frame 12: expected shape"):
         frames_of(load_sweep(tmp_path, settings))
 
 
