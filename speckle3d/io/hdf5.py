@@ -308,7 +308,8 @@ def read_vector_attribute(node: Node, name: str, size: int) -> FloatArray:
     raw = node.attrs.get(name)
     value = np.asarray(raw)
     if value.dtype.kind not in "fiu" or value.size != size or np.isnan(value).any():
-        raise InvalidInputError(f"{locate(node)} attribute {name}: expected {size} number(s), got {raw!r:.60}")
+        where = f"{locate(node)} attribute {name}"
+        raise InvalidInputError(f"{where}: expected {size} number(s), got {raw!r:.60}")
     return value.astype(np.float64).ravel()
 
 
