@@ -19,7 +19,7 @@ import numpy as np
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.parts import whole_file
-from xsens.logs.clocks import COUNTS, SHORTEST_S, TICK_S, TICKS, Stamps, unwrap, usual_step
+from xsens.logs.clocks import SHORTEST_S, TICK_S, Stamps, unwrap, usual_step
 from xsens.logs.parts import Hints, Parts, assemble_log
 from xsens.logs.samples import VECTORS, ImuLog, median_norm
 from xsens.logs.texttables import (
@@ -67,14 +67,13 @@ _HALF_TURN = 3.2
 _GRAVITY_M_S2 = 4.0
 """Median length of accelerations from which they hold gravity: a hand's own are less."""
 
-*_VECTORS, _VELOCITY_STEPS = (
-    [f"{quantity}_{axis}" for axis in "xyz"] for quantity in ("acc", "gyr", "mag", "dv")
-)
-_EULER = ["euler_roll", "euler_pitch", "euler_yaw"]
-_MATRIX = [f"mat_{row}_{column}" for row in "123" for column in "123"]
-_QUATERNION, _OPTICAL, _TURNS = (
-    [f"{source}_{axis}" for axis in "wxyz"] for source in ("quat", "optical", "dq")
-)
+_AXES = {
+    **dict.fromkeys(("acc", "gyr", "mag", "free", "dv"), tuple("xyz")),
+    **dict.fromkeys(("dq", "optical", "quat"), tuple("wxyz")),
+    "mat": tuple(f"{row}_{column}" for row in "123" for column in "123"),
+    "euler": ("roll", "pitch", "yaw"),
+}
+_ORIENTATIONS = ("optical", "quat", "mat", "euler")
 
 
 def parse_text(text: str | Iterable[str], hints: Hints | None = None, source: str = "text") -> ImuLog:
@@ -104,54 +103,67 @@ def parse_text(text: str | Iterable[str], hints: Hints | None = None, source: st
 def _mt9_export(table: TextTable) -> TextTable:
     """Name the columns of an export of the MT9 software; its kind is told by their number."""
     columns = list(table.columns.values())
-    vectors = [*_VECTORS[0], *_VECTORS[1], *_VECTORS[2]]
-    keys = {4: _EULER, 10: vectors, 11: [*vectors, "temperature"]}.get(len(columns))
-    if keys is None:
+    quantities: tuple[str, ...] = () if len(columns) not in (10, 11) else ("acc", "gyr", "mag")
+    quantities, notes = ("euler",) if len(columns) == 4 else quantities, table.notes
+    if len(columns) == 10 and np.mean(are_rotations(np.stack(columns[1:], axis=1)[:_ENOUGH])) > 0.5:
+        quantities, notes = ("mat",), (*notes, "matrices are taken row by row")
+    if not quantities:
         raise InvalidInputError(
             f"expected columns with names, or the 4, 10 or 11 of an MT9 export without, got {len(columns)} "
             "without"
         )
-    notes = table.notes
-    if keys == vectors and np.mean(are_rotations(np.stack(columns[1:], axis=1)[:_ENOUGH])) > 0.5:
-        keys, notes = _MATRIX, (*notes, "matrices are taken row by row")
-    return replace(table, columns=dict(zip(["time", *keys], columns, strict=True)), notes=notes)
+    keys = ["time", *(f"{quantity}_{axis}" for quantity in quantities for axis in _AXES[quantity])]
+    with_unit = frozenset(("time", "euler_roll"))
+    return replace(table, columns=dict(zip(keys, columns, strict=False)), with_unit=with_unit, notes=notes)
 
 
 def _samples(table: TextTable, rate_hz: float | None) -> Parts:
     """Samples of a table whose columns are known, at a rate that the header may name."""
     notes = list[str]()
     columns, stamps, dot = _stamps(table, rate_hz, notes)
-    force, rate, field = (_side_by_side(columns, keys) for keys in _VECTORS)
-    if rate is not None and dot and "gyr_x" not in table.with_unit:
-        rate = np.deg2rad(rate)
-    if force is None and any(key.startswith("free_") for key in columns):
-        force = _side_by_side(columns, [f"free_{axis}" for axis in "xyz"])
-        if force is None or median_norm(force) < _GRAVITY_M_S2:
-            force = None
+    readings = {}
+    for quantity, axes in _AXES.items():
+        parts = [columns[key] for axis in axes if (key := f"{quantity}_{axis}") in columns]
+        if len(parts) == len(axes):
+            readings[quantity] = np.stack(parts, axis=1)
+    if dot and "gyr" in readings and "gyr_x" not in table.with_unit:
+        readings["gyr"] = np.deg2rad(readings["gyr"])
+    if "acc" not in readings and any(key.startswith("free_") for key in columns):
+        if median_norm(readings.get("free", np.zeros((1, 3)))) >= _GRAVITY_M_S2:
+            readings["acc"] = readings["free"]
+        else:
             notes.append("acceleration without gravity is no accelerometer's reading and was left out")
-    increments = (_side_by_side(columns, _VELOCITY_STEPS), _side_by_side(columns, _TURNS))
-    claim: Claim | None = _claim(table, dot)
-    orientation = otherwise = None
-    otherwise_note = ""
-    for keys in (_OPTICAL, _QUATERNION, _MATRIX, _EULER):
-        orientation = _side_by_side(columns, keys) if orientation is None else orientation
-    if _side_by_side(columns, _OPTICAL) is not None:
+    notation = next(filter(readings.__contains__, _ORIENTATIONS), "")
+    orientation, claim, otherwise = readings.get(notation), _claim(table, dot), None
+    meaning = ""
+    if notation == "optical":
         claim = None
         notes.append("orientation: by cameras, in a world of their own: x and z need not be north and up")
-    elif orientation is not None and orientation.shape[1] == 4:
-        otherwise, otherwise_note = np.roll(orientation, 1, axis=1), "the scalar is the last number"
-    elif orientation is not None and _unit_open(table, orientation):
-        otherwise, otherwise_note = np.degrees(orientation), "angles are in radians"
-        if force is None:
+    elif notation == "quat":
+        otherwise, meaning = np.roll(readings["quat"], 1, axis=1), "the scalar is the last number"
+    elif notation == "euler" and "time" in table.columns and "euler_roll" not in table.with_unit:
+        angles = readings["euler"]
+        if np.nanmax(np.abs(angles), initial=0.0) < _HALF_TURN:
+            otherwise, meaning = np.degrees(angles), "angles are in radians"
+        if otherwise is not None and "acc" not in readings:
             raise InvalidInputError("expected angles with their unit, as roll_deg, got small ones without")
     odd = _unknown_columns(table)
-    if all(part is None for part in (force, rate, field, orientation, *increments)):
+    if not readings.keys() - {"free"}:
         columns_text = "; ".join(odd) or describe_unknown(table.names)
         raise InvalidInputError(
             f"expected columns of acceleration, rate of turn, field or orientation, {columns_text}"
         )
-    vectors, all_notes = (force, rate, field), (*odd, *notes)
-    return Parts(stamps, vectors, orientation, claim, all_notes, increments, otherwise, otherwise_note)
+    force, rate, field, speed_step, turn = map(readings.get, ("acc", "gyr", "mag", "dv", "dq"))
+    return Parts(
+        stamps,
+        (force, rate, field),
+        orientation,
+        claim,
+        (*odd, *notes),
+        (speed_step, turn),
+        otherwise,
+        meaning,
+    )
 
 
 def _stamps(
@@ -159,41 +171,40 @@ def _stamps(
 ) -> tuple[dict[str, FloatArray], Stamps, bool]:
     """Columns without the lines that have no time, their stamps, and whether they are a DOT's."""
     columns = dict(table.columns)
-    rate_line = _RATE.search("\n".join(table.header))
-    if rate_hz is None and rate_line:
+    if rate_hz is None and (rate_line := _RATE.search("\n".join(table.header))):
         rate_hz = number(rate_line[1])
     period_s = 1.0 / rate_hz if rate_hz and rate_hz > 0.0 else float("nan")
     for key in STAMPS:
         if key in columns and columns[key].size > 1 and not (columns[key] != columns[key][0]).any():
             notes.append(f"{key}: the same in every line, left out")
             del columns[key]
-    if "time" in columns and table.names and "time" not in table.with_unit:
+    if "time" in columns and "time" not in table.with_unit:
         columns |= _unnamed_time(columns.pop("time"), np.isfinite(period_s), notes)
-    if not columns.keys() & {"time", "ticks"} and (utc_s := _utc_s(columns)) is not None:
-        columns["time"] = utc_s
-    if table.names and np.isnan(period_s) and not columns.keys() & set(STAMPS):
+    dot = any("devicetag" in line.lower() for line in table.header)
+    if "ticks" in columns and "time" not in columns:
+        if not dot and _unit_of(columns["ticks"], _TICKS) == "DOT":
+            dot = True
+            notes.append("taken for a DOT's export by its clock: ticks of 1 us, gyroscope in deg/s")
+        columns["time"] = columns["ticks"] * _TICKS["DOT" if dot else "MT Manager"]
+    if "time" not in columns and "utc_s" in columns:
+        columns["time"] = _utc_s(columns)
+    if np.isnan(period_s) and not columns.keys() & {"time", "counter"}:
         unknown = [name[:40] for name in table.names if column_of(name) is None]
         raise InvalidInputError(
             f"expected a column of time with its unit, as time_s, got {', '.join(unknown[:9]) or 'none'}: "
             "name it so, or give --rate-hz"
         )
-    timely = np.all([np.abs(columns[key]) < _LARGEST for key in STAMPS if key in columns], axis=0)
+    timely = np.all(
+        [np.abs(columns[key]) < _LARGEST for key in ("time", "counter") if key in columns], axis=0
+    )
     if not timely.any():
         raise InvalidInputError("expected lines with a time, got none")
     if not timely.all():
         notes.append(f"{(~timely).sum()} lines without a time were left out")
         columns = {key: column[timely] for key, column in columns.items()}
-    counter, ticks, time_s = (columns.get(key) for key in ("counter", "ticks", "time"))
-    dot = any("devicetag" in line.lower() for line in table.header)
-    if ticks is not None and time_s is None:
-        ticks = unwrap(ticks.astype(np.int64), TICKS)
-        if not dot and _unit_of(ticks, _TICKS) == "DOT":
-            dot = True
-            notes.append("taken for a DOT's export by its clock: ticks of 1 us, gyroscope in deg/s")
-        time_s = ticks * _TICKS["DOT" if dot else "MT Manager"]
-    if counter is not None:
-        counter = unwrap(counter.astype(np.int64), TICKS if dot else COUNTS)
-    return columns, Stamps(counter, time_s, period_s), dot
+    counter = columns.get("counter")
+    counts = None if counter is None else counter.astype(np.int64)
+    return columns, Stamps(counts, columns.get("time"), period_s), dot
 
 
 def _unnamed_time(times: FloatArray, has_rate: bool, notes: list[str]) -> dict[str, FloatArray]:
@@ -217,30 +228,14 @@ def _unit_of(times: FloatArray, units: dict[str, float]) -> str | None:
     return next((unit for unit, scale in units.items() if low <= value * scale <= high), None)
 
 
-def _unit_open(table: TextTable, angles: FloatArray) -> bool:
-    """Whether angles of a table that is no program's export name no unit, and may be in radians."""
-    stated = "euler_roll" in table.with_unit or "time" not in table.columns or not table.names
-    return not stated and angles.shape[1] == 3 and np.nanmax(np.abs(angles), initial=0.0) < _HALF_TURN
-
-
-def _utc_s(columns: dict[str, FloatArray]) -> FloatArray | None:
-    """Seconds of columns of UTC, since the first minute, hour or day began; None without any."""
-    if "utc_s" not in columns:
-        return None
-    hour, minute, seconds, nano = (
-        columns.get(f"utc_{part}", 0.0) for part in ("hour", "minute", "s", "nano")
-    )
-    times = np.asarray(3600.0 * hour + 60.0 * minute + seconds + 1e-9 * nano)
+def _utc_s(columns: dict[str, FloatArray]) -> FloatArray:
+    """Seconds of columns of UTC, since the first minute, hour or day began."""
+    hour, minute, nano = (columns.get(f"utc_{part}", 0.0) for part in ("hour", "minute", "nano"))
+    times = np.asarray(3600.0 * hour + 60.0 * minute + columns["utc_s"] + 1e-9 * nano)
     span = 60 if "utc_minute" not in columns else 3600 if "utc_hour" not in columns else 86400
     finite = np.isfinite(times)
     times[finite] = unwrap(times[finite], span)
     return times
-
-
-def _side_by_side(columns: dict[str, FloatArray], keys: list[str]) -> FloatArray | None:
-    """Columns as an array, shape (rows, keys); None if one is missing."""
-    vectors = [columns[key] for key in keys if key in columns]
-    return np.stack(vectors, axis=1) if len(vectors) == len(keys) else None
 
 
 def _claim(table: TextTable, dot: bool) -> Claim:
@@ -262,9 +257,9 @@ def _unknown_columns(table: TextTable) -> Names:
     keys = {name: column[0] for name in table.names if (column := column_of(name))}
     plain = "time" in keys.values()
     odd = [name for name in table.names if name not in keys and (plain or _SENSOR_LIKE.match(name))]
-    for quantity in (*_VECTORS, _QUATERNION):
-        columns = [name for name, key in keys.items() if key in quantity]
-        odd += columns if len(columns) < len(quantity) else []
+    for quantity in ("acc", "gyr", "mag", "quat"):
+        columns = [name for name, key in keys.items() if key.startswith(f"{quantity}_")]
+        odd += columns if len(columns) < len(_AXES[quantity]) else []
     return (describe_unknown(filter(None, odd)),) if any(odd) else ()
 
 

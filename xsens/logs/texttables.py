@@ -9,11 +9,12 @@ import csv
 import math
 import re
 from array import array
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from itertools import chain
+from functools import cache
+from itertools import chain, islice, zip_longest
 
 import numpy as np
 from scipy.constants import g
@@ -28,10 +29,9 @@ Header = list[str]
 _SEPARATORS = ("\t", ";", "|", ",", None)
 """In order of trust: a tab only separates, a comma may be a decimal point, blanks (None) may be padding."""
 
-_LONGEST_HEADER = 64
-"""Lines, not counting comments, among which the names of the columns or the first numbers must be."""
+_LONGEST_HEADER = 128
+"""Lines among which the first numbers must be."""
 
-_COMMENT = "#"
 _DATE_DIGIT, _MILLISECONDS = re.compile(r"\b(\d)\b"), re.compile(r":(\d{3})$")
 """In dates and times: a number without its leading zero, and thousandths after a colon."""
 
@@ -41,17 +41,8 @@ _DIGIT = re.compile("[0-9]")
 _DEG = 0.017453292519943295
 TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}
 _FORCES = dict.fromkeys(("m_s2", "m_s_2", "m_s_s", "mps2"), 1.0) | {"g": g, "mg": 1e-3 * g}
-_RATES = {
-    f"{unit}{power}": scale
-    for units, scale in (
-        ("rad_s rads", 1.0),
-        ("mrad_s", 1e-3),
-        ("deg_s dps °_s", _DEG),
-        ("mdps", 1e-3 * _DEG),
-    )
-    for unit in units.split()
-    for power in ("", "_1")
-}
+_RATES = {"rad_s": 1.0, "rads": 1.0, "mrad_s": 1e-3, "mdps": 1e-3 * _DEG}
+_RATES |= dict.fromkeys(("deg_s", "dps", "°_s"), _DEG)
 _FIELDS = dict.fromkeys(
     ("au", "a_u", "ut", "µt", "nt", "mt", "t", "gauss", "g", "mgauss", "mg", "local_flux"), 1.0
 )
@@ -99,18 +90,15 @@ _PATTERNS = [
     for quantity, names, axes, units, letters in _COLUMNS
 ]
 
-_SPELLINGS = {
-    short: re.compile(rf"(?<![^_])(?:{spelling})(?![^_])")
-    for short, spelling in (
-        ("s", "(?:per_)?sec(?:ond)?s?"),
-        ("ms", "m(?:illi)?sec(?:ond)?s?|millis"),
-        ("us", "(?:u|micro)sec(?:ond)?s?|micros"),
-        ("ns", "n(?:ano)?sec(?:ond)?s?|nanos"),
-        ("deg", "degrees?"),
-        ("rad", "radians?"),
-    )
-}
-"""Units by how they may be spelt out."""
+_SPELLINGS = (
+    ("s", "(?:per_)?sec(?:ond)?s?|s_1"),
+    ("ms", "m(?:illi)?sec(?:ond)?s?|millis"),
+    ("us", "(?:u|micro)sec(?:ond)?s?|micros"),
+    ("ns", "n(?:ano)?sec(?:ond)?s?|nanos"),
+    ("deg", "degrees?"),
+    ("rad", "radians?"),
+)
+"""Units, and how they may be spelt out."""
 
 STAMPS = ("time", "counter", "ticks")
 
@@ -124,14 +112,15 @@ _WHOSE = re.compile(
 """Names of columns that say which sensor a row is of."""
 
 
+@cache
 def column_of(name: str) -> tuple[str, float | None] | None:
     """Key of a column by its name in lower case; None if it is not understood.
 
     With it comes what turns its numbers to SI units, None if the name states no unit.
     """
     words = stated = re.sub(r"[^a-z0-9°µ]+", "_", name.replace("²", "2")).strip("_")
-    for short, spelling in _SPELLINGS.items():
-        words = spelling.sub(short, words)
+    for short, spelling in _SPELLINGS:
+        words = re.sub(rf"(?<![^_])(?:{spelling})(?![^_])", short, words)
     if words in TIMES:  # as millis; s alone may be anything
         return ("time", TIMES[words]) if words != stated else None
     for quantity, pattern, units, letters in _PATTERNS:
@@ -160,8 +149,7 @@ class TextTable:
     """A table of numbers: the lines before it, names in lower case, and the columns that are understood.
 
     `columns` are in SI units by key, without blank ones, those of `with_unit` by a unit in their name; where
-    none has a name, all by number. `notes` count lines of another length than the first or without a digit,
-    and cells that hold no number.
+    none has a name, all by number. `notes` count lines of another length than the first or without a digit.
     """
 
     header: Header
@@ -174,32 +162,32 @@ class TextTable:
 def read_table(lines: Iterable[str]) -> TextTable:
     """Find the table in some lines and read it.
 
-    Names may be in one line, or in two: ``Acceleration;;;Field`` above ``X;Y;Z;X`` names ``acceleration_x``.
-    A line that holds three known names at least is the line of names.
+    It begins where lines of names, of which three are known, stand above as many cells with a number among
+    them, or where four cells at least are all numbers.
 
     Raises
     ------
     InvalidInputError
         If there is no table, a quantity has two columns, or its rows are of several sensors.
     """
-    rows, header, count = (line for line in lines if line.strip("\r\n")), [""], 0
-    for line in rows:
-        comment = line.startswith(_COMMENT)
-        for separator in () if comment else _SEPARATORS:
-            cells, above = _cells(line, separator), _cells(header[-1].lstrip("#% "), separator)
-            for names in (cells, _join(above, cells)):
-                if sum(column_of(name) is not None for name in names) >= 3:
-                    return _read_columns(rows, header, names, separator)
-            if len(cells) >= 4 and all(cell == "nan" or _is_number(cell) for cell in cells):
-                if len(above) == len(cells) and any(above) and not any(map(_is_number, above)):
-                    return _read_columns(chain([line], rows), header, above, separator)
-                columns = {str(i): (i, None) for i in range(len(cells))}
-                return _rows(chain([line], rows), header, (), columns, separator)
+    rows, header = (line for line in lines if line.strip("\r\n")), ["", ""]
+    for line in islice(rows, _LONGEST_HEADER):
+        for separator in () if line.startswith("#") else _SEPARATORS:
+            cells = _cells(line, separator)
+            numbers = [cell == "nan" or not math.isnan(number(cell)) for cell in cells]
+            if not any(numbers):
+                continue
+            above, below = (_cells(text.lstrip("#% "), separator) for text in header[-2:])
+            blanks = [part for name in below for part in name.split()]
+            for names in (_join(above, below), _join([], below), blanks):  # blanks where tabs should be
+                fits = len(names) <= len(cells) and not any(cells[len(names) :])
+                if fits and sum(column_of(name) is not None for name in names) >= 3:
+                    return _read_rows(chain([line], rows), header, names, separator)
+            if len(cells) >= 4 and all(numbers):
+                names = below if len(below) == len(cells) else [""] * len(cells)
+                return _read_rows(chain([line], rows), header, names, separator)
         header.append(line.rstrip("\n"))
-        count += not comment
-        if count > _LONGEST_HEADER:
-            break
-    raise InvalidInputError("expected a table of numbers, got none")
+    raise InvalidInputError("expected names of columns above lines of as many cells with numbers, got none")
 
 
 def number(cell: str) -> float:
@@ -225,69 +213,47 @@ def _split(line: str, separator: str | None) -> list[str]:
     return line.split(separator)
 
 
-def _cells(line: str, separator: str | None) -> Names:
-    return tuple(cell.strip().strip('"').lower() for cell in _split(line, separator))
+def _cells(line: str, separator: str | None) -> list[str]:
+    return [cell.strip().strip('"').lower() for cell in _split(line, separator)]
 
 
-def _is_number(cell: str) -> bool:
-    return not math.isnan(number(cell))
-
-
-def _join(above: Names, below: Names) -> Names:
-    """Names in two lines, of which the upper one may name a group at its first column alone."""
+def _join(above: list[str], below: list[str]) -> list[str]:
+    """Names in two lines: the lower one holds their units or axes, the upper one perhaps groups."""
     names, group = list[str](), ""
-    for over, under in zip(above, below, strict=False):
+    for over, under in zip_longest(above, below, fillvalue=""):
         group = over or group
-        names.append(f"{group} {under}" if under else over)
-    return tuple(names) if len(above) == len(below) else ()
+        spellings = (f"{group} {under}".strip(), under) if under else ()
+        names.append(next(filter(column_of, spellings), over or under))
+    while names and not names[-1]:  # what separators at the end of a line make
+        names.pop()
+    return names
 
 
-def _read_columns(rows: Iterator[str], header: Header, names: Names, separator: str | None) -> TextTable:
-    while not names[-1]:  # what a separator at the end of the line makes
-        names = names[:-1]
-    first = next(rows, "")
-    cells = _cells(first, separator)
-    with_units = _join(names, cells)
-    if any(map(column_of, with_units)) and not any(map(_is_number, cells)):  # a line of units
-        pairs = zip(names, with_units, strict=True)
-        names, first = tuple(pair if column_of(pair) else name for name, pair in pairs), next(rows, "")
-    blanks = tuple(part for name in names for part in name.split())
-    if len(names) != len(cells) == len(blanks):  # a blank where a tab should be
-        names = blanks
+def _read_rows(lines: Iterable[str], header: Header, names: list[str], separator: str | None) -> TextTable:
+    """Read the columns that are understood, all where none has a name."""
     columns: dict[str, tuple[int, float | None]] = {}
     for i, name in enumerate(names):
-        if (column := column_of(name)) is None:
-            continue
-        key, scale = column
-        if key in columns and key not in ("counter", "time"):
+        key, scale = column_of(name) or ("", None)
+        if key in columns and key not in ("", "counter", "time"):
             raise InvalidInputError(
                 f"expected the columns of one sensor, got two of {key}: {names[columns[key][0]]}, {name}"
             )
         # Of several times, the first with its unit, else the first.
         if key not in columns or (columns[key][1] is None and scale is not None):
             columns[key] = i, scale
+    columns.pop("", None)
+    if not any(names):
+        columns = {str(i): (i, None) for i in range(len(names))}
     if not columns:
         raise InvalidInputError(describe_unknown(names))
-    return _rows(chain([first], rows), header, names, columns, separator)
-
-
-def _rows(
-    lines: Iterable[str],
-    header: Header,
-    names: Names,
-    columns: Mapping[str, tuple[int, float | None]],
-    separator: str | None,
-) -> TextTable:
-    """Read columns, of which index and unit are known by key."""
-    count = len(names or columns)
     indices = [i for i, _ in columns.values()]
     sensors = {i: dict[str, None]() for i, name in enumerate(names) if _WHOSE.match(name)}
     values, left_out = array("d"), 0
     for line in lines:
         cells = _split(line if separator == "," else line.replace(",", "."), separator)
-        while len(cells) > count and not cells[-1].strip():
+        while len(cells) > len(names) and not cells[-1].strip():
             cells.pop()
-        if len(cells) != count or not _DIGIT.search(line):
+        if len(cells) != len(names) or not _DIGIT.search(line):
             left_out += 1
             continue
         for i, ids in sensors.items():
@@ -296,10 +262,6 @@ def _rows(
             values.extend([float(cells[i]) for i in indices])
         except ValueError:  # quoted, blank, a time, or a word
             values.extend([number(cells[i]) for i in indices])
-    if not values:
-        raise InvalidInputError(
-            f"expected lines of {count} cells below the names, got {left_out} lines of another length"
-        )
     for i, ids in sensors.items():
         if len(ids) > 1:
             examples = ", ".join([*ids][:4])
@@ -307,16 +269,14 @@ def _rows(
                 f"column {names[i]}: expected rows of one sensor, got {len(ids)} ({examples}): "
                 "split the table"
             )
-    notes = []
-    if left_out:
-        notes.append(f"{left_out} lines of another length or without a digit were left out")
+    notes = [f"{left_out} lines of another length or without a digit were left out"] if left_out else []
     rows, quantities = np.frombuffer(values).reshape(-1, len(indices)), {}
     for (key, (_, scale)), column in zip(columns.items(), rows.T, strict=True):
-        if not names or np.isfinite(column).any():
+        if not any(names) or np.isfinite(column).any():
             with np.errstate(over="ignore"):  # damage, which is left out as no measurement
                 quantities[key] = (_unwrap_column(column) if key in STAMPS else column) * (scale or 1.0)
     with_unit = frozenset(key for key, (_, scale) in columns.items() if scale is not None)
-    return TextTable(header, names, quantities, with_unit, tuple(notes))
+    return TextTable(header, tuple(filter(None, names)), quantities, with_unit, tuple(notes))
 
 
 def _unwrap_column(column: FloatArray) -> FloatArray:
