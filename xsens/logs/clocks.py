@@ -20,9 +20,6 @@ from xsens.logs.samples import Gap
 UNKNOWN_PAUSE_S = 1.0
 """Assumed pause before a new start of unknown length; longer than interpolation bridges."""
 
-_RATES_HZ = (1e-3, 1e5)
-"""Sampling rates that a sensor may have: they end at 2 kHz."""
-
 SHORTEST_S = 4e-4
 """No sensor's samples are closer: they end at 2 kHz."""
 
@@ -60,7 +57,7 @@ class Stamps:
         By the sensor's clock, likewise.
     period_s : float
         Sampling period as configured or stated; NaN if not known.
-    others : ndarray of int, shape (m,), optional
+    extras : ndarray of int, shape (m,), optional
         Number of messages before each sample that the sensor counted, but that were no samples.
     starts : ndarray of bool, shape (m,), optional
         True for samples before which the sensor was started anew.
@@ -75,10 +72,6 @@ class Stamps:
     starts: BoolArray | None = None
     computer_s: FloatArray | None = None
 
-    def __getitem__(self, index: Any) -> Stamps:
-        arrays: dict[str, Any] = {k: v[index] for k, v in vars(self).items() if isinstance(v, np.ndarray)}
-        return replace(self, **arrays)
-
 
 @dataclass(frozen=True)
 class Timeline:
@@ -92,13 +85,6 @@ class Timeline:
     counter: IntArray | None = None
     gaps: tuple[Gap, ...] = ()
     notes: tuple[str, ...] = ()
-
-
-def require_rate(rate_hz: float, name: str) -> None:
-    """Raise `InvalidInputError` if no sensor has such a sampling rate."""
-    low, high = _RATES_HZ
-    if not low <= rate_hz <= high:
-        raise InvalidInputError(f"{name}: expected {low:g} to {high:g} Hz, got {rate_hz:g}")
 
 
 def unwrap(values: Any, span: int) -> Any:
@@ -122,13 +108,14 @@ def spread(stamps: Stamps, readings: Sequence[FloatArray | None]) -> tuple[Stamp
     differ = np.any([(rows[1:] != rows[:-1]).any(axis=1) for rows in readings if rows is not None], axis=0)
     if together.all() or 2 * (together & differ).sum() <= steps.size:
         return stamps, ()
-    first = np.flatnonzero(np.append(True, ~together))
-    counts, arrival_s = np.diff(np.append(first, steps.size + 1)), stamps.time_s[first]
+    last = np.flatnonzero(np.append(~together, True))
+    counts, arrival_s = np.diff(last, prepend=-1), stamps.time_s[last]
     spans = np.diff(arrival_s) / counts[1:]
     usual = np.median(spans)
     period_s = np.append(usual, np.minimum(spans, _LONGER * usual))
-    before = np.repeat(first + counts - 1, counts) - np.arange(steps.size + 1)
-    time_s = np.repeat(arrival_s, counts) - before * np.repeat(period_s, counts)
+    time_s = np.repeat(arrival_s - last * period_s, counts) + np.arange(steps.size + 1) * np.repeat(
+        period_s, counts
+    )
     note = f"{counts.size} stamps for {time_s.size} samples: spread evenly between stamps"
     return replace(stamps, time_s=time_s), (note,)
 
@@ -144,33 +131,69 @@ def timeline(stamps: Stamps) -> Timeline:
         If there is neither a clock nor a counter with a known and possible period, or the times contradict
         the period.
     """
-    numbers = None if stamps.counter is None else _sample_numbers(stamps.counter, stamps.extras)
-    values = stamps.time_s
+    numbers, values = None, stamps.time_s
+    if stamps.counter is not None:
+        numbers = _sample_numbers(stamps.counter, stamps.extras)
     if values is None:
         if numbers is None or not stamps.period_s > 0.0:
             evidence = "neither" if numbers is None else "a counter, but no rate"
             raise InvalidInputError(
                 f"expected samples with a clock, or with a sampling rate, got {evidence}: give --rate-hz"
             )
-        require_rate(1.0 / stamps.period_s, "sampling rate")
-        values = numbers * stamps.period_s
-    anew = _new_starts(values, stamps)
-    if anew.any():  # each start far behind all before it, to sort them
-        steps = np.diff(values)
-        steps[anew[1:]] = LATE * usual_step(steps)
-        values = _running_sums(steps)
-    notes, rows = list[str](), np.argsort(values, kind="stable")
+        values = (numbers - numbers[0]) * stamps.period_s
+    anew, notes = _new_starts(values, stamps), list[str]()
+    if anew.any():
+        steps = np.where(anew[1:], 0.0, np.diff(values))
+        pauses = _pauses(stamps.computer_s, anew, _running_sums(steps))
+        certain = np.isfinite(pauses)
+        steps[anew[1:]] = np.where(certain, pauses, UNKNOWN_PAUSE_S)
+        values = values[0] + _running_sums(steps)
+        notes.append(
+            f"the sensor started anew {anew.sum()} times; the pause is by the computer's clock "
+            f"{certain.sum()} times, else not known and taken as {UNKNOWN_PAUSE_S:g} s"
+        )
+    rows: Any = np.argsort(values, kind="stable")
     rank = np.argsort(rows)
     if late := int((rank < np.maximum.accumulate(rank)).sum()):
         notes.append(f"{late} samples came out of order and were sorted")
     distinct = np.append(True, np.diff(values[rows]) > 0.0)
     if left_out := int((~distinct).sum()):
         notes.append(f"{left_out} samples at the time of another were left out")
-        rows = rows[distinct]
-    if not (late or left_out):
-        return _build(stamps, values, numbers, anew[1:], notes)
-    anew, numbers = np.diff(np.cumsum(anew)[rows]) > 0, None if numbers is None else numbers[rows]
-    return replace(_build(stamps[rows], values[rows], numbers, anew, notes), rows=rows)
+    rows = rows[distinct] if late or left_out else slice(None)
+    counter = None if stamps.counter is None else stamps.counter[rows]
+    line = Timeline(rows, values[rows], counter, notes=tuple(notes))
+    numbers = None if numbers is None else numbers[rows]
+    return _with_gaps(line, numbers, np.diff(np.cumsum(anew)[rows]) > 0, stamps.period_s)
+
+
+def _with_gaps(line: Timeline, numbers: FloatArray | None, anew: BoolArray, stated_s: float) -> Timeline:
+    """Find the gaps between samples in order, by their numbers or else by the clock, and a wrong rate."""
+    seconds, counter, notes = np.diff(line.time_s), line.counter, line.notes
+    running = seconds[~anew]
+    usual_s, longest = usual_step(running), _LONGER
+    regular = running[running < 2.5 * usual_s]
+    period_s = float(regular.sum() / max(regular.size, 1)) or 1.0
+    periods = seconds / period_s
+    rates_hz = [1.0 / running]
+    if counter is not None and numbers is not None:
+        counts, periods = np.diff(counter), np.diff(numbers)
+        counter = counter[0] + _running_sums(np.maximum(counts, 1))
+        rates_hz.append(counts[~anew] / running)
+    elif (running < _SHORTER * period_s).sum() > _RARE * running.size:
+        longest = _MUCH_LONGER
+        span = f"{1e3 * seconds.min():.3g} to {1e3 * seconds.max():.3g} ms"
+        notes += (f"irregular clock, steps of {span}: single losses cannot be told",)
+    medians_hz = [float(np.median(rates)) for rates in rates_hz if running.size and stated_s > 0.0]
+    if medians_hz and not any(1.0 / _AGREES < hz * stated_s < _AGREES for hz in medians_hz):
+        rates = f"{1.0 / stated_s:g} Hz, got {medians_hz[0]:.4g} Hz"
+        contradiction = f"expected times at the stated rate, {rates} by their clock"
+        if counter is not None:
+            raise InvalidInputError(contradiction)
+        notes += (f"{contradiction}, which holds",)
+    missing = np.where(anew | (periods <= longest), 0.0, np.round(np.minimum(periods, _MOST_PERIODS)) - 1.0)
+    at = np.flatnonzero((missing > 0.0) | anew | (seconds > longest * usual_s))
+    gaps = tuple(Gap(int(i), int(missing[i]), float(seconds[i])) for i in at)
+    return replace(line, counter=counter, gaps=gaps, notes=notes)
 
 
 def _running_sums(steps: Any) -> Any:
@@ -213,80 +236,12 @@ def _new_starts(values: FloatArray, stamps: Stamps) -> BoolArray:
     return anew
 
 
-def _build(
-    stamps: Stamps, values: FloatArray, numbers: FloatArray | None, anew: BoolArray, notes: list[str]
-) -> Timeline:
-    """Times, rising counter and gaps of samples in order, without repeats."""
-    seconds, irregular = np.diff(values), False
-    period_s = float(np.median(seconds[~anew])) if (~anew).any() else float("nan")
-    if numbers is None:
-        periods, irregular = _by_clock(seconds, anew)
-    else:
-        periods = np.maximum(np.diff(numbers), 1.0)
-        if stamps.time_s is None:
-            period_s, seconds = stamps.period_s, periods * stamps.period_s
-    if contradiction := _stated_otherwise(stamps, seconds, anew):
-        if numbers is not None:
-            raise InvalidInputError(contradiction)
-        notes.append(f"{contradiction}, which holds")
-    if irregular:
-        shortest, longest = 1e3 * seconds.min(), 1e3 * seconds.max()
-        notes.append(
-            f"irregular clock, steps of {shortest:.3g} to {longest:.3g} ms: single losses cannot be told"
-        )
-    if anew.any():
-        pauses = _pauses(stamps, anew, seconds)
-        certain = anew & np.isfinite(pauses)
-        seconds = np.where(anew, np.where(certain, pauses, UNKNOWN_PAUSE_S), seconds)
-        notes.append(
-            f"the sensor started anew {anew.sum()} times; the pause is by the computer's clock "
-            f"{certain.sum()} times, else not known and taken as {UNKNOWN_PAUSE_S:g} s"
-        )
-    long = (seconds > _LONGER * period_s) & (not irregular)
-    at = np.flatnonzero((periods > 1.5) | anew | long)
-    missing = np.where(anew[at], 0, np.round(np.minimum(periods[at], _MOST_PERIODS)) - 1)
-    gaps = tuple(Gap(int(i), int(count), float(seconds[i])) for i, count in zip(at, missing, strict=True))
-    time_s, counter = stamps.time_s, stamps.counter
-    if time_s is None or anew.any():
-        time_s = (0.0 if time_s is None else time_s[0]) + _running_sums(seconds)
-    if counter is not None:
-        counter = counter[0] + _running_sums(np.maximum(np.diff(counter), 1))
-    return Timeline(slice(None), time_s, counter, gaps, tuple(notes))
-
-
-def _stated_otherwise(stamps: Stamps, seconds: FloatArray, anew: BoolArray) -> str:
-    """Sentence on a stated rate that is neither the samples' nor the counter's by their clock."""
-    going = (seconds > 0.0) & ~anew
-    if not (stamps.period_s > 0.0 and going.any()):
-        return ""
-    rates = [float(np.median(1.0 / seconds[going]))]
-    if stamps.counter is not None:
-        rates.append(float(np.median(np.diff(stamps.counter)[going] / seconds[going])))
-    if any(1.0 / _AGREES < rate * stamps.period_s < _AGREES for rate in rates):
-        return ""
-    stated_hz = 1.0 / stamps.period_s
-    return f"expected times at the stated rate, {stated_hz:g} Hz, got {rates[0]:.4g} Hz by their clock"
-
-
-def _by_clock(seconds: FloatArray, anew: BoolArray) -> tuple[FloatArray, bool]:
-    """Whole periods of each step; whether the clock is irregular: jitter makes short steps, losses none."""
-    running = seconds[~anew]
-    if not running.size:
-        return np.ones(seconds.size), False
-    period_s = running[running < 2.5 * np.median(running)].mean()
-    periods = seconds / period_s
-    irregular = bool(np.mean(running < _SHORTER * period_s) > _RARE)
-    return np.where(periods > (_MUCH_LONGER if irregular else _LONGER), np.round(periods), 1.0), irregular
-
-
-def _pauses(stamps: Stamps, anew: BoolArray, seconds: FloatArray) -> FloatArray:
-    """Pause before each new start by the computer's clock, shape (m - 1,); NaN where that is not known."""
+def _pauses(computer_s: FloatArray | None, anew: BoolArray, running_s: FloatArray) -> FloatArray:
+    """Pause before each new start by the computer's clock; NaN where that is not known."""
     pauses = np.full(anew.size, np.nan)
-    if stamps.computer_s is None:
-        return pauses
-    running = _running_sums(np.where(anew, 0.0, seconds))
-    behind = stamps.computer_s - running  # constant while the sensor runs, and larger by each pause
-    for before, after in pairwise(np.flatnonzero(np.isfinite(behind))):
-        if anew[before:after].sum() == 1:
-            pauses[after - 1] = behind[after] - behind[before]
-    return np.where(pauses > 0.0, pauses, np.nan)
+    if computer_s is not None:
+        behind = computer_s - running_s  # constant while the sensor runs, and larger by each pause
+        for before, after in pairwise(np.flatnonzero(np.isfinite(behind))):
+            if anew[before + 1 : after + 1].sum() == 1 and behind[after] > behind[before]:
+                pauses[after] = behind[after] - behind[before]
+    return pauses[anew]

@@ -8,7 +8,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from speckle3d.core.arrays import FloatArray
-from xsens.logs.clocks import Stamps, require_rate, spread, timeline
+from speckle3d.core.errors import InvalidInputError
+from xsens.logs.clocks import Stamps, spread, timeline
 from xsens.logs.faults import without_faults
 from xsens.logs.samples import VECTORS, ImuLog
 from xsens.logs.worlds import Claim, likelier, nwu_from, quaternions_of, world_of
@@ -39,8 +40,8 @@ class Hints:
     as_stated: bool = False
 
     def __post_init__(self) -> None:
-        if self.rate_hz is not None:
-            require_rate(self.rate_hz, "rate_hz")
+        if self.rate_hz is not None and not 1e-3 <= self.rate_hz <= 1e5:
+            raise InvalidInputError(f"rate_hz: expected 0.001 to 100000, got {self.rate_hz:g}")
         if self.world is not None:
             nwu_from(self.world)
 
