@@ -15,11 +15,11 @@ from xsens.logs.clocks import COUNTS, TICK_S, TICKS, Stamps, unwrap
 from xsens.logs.faults import at_ends
 from xsens.logs.parts import Parts
 from xsens.logs.samples import VECTORS
-from xsens.logs.worlds import Claim
+from xsens.logs.worlds import Claim, quaternions_of, rotation_vectors
 from xsens.messages.control import Configuration, MessageId, utc_time_s
 from xsens.messages.framing import Frames, Message
-from xsens.messages.mtdata import DataLayout, OutputMode, as_floats
-from xsens.messages.mtdata2 import MEASURED, ORIENTATIONS, STAMPS, read_items
+from xsens.messages.mtdata import DataLayout, OutputMode, Values, as_floats
+from xsens.messages.mtdata2 import read_items
 from xsens.messages.rawcounts import BLOCK_SIZE, COMPENSATION_NOTE, RawCalibration
 
 _STARTS = (MessageId.WAKE_UP, MessageId.GO_TO_MEASUREMENT_ACK, MessageId.UTC_TIME)
@@ -37,10 +37,35 @@ def _stretches(frames: Frames, indices: IntArray) -> Stamps:
     return Stamps(starts=starts, computer_s=computer_s)
 
 
+_NOTATIONS = ("quaternion_wxyz", "matrix", "euler_deg")
+
+
+def _parts(
+    frames: Frames, indices: IntArray, values: Values, claim: Claim, notes: list[str], **changes: Any
+) -> Parts:
+    """Samples of the messages at `indices` by the values that they hold, with changes of their stamps."""
+    counter, ticks = (
+        unwrap(values[name][:, 0].astype(np.int64), span) if name in values else None
+        for name, span in (("counter", COUNTS), ("ticks", TICKS))
+    )
+    time_s = None if ticks is None else ticks * TICK_S
+    notations = [quaternions_of(values[name]) for name in _NOTATIONS if name in values]
+    return Parts(
+        replace(_stretches(frames, indices), counter=counter, time_s=time_s, **changes),
+        tuple(map(values.get, VECTORS)),
+        {"": notations[0]} if notations else {},
+        claim,
+        tuple(notes),
+        (
+            values.get("delta_v_m_s"),
+            rotation_vectors(values["delta_q_wxyz"]) if "delta_q_wxyz" in values else None,
+        ),
+    )
+
+
 # -- legacy MTData
 
 _RAW_VECTORS = ("raw_accelerometer", "raw_gyroscope", "raw_magnetometer")
-_NOTATIONS = ("quaternion_wxyz", "matrix", "euler_deg")
 _READ_FIELDS = ("counter", *VECTORS, *_NOTATIONS)
 
 
@@ -77,17 +102,8 @@ def legacy_samples(frames: Frames, indices: IntArray) -> Parts:
             if ends.any():
                 values[name][ends] = np.nan
                 notes.append(f"{name.split('_')[0]}: {ends.sum()} at the end of the range: taken as missing")
-    counter = values.get("counter")
-    return Parts(
-        replace(
-            _stretches(frames, indices),
-            period_s=1.0 / rate_hz,
-            counter=None if counter is None else unwrap(counter[:, 0].astype(np.int64), COUNTS),
-        ),
-        tuple(map(values.get, VECTORS)),
-        next((values[name] for name in _NOTATIONS if name in values), None),
-        Claim(layout.frame, "as configured"),
-        tuple(notes),
+    return _parts(
+        frames, indices, values, Claim(layout.frame, "as configured"), notes, period_s=1.0 / rate_hz
     )
 
 
@@ -127,13 +143,13 @@ def mtdata2_samples(frames: Frames, indices: IntArray) -> Parts:
     InvalidInputError
         If none holds a measurement, or none a time.
     """
-    items, world, rows, damage = read_items(frames[indices])
+    values, world, rows, damage = read_items(frames[indices])
     notes = []
     if damage.any():
         notes.append(f"{damage.sum()} messages could not be taken apart and were left out")
-    stamps = [items.pop(name, None) for name in STAMPS]
-    for stamp in stamps:
-        rows &= True if stamp is None else np.isfinite(stamp[:, 0])
+    for name in ("counter", "ticks"):
+        if name in values:
+            rows &= np.isfinite(values[name][:, 0])
     if not rows.any():
         raise InvalidInputError(
             f"expected measurements with a time in {indices.size} MTData2 messages, got none"
@@ -141,26 +157,6 @@ def mtdata2_samples(frames: Frames, indices: IntArray) -> Parts:
     extras = None
     if not rows.all():
         notes.append(f"{(~rows).sum()} messages without a measurement or its time are no samples")
-        items = {name: values[rows] for name, values in items.items()}
+        values = {name: column[rows] for name, column in values.items()}
         extras, indices = np.cumsum(~rows, dtype=np.int64)[rows], indices[rows]
-    counter, ticks = (
-        None if stamp is None else unwrap(stamp[rows, 0].astype(np.int64), span)
-        for stamp, span in zip(stamps, (COUNTS, TICKS), strict=True)
-    )
-    notation = next((name for name in ORIENTATIONS if name in items), None)
-    orientations = None if notation is None else items[notation]
-    if orientations is not None and notation == ORIENTATIONS[1]:
-        orientations = orientations.reshape(-1, 3, 3).swapaxes(1, 2).reshape(-1, 9)
-    return Parts(
-        replace(
-            _stretches(frames, indices),
-            counter=counter,
-            time_s=None if ticks is None else ticks * TICK_S,
-            extras=extras,
-        ),
-        tuple(map(items.get, MEASURED)),
-        orientations,
-        Claim(world or "NWU", "as its messages say"),
-        tuple(notes),
-        (items.get("delta_v_m_s"), items.get("delta_q_wxyz")),
-    )
+    return _parts(frames, indices, values, Claim(world or "NWU", "as its messages say"), notes, extras=extras)

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
 from xsens.logs.clocks import Stamps, spread, timeline
 from xsens.logs.faults import without_faults
 from xsens.logs.samples import VECTORS, ImuLog
-from xsens.logs.worlds import Claim, likelier, nwu_from, quaternions_of, world_of
+from xsens.logs.worlds import Claim, nwu_from, own_rotations
 
 
 @dataclass(frozen=True)
@@ -55,24 +55,20 @@ class Parts:
     stamps : Stamps
     vectors : tuple of ndarray, shape (m, 3), or None
         Readings of accelerometer, gyroscope and magnetometer.
-    orientations : ndarray, optional
-        The sensor's own, in a notation of `quaternions_of`.
+    notations : mapping of str to ndarray, shape (m, 4)
+        The sensor's own orientation, as `own_rotations` has it.
     claim : Claim, optional
         Its world; None for one that has nothing to do with north and up.
     increments : tuple of ndarray, shapes (m, 3) and (m, 3) or (m, 4), or None
-        Of velocity, and of orientation as rotation vector or quaternion, over each sampling period.
-    otherwise : ndarray, optional
-        Orientations if the numbers mean something else, as `otherwise_note` says.
+        Of velocity, and rotation vectors, over each sampling period.
     """
 
     stamps: Stamps
     vectors: tuple[FloatArray | None, ...] = (None, None, None)
-    orientations: FloatArray | None = None
+    notations: Mapping[str, FloatArray] = field(default_factory=dict)
     claim: Claim | None = None
     notes: tuple[str, ...] = ()
     increments: tuple[FloatArray | None, FloatArray | None] = (None, None)
-    otherwise: FloatArray | None = None
-    otherwise_note: str = ""
 
 
 def assemble_log(parts: Parts, hints: Hints, source: str) -> ImuLog:
@@ -84,65 +80,38 @@ def assemble_log(parts: Parts, hints: Hints, source: str) -> ImuLog:
         If they have neither a clock, nor a rate; if orientation and acceleration contradict each other; or if
         they are of several sensors.
     """
-    stamps, notes, rows, vectors = parts.stamps, list(parts.notes), parts.orientations, list(parts.vectors)
+    stamps, notes, vectors = parts.stamps, list(parts.notes), list(parts.vectors)
     if hints.rate_hz is not None:
         stamps = replace(stamps, period_s=1.0 / hints.rate_hz)
     scaled = []
     for i, part in enumerate(parts.increments):
         if part is not None and vectors[i] is None:
-            vectors[i] = _rotation_vectors(part)
+            vectors[i] = part
             scaled.append(VECTORS[i])
             notes.append(f"{VECTORS[i].split('_')[0]}: increments over the sampling period")
+    readings = [part for part in (*vectors, *parts.notations.values()) if part is not None]
     has_counter = stamps.counter is not None
     if not has_counter and stamps.time_s is None and stamps.period_s > 0.0:
-        samples = next(len(v) for v in (stamps.starts, *vectors, rows) if v is not None)
+        samples = next(len(part) for part in (stamps.starts, *readings) if part is not None)
         stamps = replace(stamps, counter=np.arange(samples))
         notes.append("samples have no counter: losses cannot be found")
     rotations, oriented = None, np.zeros(0, dtype=bool)
-    if rows is not None:
-        wxyz = quaternions_of(rows)
-        if parts.otherwise is not None:
-            notations = [wxyz, quaternions_of(parts.otherwise)]
-            if best := likelier(notations, vectors[0]):
-                wxyz = notations[best]
-                notes.append(f"orientation: {parts.otherwise_note}, by its own accelerometer")
-        oriented = np.asarray(np.isfinite(wxyz).all(axis=1))
+    if parts.notations:
         claim = parts.claim if hints.world is None else Claim(hints.world, "as given", final=True)
-        world = "NWU" if claim is None else claim.world
-        if claim is not None and not hints.as_stated and oriented.any():
-            world, world_notes = world_of(claim, wxyz, vectors[0], vectors[2])
-            notes += world_notes
-        rotations = nwu_from(world) * Rotation.from_quat(
-            np.where(oriented[:, None], wxyz, 0.5), scalar_first=True
-        )
-        if not oriented.all():
-            notes.append(f"{int((~oriented).sum())} samples lack the sensor's own orientation")
-    stamps, burst_notes = spread(stamps, (*vectors, rows))
-    notes += burst_notes
+        force, _, field_au = vectors
+        rotations, oriented, more = own_rotations(parts.notations, claim, force, field_au, hints.as_stated)
+        notes += more
+    stamps, burst_notes = spread(stamps, readings)
     line = timeline(stamps)
-    oriented = oriented[line.rows] if oriented.any() else oriented[:0]
-    force, rate, field = (None if readings is None else readings[line.rows] for readings in vectors)
     log = ImuLog(
         line.time_s,
-        force,
-        rate,
-        field,
-        rotations[line.rows] if rotations is not None and oriented.size else None,
+        *(None if part is None else part[line.rows] for part in vectors),
+        rotations[line.rows] if rotations is not None and oriented.any() else None,
         line.counter if has_counter else None,
         line.gaps,
-        (*notes, *line.notes),
+        (*notes, *burst_notes, *line.notes),
         source,
-        oriented,
+        oriented[line.rows] if oriented.any() else oriented[:0],
     )
     log = replace(log, **{name: getattr(log, name) * log.rate_hz for name in scaled})
     return without_faults(log)
-
-
-def _rotation_vectors(numbers: FloatArray) -> FloatArray:
-    """Rotation vectors of quaternions, NaN of those that are damage; vectors as they are."""
-    if numbers.shape[1] == 3:
-        return numbers
-    wxyz = quaternions_of(numbers)
-    finite = np.isfinite(wxyz)
-    turns = Rotation.from_quat(np.where(finite, wxyz, 1.0), scalar_first=True)
-    return np.where(finite[:, :1], turns.as_rotvec(), np.nan)

@@ -32,7 +32,7 @@ from xsens.logs.texttables import (
     number,
     read_table,
 )
-from xsens.logs.worlds import Claim, are_rotations
+from xsens.logs.worlds import Claim, are_rotations, quaternions_of, rotation_vectors
 
 _SENSOR_LIKE = re.compile("acc|gyr|mag|quat|euler|roll|pitch|yaw|time")
 _EQUALS = r"\s*[:=,;][,;\s]*"
@@ -134,18 +134,18 @@ def _samples(table: TextTable, rate_hz: float | None) -> Parts:
         else:
             notes.append("acceleration without gravity is no accelerometer's reading and was left out")
     notation = next(filter(readings.__contains__, _ORIENTATIONS), "")
-    orientation, claim, otherwise = readings.get(notation), _claim(table, dot), None
-    meaning = ""
+    claim: Claim | None = _claim(table, dot)
+    notations = {"": quaternions_of(readings[notation])} if notation else {}
     if notation == "optical":
         claim = None
         notes.append("orientation: by cameras, in a world of their own: x and z need not be north and up")
     elif notation == "quat":
-        otherwise, meaning = np.roll(readings["quat"], 1, axis=1), "the scalar is the last number"
+        notations["the scalar is the last number"] = np.roll(notations[""], 1, axis=1)
     elif notation == "euler" and "time" in table.columns and "euler_roll" not in table.with_unit:
         angles = readings["euler"]
         if np.nanmax(np.abs(angles), initial=0.0) < _HALF_TURN:
-            otherwise, meaning = np.degrees(angles), "angles are in radians"
-        if otherwise is not None and "acc" not in readings:
+            notations["angles are in radians"] = quaternions_of(np.degrees(angles))
+        if len(notations) > 1 and "acc" not in readings:
             raise InvalidInputError("expected angles with their unit, as roll_deg, got small ones without")
     odd = _unknown_columns(table)
     if not readings.keys() - {"free"}:
@@ -153,17 +153,9 @@ def _samples(table: TextTable, rate_hz: float | None) -> Parts:
         raise InvalidInputError(
             f"expected columns of acceleration, rate of turn, field or orientation, {columns_text}"
         )
-    force, rate, field, speed_step, turn = map(readings.get, ("acc", "gyr", "mag", "dv", "dq"))
-    return Parts(
-        stamps,
-        (force, rate, field),
-        orientation,
-        claim,
-        (*odd, *notes),
-        (speed_step, turn),
-        otherwise,
-        meaning,
-    )
+    vectors = readings.get("acc"), readings.get("gyr"), readings.get("mag")
+    turns = rotation_vectors(readings["dq"]) if "dq" in readings else None
+    return Parts(stamps, vectors, notations, claim, (*odd, *notes), (readings.get("dv"), turns))
 
 
 def _stamps(

@@ -7,7 +7,7 @@ may disturb some samples. The dip of the field has no part in it: it points up i
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -106,26 +106,66 @@ def are_rotations(numbers: FloatArray) -> BoolArray:
     return np.asarray((off < _WORST_NORM) & (np.linalg.det(matrices) > 0.0))
 
 
+def rotation_vectors(wxyz: FloatArray) -> FloatArray:
+    """Rotation vectors of quaternions, NaN of those that are damage."""
+    good = np.isfinite(quaternions_of(wxyz)[:, :1])
+    turns = Rotation.from_quat(np.where(good, wxyz, 1.0), scalar_first=True)
+    return np.where(good, turns.as_rotvec(), np.nan)
+
+
 # -- worlds
 
 
-def likelier(notations: Sequence[FloatArray], acceleration: FloatArray | None) -> int:
-    """Index of the notation in which the acceleration at rest is vertical; 0 unless another surely is.
+def own_rotations(
+    notations: Mapping[str, FloatArray],
+    claim: Claim | None,
+    acceleration: FloatArray | None,
+    field: FloatArray | None,
+    as_stated: bool = False,
+) -> tuple[Rotation, BoolArray, tuple[str, ...]]:
+    """The sensor's own orientation in NWU, where it has one, and notes on it.
 
     Parameters
     ----------
-    notations : sequence of ndarray, shape (m, 4)
-        Orientations of the same samples by what their numbers may mean, scalar first.
-    acceleration : ndarray, shape (m, 3), or None
+    notations : mapping of str to ndarray, shape (m, 4)
+        Orientations of the same samples, scalar first, by what their numbers may mean; the usual first.
+    claim : Claim, optional
+        Their world; None for one that has nothing to do with north and up.
+    acceleration, field : ndarray, shape (m, 3), or None
+    as_stated : bool
+        Take the world that is claimed, whatever the readings show.
+
+    Raises
+    ------
+    InvalidInputError
+        If acceleration and orientation contradict each other, unless the claim is final.
     """
-    tilts_deg = []
-    for wxyz in notations:
+    meaning = likelier(notations, acceleration)
+    wxyz, notes = (
+        notations[meaning],
+        (f"orientation: {meaning}, by its own accelerometer",) if meaning else (),
+    )
+    oriented = np.asarray(np.isfinite(wxyz).all(axis=1))
+    world = "NWU" if claim is None else claim.world
+    if claim is not None and not as_stated and oriented.any():
+        world, world_notes = world_of(claim, wxyz, acceleration, field)
+        notes += world_notes
+    if not oriented.all():
+        notes += (f"{int((~oriented).sum())} samples lack the sensor's own orientation",)
+    turns = Rotation.from_quat(np.where(oriented[:, None], wxyz, 0.5), scalar_first=True)
+    return nwu_from(world) * turns, oriented, notes
+
+
+def likelier(notations: Mapping[str, FloatArray], acceleration: FloatArray | None) -> str:
+    """Notation in which the acceleration at rest is vertical; the first unless another surely is."""
+    tilts_deg = {}
+    for meaning, wxyz in notations.items():
         vectors = _in_world(wxyz, acceleration)
         upright = [0.0] if vectors is None else np.abs(_at_rest(vectors)[:, 2])
-        tilts_deg.append(np.degrees(np.arccos(min(np.percentile(upright, 10), 1.0))))
-    best = int(np.argmin(tilts_deg))
-    sure = np.hypot(tilts_deg[0], _SURE_DEG) > _BETTER * np.hypot(tilts_deg[best], _SURE_DEG)
-    return best if sure else 0
+        tilts_deg[meaning] = np.degrees(np.arccos(min(np.percentile(upright, 10), 1.0)))
+    first, best = next(iter(tilts_deg)), min(tilts_deg, key=tilts_deg.__getitem__)
+    sure = np.hypot(tilts_deg[first], _SURE_DEG) > _BETTER * np.hypot(tilts_deg[best], _SURE_DEG)
+    return best if sure else first
 
 
 def _at_rest(vectors: FloatArray) -> FloatArray:

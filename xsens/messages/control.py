@@ -95,8 +95,8 @@ def utc_message(moment: datetime | None = None) -> Message:
 
 
 def utc_time_s(message: Message) -> float:
-    """Seconds since 1970 of a UTC message; NaN if it is another one or holds no valid date."""
-    if message.mid != MessageId.UTC_TIME or len(message.payload) != _UTC.size:
+    """Seconds since 1970 of a UTC message; NaN if it holds no valid date."""
+    if len(message.payload) != _UTC.size:
         return float("nan")
     nanosecond, year, month, day, hour, minute, second, _ = _UTC.unpack(message.payload)
     try:

@@ -84,7 +84,7 @@ _RAW = (
     Field("raw_temperature", 1, ">u2"),
 )
 _COUNTER = Field("counter", 1, ">u2")
-_ORIENTATION = (Field("quaternion_wxyz", 4), Field("euler_deg", 3), Field("matrix", 9))
+_ORIENTATION = (Field("quaternion_wxyz", 4), Field("euler_deg", 3), Field("matrix", 9), None)
 _PARTS = (
     (OutputMode.TEMPERATURE, 0, Field("temperature_c", 1)),
     (OutputMode.CALIBRATED, OutputSettings.NO_ACCELEROMETER, Field("accelerometer_m_s2", 3)),
@@ -98,8 +98,6 @@ _PARTS = (
     (OutputMode.STATUS, 0, Field("status", 1, ">u1")),
 )
 """Part, the setting that leaves the field out, and the field (None: by the settings), in order."""
-
-_ALL_MODES = sum(OutputMode)
 
 
 @dataclass(frozen=True)
@@ -122,14 +120,10 @@ class DataLayout:
     settings: int = OutputSettings.COUNTER
 
     def __post_init__(self) -> None:
-        raw = self.mode & (OutputMode.RAW | OutputMode.MT9)
-        if not self.mode or self.mode & ~_ALL_MODES or (raw and self.mode not in tuple(OutputMode)):
-            raise InvalidInputError(
-                f"output mode: expected raw counts alone or any of the others, got {self.mode:#06x}"
-            )
         if (self.settings >> 2) & 3 == 3 or not self.fields:
             raise InvalidInputError(
-                f"output settings: expected some output, orientation as 0, 1 or 2, got {self.settings:#x}"
+                f"expected output mode and settings of some known output, got {self.mode:#x}, "
+                f"{self.settings:#x}"
             )
 
     @property

@@ -14,21 +14,17 @@ from speckle3d.core.arrays import BoolArray
 from xsens.messages.framing import Frames, rows_at
 from xsens.messages.mtdata import REAL, Field, Values, as_floats
 
-STAMPS = ("packet_counter", "sample_time_fine")
-MEASURED = ("acceleration_m_s2", "rate_of_turn_rad_s", "magnetic_field_au")
-ORIENTATIONS = ("quaternion_wxyz", "rotation_matrix_by_column", "euler_deg")
-
 KINDS = {
-    0x1020: Field(STAMPS[0], 1, ">u2"),
-    0x1060: Field(STAMPS[1], 1, ">u4"),
-    0x2010: Field(ORIENTATIONS[0], 4),
-    0x2020: Field(ORIENTATIONS[1], 9),
-    0x2030: Field(ORIENTATIONS[2], 3),
+    0x1020: Field("counter", 1, ">u2"),
+    0x1060: Field("ticks", 1, ">u4"),
+    0x2010: Field("quaternion_wxyz", 4),
+    0x2020: Field("matrix", 9),
+    0x2030: Field("euler_deg", 3),
     0x4010: Field("delta_v_m_s", 3),
-    0x4020: Field(MEASURED[0], 3),
-    0x8020: Field(MEASURED[1], 3),
+    0x4020: Field("accelerometer_m_s2", 3),
+    0x8020: Field("gyroscope_rad_s", 3),
     0x8030: Field("delta_q_wxyz", 4),
-    0xC020: Field(MEASURED[2], 3),
+    0xC020: Field("magnetometer_au", 3),
 }
 """Identifiers of the vendor's list that are read, their last four bits zero for real numbers."""
 
@@ -77,8 +73,8 @@ def read_items(frames: Frames) -> Items:
             matches = (identifiers == identifier) & (sizes == size) & (after <= end)
             if not matches.any():
                 continue
-            is_sample[rows[matches]] |= kind.name not in STAMPS
-            if kind.name in ORIENTATIONS:
+            is_sample[rows[matches]] |= not kind.whole
+            if identifier >> 12 == 2:  # an orientation
                 frame = _WORLDS[identifier >> 2 & 3]
                 world = world or frame
                 if frame != world:
@@ -88,6 +84,8 @@ def read_items(frames: Frames) -> Items:
             values[kind.name][rows[matches]] = as_floats(rows_at(data, at[matches] + 3, size).view(number))
         at = after
     is_sample &= ~damage
+    if "matrix" in values:  # sent column by column
+        values["matrix"] = values["matrix"].reshape(-1, 3, 3).swapaxes(1, 2).reshape(-1, 9)
     for column in values.values():
         column[damage] = np.nan
     return Items(values, world, is_sample, damage)

@@ -13,7 +13,7 @@ import numpy as np
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
-from xsens.messages.control import MessageId, rate_of
+from xsens.messages.control import rate_of
 from xsens.messages.framing import Message
 
 BLOCK_SIZE = 168
@@ -73,14 +73,8 @@ class RawCalibration:
 
     @classmethod
     def from_message(cls, message: Message) -> RawCalibration:
-        """Decode an eMTS message; raises `InvalidInputError` at another one, or another kind of sensor's."""
-        data = message.payload
-        if message.mid != MessageId.EMTS or len(data) != BLOCK_SIZE:
-            raise InvalidInputError(
-                f"calibration block: expected message {MessageId.EMTS:#04x} of {BLOCK_SIZE} bytes, "
-                f"got {message.mid:#04x} of {len(data)}"
-            )
-        block = np.frombuffer(data, _BLOCK)[0]
+        """Decode an eMTS message of `BLOCK_SIZE` bytes."""
+        block = np.frombuffer(message.payload, _BLOCK)[0]
         return cls(
             rate_of(int(block["period"])),
             block["offsets"].astype(float),

@@ -22,8 +22,8 @@ def test_a_record_of_a_real_mt9():
 def test_a_packet_of_a_real_mti():
     data = "faff3626102002468210600401c4fc3e2010103f71ce6cbea56bcf3c613bd8bd691d25e020040040000312"
     values, world, is_sample, broken_data = read_items(find_frames(bytes.fromhex(data)))
-    assert (sorted(values), world) == (["packet_counter", "quaternion_wxyz", "sample_time_fine"], "ENU")
+    assert (sorted(values), world) == (["counter", "quaternion_wxyz", "ticks"], "ENU")
     assert (is_sample.all(), broken_data.any()) == (True, False)
-    assert (values["packet_counter"].item(), values["sample_time_fine"].item()) == (18050.0, 29686846.0)
+    assert (values["counter"].item(), values["ticks"].item()) == (18050.0, 29686846.0)
     quaternion = [[0.944556, -0.323088, 0.013747, -0.056913]]
     np.testing.assert_allclose(values["quaternion_wxyz"], quaternion, atol=5e-7)
