@@ -12,7 +12,7 @@ import numpy as np
 from speckle3d.core.arrays import BoolArray, IntArray
 from speckle3d.core.errors import InvalidInputError
 from xsens.logs.clocks import COUNTS, TICK_S, TICKS, Stamps, unwrap
-from xsens.logs.faults import at_ends
+from xsens.logs.faults import stuck_axes
 from xsens.logs.parts import Parts
 from xsens.logs.samples import VECTORS
 from xsens.logs.worlds import Claim, quaternions_of, rotation_vectors
@@ -97,11 +97,13 @@ def legacy_samples(frames: Frames, indices: IntArray) -> Parts:
         notes.append(COMPENSATION_NOTE)
         for sensor, name in enumerate(VECTORS):
             counts = layout.decode(data, _RAW_VECTORS[sensor])
-            ends = at_ends(counts)  # which the units' mixture of axes would hide
+            ends = stuck_axes(counts)  # which the units' mixture of axes would hide
             values[name] = calibration.to_units(sensor, as_floats(counts))
             if ends.any():
                 values[name][ends] = np.nan
-                notes.append(f"{name.split('_')[0]}: {ends.sum()} at the end of the range: taken as missing")
+                notes.append(
+                    f"{name.split('_')[0]}: {ends.sum()} with an axis that stands still: taken as missing"
+                )
     return _parts(
         frames, indices, values, Claim(layout.frame, "as configured"), notes, period_s=1.0 / rate_hz
     )

@@ -11,8 +11,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from speckle3d.core.arrays import BoolArray, FloatArray
+from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
+from xsens.logs.clocks import usual_step
 from xsens.logs.samples import VECTORS, ImuLog, finite_rows, median_norm, row_norms, selection
 
 
@@ -58,6 +59,9 @@ _TURNS_APART = 5.0
 
 _NOISY = 10.0
 """Last digits: readings that change by more are not repeated by chance. Usual changes: more is a jump."""
+
+_STUCK = 5
+"""Rows in which an axis may stand still by chance, where its noise is a few of its last digits."""
 
 _ENOUGH = 50
 _MOST_SENSORS = 8
@@ -123,9 +127,15 @@ def _bad(name: str, rows: FloatArray, force: FloatArray, rate: FloatArray) -> di
         "readings of zero": zero,
         "out of range": beyond,
         "repeated": repeats,
-        "at the end of the range": at_ends(rows),
+        "with an axis that stands still": stuck_axes(rows, _SLOW_RAD_S if name == VECTORS[1] else 0.0),
         "single spikes": _spikes(rows, limits.spike * unit),
     }
+
+
+def _runs(rows: FloatArray) -> tuple[IntArray, IntArray]:
+    """First row and length of each run of equal rows."""
+    start = np.flatnonzero(np.append(True, np.logical_or.reduce([axis[1:] != axis[:-1] for axis in rows.T])))
+    return start, np.diff(np.append(start, len(rows)))
 
 
 def _repeats(name: str, change: float, rows: FloatArray, force: FloatArray, rate: FloatArray) -> BoolArray:
@@ -134,19 +144,18 @@ def _repeats(name: str, change: float, rows: FloatArray, force: FloatArray, rate
     One in ten of a sensor's samples may last longer: its rate is another than that of the log.
     Where readings before and after change by many of their last digits, none is repeated by chance.
     """
-    changes = np.logical_or.reduce([axis[1:] != axis[:-1] for axis in rows.T])
-    start = np.flatnonzero(np.append(True, changes))
-    length = np.diff(np.append(start, len(rows)))
+    start, length = _runs(rows)
     middle, high = np.percentile(length, [50, 90]) if len(length) > 1 else (1, 1)
     usual = int(min(3.0 * middle, high))
     long, repeats = length > max(2, 2 * usual), np.zeros(len(rows), dtype=bool)
     if not long.any():
         return repeats
+    start, length = start[long], length[long]
     steps = np.diff(rows, axis=0)
     step = np.pad(row_norms(steps), 1, constant_values=np.nan)
-    changes = step[start]
-    at, start, length = np.flatnonzero(np.repeat(long, length)), start[long], length[long]
     before, after, first = step[start], step[start + length], np.cumsum(length) - length
+    place = np.arange(length.sum()) - np.repeat(first, length)
+    at = np.repeat(start, length) + place
     moves = (np.minimum(before, after) > _NOISY * _digit(steps)) | (after > change)
     moves |= np.isnan(after) & (start > 0)
     if name == VECTORS[1]:  # a resting one may read its bias, or zero
@@ -161,27 +170,29 @@ def _repeats(name: str, change: float, rows: FloatArray, force: FloatArray, rate
     valid = np.full(len(start), usual)
     if bad.any():  # what readings jump to again and again is none, but a number that stands for none
         _, code, count = np.unique(rows[start[bad]], axis=0, return_inverse=True, return_counts=True)
-        valid[bad] *= (count[code] == 1) | ~(before[bad] > _NOISY * np.median(np.nan_to_num(changes)))
-    place = at - np.repeat(start, length)
+        valid[bad] *= (count[code] == 1) | ~(before[bad] > _NOISY * np.nanmedian(step))
     repeats[at] = np.repeat(bad, length) & (place >= np.repeat(valid, length))
     return repeats
 
 
-def at_ends(rows: FloatArray) -> BoolArray:
-    """Rows in which an axis stays at its highest or lowest value, from one steep slope to another."""
+def stuck_axes(rows: FloatArray, least: float = 0.0) -> BoolArray:
+    """Rows in which an axis repeats a value larger than the least, while others go on: dead, or saturated.
+
+    Slopes before and after are steep: beyond its last digits, and a tenth of its usual change.
+    """
     bad = np.zeros(len(rows), dtype=bool)
     for column in rows.T:
-        axis = np.asarray(column, dtype=float)
-        for end in {float(np.fmax.reduce(axis)), float(np.fmin.reduce(axis))} - {0.0}:
-            at = np.flatnonzero(axis == end)
-            if at.size < 3:
-                continue
-            steps = np.abs(np.pad(np.diff(axis), 2))  # into each sample from the second before it, and out
-            first, last = at[np.diff(at, prepend=-2) > 1], at[np.diff(at, append=len(axis) + 1) > 1]
-            steep = np.minimum(steps[first], steps[last + 3]) > 3.0 * _digit(steps)
-            for i, k in zip(first[steep], last[steep], strict=True):
-                others_go_on = (rows[i + 1 : k + 1] != rows[i:k]).any(axis=1).sum() > 1
-                bad[i : k + 1] |= others_go_on
+        axis = column[:, None].astype(float)
+        start, length = _runs(axis)
+        long = length > max(_STUCK, 2.0 * float(np.median(length)))
+        start, length = start[long], length[long]
+        steps = np.abs(np.pad(np.diff(axis[:, 0]), 2, constant_values=np.nan))
+        slope = np.fmin(steps[start], steps[start + length + 2])  # of the two samples before, and after
+        steep = slope > max(3.0 * _digit(steps), 0.1 * usual_step(steps))
+        steep &= np.abs(axis[start, 0]) >= least
+        for i, k in zip(start[steep], (start + length)[steep], strict=True):
+            others_go_on = (rows[i + 1 : k] != rows[i : k - 1]).any(axis=1).sum() > 1
+            bad[i + 1 : k] |= others_go_on
     return bad
 
 
