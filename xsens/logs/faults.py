@@ -63,6 +63,9 @@ _NOISY = 10.0
 _STUCK = 5
 """Rows in which an axis may stand still by chance, where its noise is a few of its last digits."""
 
+_SCATTERED = 0.5
+"""Share of white noise in readings, of their square and of their steps', from which they are noise."""
+
 _ENOUGH = 50
 _MOST_SENSORS = 8
 _LOOKED_AT = 1000
@@ -129,7 +132,17 @@ def _bad(name: str, rows: FloatArray, force: FloatArray, rate: FloatArray) -> di
         "repeated": repeats,
         "with an axis that stands still": stuck_axes(rows, _SLOW_RAD_S if name == VECTORS[1] else 0.0),
         "single spikes": _spikes(rows, limits.spike * unit),
+        "noise": valid & (name == VECTORS[2] and _is_noise(rows[valid])),
     }
+
+
+def _is_noise(rows: FloatArray) -> bool:
+    """Whether readings of a vector of constant length are scattered about zero, each on its own."""
+    if len(rows) < _ENOUGH:
+        return False
+    step, spread = row_norms(np.diff(rows, axis=0)) ** 2, np.mean(row_norms(rows - rows.mean(axis=0)) ** 2)
+    scattered = spread > _SCATTERED * np.mean(row_norms(rows) ** 2)
+    return bool(scattered and usual_step(step, 0.0) > 2.0 * _SCATTERED * spread)
 
 
 def _runs(rows: FloatArray) -> tuple[IntArray, IntArray]:
@@ -170,7 +183,7 @@ def _repeats(name: str, change: float, rows: FloatArray, force: FloatArray, rate
     valid = np.full(len(start), usual)
     if bad.any():  # what readings jump to again and again is none, but a number that stands for none
         _, code, count = np.unique(rows[start[bad]], axis=0, return_inverse=True, return_counts=True)
-        valid[bad] *= (count[code] == 1) | ~(before[bad] > _NOISY * np.nanmedian(step))
+        valid[bad] *= (count[code] == 1) | ~(before[bad] > _NOISY * usual_step(step))
     repeats[at] = np.repeat(bad, length) & (place >= np.repeat(valid, length))
     return repeats
 
