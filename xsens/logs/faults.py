@@ -61,7 +61,7 @@ _NOISY = 10.0
 """Last digits: readings that change by more are not repeated by chance. Usual changes: more is a jump."""
 
 _STUCK = 5
-"""Rows in which an axis may stand still by chance, where its noise is a few of its last digits."""
+"""Samples in which an axis may stand still by chance, where its noise is a few of its last digits."""
 
 _SCATTERED = 0.5
 """Share of white noise in readings, of their square and of their steps', from which they are noise."""
@@ -189,23 +189,32 @@ def _repeats(name: str, change: float, rows: FloatArray, force: FloatArray, rate
 
 
 def stuck_axes(rows: FloatArray, least: float = 0.0) -> BoolArray:
-    """Rows in which an axis repeats a value larger than the least, while others go on: dead, or saturated.
+    """Rows in which an axis repeats a value, at least so large, while others go on: saturated, or dead.
 
-    Slopes before and after are steep: beyond its last digits, and a tenth of its usual change.
+    At the end of its range slopes before and after are steep; a dead axis jumps, or never changes again.
     """
     bad = np.zeros(len(rows), dtype=bool)
+    longest = _STUCK * float(np.median(_runs(rows)[1]))
     for column in rows.T:
-        axis = column[:, None].astype(float)
-        start, length = _runs(axis)
-        long = length > max(_STUCK, 2.0 * float(np.median(length)))
+        axis = column.astype(float)
+        start, length = _runs(axis[:, None])
+        long = (length > 2) & (length < len(rows)) & (np.abs(axis[start]) >= least)
+        if not long.any():
+            continue
         start, length = start[long], length[long]
-        steps = np.abs(np.pad(np.diff(axis[:, 0]), 2, constant_values=np.nan))
-        slope = np.fmin(steps[start], steps[start + length + 2])  # of the two samples before, and after
-        steep = slope > max(3.0 * _digit(steps), 0.1 * usual_step(steps))
-        steep &= np.abs(axis[start, 0]) >= least
-        for i, k in zip(start[steep], (start + length)[steep], strict=True):
+        steps, value, end = (
+            np.abs(np.pad(np.diff(axis), 2, constant_values=np.nan)),
+            axis[start],
+            start + length,
+        )
+        steep = np.fmin(steps[start], steps[end + 2]) > 3.0 * _digit(steps)
+        at_end = (value == np.fmax.reduce(axis)) | (value == np.fmin.reduce(axis))
+        jumps = np.fmax(steps[start + 1], steps[end + 1]) > _NOISY * usual_step(steps)
+        dead = (length > longest) & (jumps | ((end == len(rows)) & (value != 0.0)))
+        stuck = dead | (at_end & steep & (value != 0.0))
+        for i, k in zip(start[stuck], end[stuck], strict=True):
             others_go_on = (rows[i + 1 : k] != rows[i : k - 1]).any(axis=1).sum() > 1
-            bad[i + 1 : k] |= others_go_on
+            bad[i:k] |= others_go_on
     return bad
 
 
