@@ -198,7 +198,7 @@ def stuck_axes(rows: FloatArray, least: float = 0.0) -> BoolArray:
     for column in rows.T:
         axis = column.astype(float)
         start, length = _runs(axis[:, None])
-        long = (length > 2) & (length < len(rows)) & (np.abs(axis[start]) >= least)
+        long = (length > 2) & (np.abs(axis[start]) >= least)
         if not long.any():
             continue
         start, length = start[long], length[long]
@@ -209,8 +209,9 @@ def stuck_axes(rows: FloatArray, least: float = 0.0) -> BoolArray:
         )
         steep = np.fmin(steps[start], steps[end + 2]) > 3.0 * _digit(steps)
         at_end = (value == np.fmax.reduce(axis)) | (value == np.fmin.reduce(axis))
-        jumps = np.fmax(steps[start + 1], steps[end + 1]) > _NOISY * usual_step(steps)
-        dead = (length > longest) & (jumps | ((end == len(rows)) & (value != 0.0)))
+        usual = usual_step(steps, np.inf)
+        jumps = np.fmax(steps[start + 1], steps[end + 1]) > _NOISY * usual
+        dead = (length > longest) & (jumps | ((end == len(rows)) & (value != 0.0) & (usual < np.inf)))
         stuck = dead | (at_end & steep & (value != 0.0))
         for i, k in zip(start[stuck], end[stuck], strict=True):
             others_go_on = (rows[i + 1 : k] != rows[i : k - 1]).any(axis=1).sum() > 1

@@ -103,9 +103,12 @@ def assemble_log(parts: Parts, hints: Hints, source: str) -> ImuLog:
         notes += more
     stamps, burst_notes = spread(stamps, readings)
     line = timeline(stamps)
+    force, rate, field_au = (None if part is None else part[line.rows] for part in vectors)
     log = ImuLog(
         line.time_s,
-        *(None if part is None else part[line.rows] for part in vectors),
+        force,
+        rate,
+        field_au,
         rotations[line.rows] if rotations is not None and oriented.any() else None,
         line.counter if has_counter else None,
         line.gaps,

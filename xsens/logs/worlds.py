@@ -122,7 +122,7 @@ def own_rotations(
     acceleration: FloatArray | None,
     field: FloatArray | None,
     as_stated: bool = False,
-) -> tuple[Rotation, BoolArray, tuple[str, ...]]:
+) -> tuple[Rotation, BoolArray, list[str]]:
     """The sensor's own orientation in NWU, where it has one, and notes on it.
 
     Parameters
@@ -141,17 +141,15 @@ def own_rotations(
         If acceleration and orientation contradict each other, unless the claim is final.
     """
     meaning = likelier(notations, acceleration)
-    wxyz, notes = (
-        notations[meaning],
-        (f"orientation: {meaning}, by its own accelerometer",) if meaning else (),
-    )
+    wxyz = notations[meaning]
+    notes = [f"orientation: {meaning}, by its own accelerometer"] if meaning else []
     oriented = np.asarray(np.isfinite(wxyz).all(axis=1))
     world = "NWU" if claim is None else claim.world
     if claim is not None and not as_stated and oriented.any():
         world, world_notes = world_of(claim, wxyz, acceleration, field)
         notes += world_notes
     if not oriented.all():
-        notes += (f"{int((~oriented).sum())} samples lack the sensor's own orientation",)
+        notes.append(f"{int((~oriented).sum())} samples lack the sensor's own orientation")
     turns = Rotation.from_quat(np.where(oriented[:, None], wxyz, 0.5), scalar_first=True)
     return nwu_from(world) * turns, oriented, notes
 
