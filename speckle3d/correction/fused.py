@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
@@ -34,6 +35,10 @@ from speckle3d.correction.settings import FusedSettings
 HUBER = 2.0
 """Deviations, by the root mean square of three residuals, at which a reading begins to lose weight."""
 MOST_ROUNDS, LEAST_STEP = 12, 1e-5
+ROUNDS = 2
+"""The first finds how the sensors wander, which the second solves with."""
+NEGLIGIBLE = 1e-4
+"""Weight of a wander that has no say in the covariance."""
 FARTHEST = 2.0
 """Factor between the lengths of images and tracker beyond which no average of the two means anything."""
 
@@ -53,35 +58,51 @@ class FusionProblem:
         return [slice(int(first), int(last)) for first, last in zip([0, *ends[:-1]], ends, strict=True)]
 
     def solve(self) -> tuple[FloatArray, FloatArray, FusionProblem]:
-        """Best unknowns, their covariance, and the problem with the sensors' jitter as it was found.
+        """Best unknowns, their covariance, and the problem with the sensors' likeliest wander."""
+        problem, unknowns = self, np.zeros(self.columns[-1].stop)
+        for _ in range(ROUNDS):
+            unknowns = problem.gauss_newton(unknowns)
+            problem, step, covariance = problem.likeliest(unknowns)
+            unknowns = unknowns + step
+        return unknowns, covariance, problem
 
-        Where images and tracker strain the tracker's millimetres, the covariance grows by as much.
+    def likeliest(self, unknowns: FloatArray) -> tuple[FusionProblem, FloatArray, FloatArray]:
+        """The problem with the sensors' likeliest wander; the mean step over all, and its covariance.
+
+        Each wander counts by its evidence, in Laplace's approximation at the unknowns.
         """
-        # A path that cannot follow a sensor that wanders shows how large its error is.
-        stiff = replace(self, path=self.path.stiff)
-        unknowns, _ = stiff.gauss_newton(np.zeros(self.columns[-1].stop))
-        poses = self.path.chain.poses(unknowns[self.columns[0]])
-        sensors = [sensor.with_jitter_along(poses, part) for sensor, part in self._of_sensors(unknowns)]
-        problem = replace(self, sensors=tuple(sensors))
-        unknowns, matrix = problem.gauss_newton(unknowns)
-        strain = max([1.0, *(sensor.strain(part) for sensor, part in self._of_sensors(unknowns))])
-        return unknowns, strain**2 * np.asarray(np.linalg.inv(matrix), dtype=float), problem
-
-    def _of_sensors(self, unknowns: FloatArray) -> list[tuple[SensorReadings, FloatArray]]:
-        """Each sensor with its unknowns."""
-        parts = [unknowns[columns] for columns in self.columns[1:]]
-        return list(zip(self.sensors, parts, strict=True))
-
-    def gauss_newton(self, unknowns: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Gauss-Newton with Huber's weights: unknowns, and the matrix of the normal equations there."""
         matrix, gradient = self.normal_equations(unknowns)
+        variants = [replace(self, sensors=s) for s in product(*(sensor.wanders() for sensor in self.sensors))]
+        evidence, steps, factors = [], [], []
+        for variant in variants:
+            normal, pull, log_evidence = matrix.copy(), gradient.copy(), 0.0
+            for old, new, columns in zip(self.sensors, variant.sensors, self.columns[1:], strict=True):
+                (residual, root), (new_residual, new_root) = (s.prior(unknowns[columns]) for s in (old, new))
+                normal[columns, columns] += new_root.T @ new_root - root.T @ root
+                pull[columns] += new_root.T @ new_residual - root.T @ residual
+                log_evidence += np.log(new.wander.probability) - new_residual @ new_residual / 2.0
+                log_evidence += np.linalg.slogdet(new_root)[1]
+            factors.append(cho_factor(normal))
+            steps.append(-cho_solve(factors[-1], pull))
+            log_evidence -= pull @ steps[-1] / 2.0 + np.log(np.diag(factors[-1][0])).sum()
+            evidence.append(log_evidence)
+        weight = np.exp(np.array(evidence) - max(evidence))
+        weight /= weight.sum()
+        mean, covariance = weight @ np.array(steps), np.zeros_like(matrix)
+        for k in np.flatnonzero(weight > NEGLIGIBLE):
+            away = steps[k] - mean
+            covariance += weight[k] * (cho_solve(factors[k], np.eye(mean.size)) + np.outer(away, away))
+        return variants[int(np.argmax(weight))], mean, covariance
+
+    def gauss_newton(self, unknowns: FloatArray) -> FloatArray:
+        """Best unknowns by Gauss-Newton with Huber's weights."""
         for _ in range(MOST_ROUNDS):
+            matrix, gradient = self.normal_equations(unknowns)
             step = cho_solve(cho_factor(matrix), -gradient)
             unknowns = unknowns + step
-            matrix, gradient = self.normal_equations(unknowns)
             if np.abs(step[self.columns[0]]).max() < LEAST_STEP:
                 break
-        return unknowns, matrix
+        return unknowns
 
     def normal_equations(self, unknowns: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Matrix and gradient, summed over pieces of the equations."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy import sparse
@@ -24,7 +24,6 @@ LEAST_STEP_MM = 0.005
 HAND_TURN_RAD = float(np.deg2rad(1.0))
 """How far a scanning hand tilts and yaws in a second, deviation of a random walk: over tissue images see none
 of it. Three freehand sweeps of the PLUS library turn by 0.4 to 1.6 degrees in a second."""
-HELD_MM = 1e-6
 LEAST_SCALE_CHANGE = 0.1
 """The scale changes along a sweep by at least this share of what it may be wrong by."""
 Z = AXES.index("z")
@@ -96,13 +95,6 @@ class ImagePath:
         sigma[:, 1:] = np.sqrt(scatter + density[:, None] * travel)
         sigma[3:5, 1:] = np.hypot(sigma[3:5, 1:], HAND_TURN_RAD * np.sqrt(np.diff(frame_time_s[knots])))
         return cls(CorrectedChain.of(path, AXES, basis), sigma, step)
-
-    @property
-    def stiff(self) -> ImagePath:
-        """The path whose places are corrected by rates alone."""
-        sigma = self.sigma.copy()
-        sigma[:3, 1:] = HELD_MM
-        return replace(self, sigma=sigma)
 
     def prior(self, coefficients: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Coefficients over their deviations, and derivatives; of the scale's rate the logarithm counts."""

@@ -5,8 +5,8 @@ A reading of orientation or pose at time t is, but for its jitter,
     world * wander(t) * path(t + late) * (centre from sensor) * mounting
 
 with a tracker's places stretched by its millimetres. The unknowns are small and kept in one vector: turn and
-shift of the world, turn and shift of the mounting, clock, log of the millimetres, and an orientation sensor's
-wandering error at knots in time.
+shift of the world, turn and shift of the mounting, clock, log of the millimetres, and the wandering error at
+knots in time: a turn of an orientation sensor, a shift of a tracker.
 """
 
 from __future__ import annotations
@@ -21,15 +21,21 @@ from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.geometry import skew
 from speckle3d.core.leastsquares import robust_sigma
 from speckle3d.core.sweep import OrientationSensor, Tracker
-from speckle3d.correction.claims import correlated_readings
 from speckle3d.correction.image_path import ImagePath
 from speckle3d.correction.settings import FusedSettings
 
 FEWEST_READINGS = 10
 PER_PIECE = 512
 """Readings whose equations are held in memory at a time."""
-WANDER_KNOTS_PER_TIME, MOST_WANDER_KNOTS = 10, 60
+WANDER_KNOTS_PER_TIME, MOST_WANDER_KNOTS = 10, 30
 """Knots of the wandering error in the time in which it changes."""
+WANDER_MM = np.geomspace(0.03, 3.0, 7)
+"""Sizes of a tracker's wandering error that are tried: from what optical ones have to what metal does to a
+field."""
+WANDER_TIMES = (0.1, 0.3, 1.0, 3.0)
+"""Times in which it changes, over the sweep's: shorter ones look like jitter, longer ones like a line."""
+STEADY = 0.5
+"""Probability, before anything is read, that it does not wander."""
 LEAST_JITTER = np.array([2e-5, 2e-3])
 """Of a turn, rad, and a place, mm: the last digits of sensors; simulated ones may have no noise."""
 TICK_S = 1e-3
@@ -37,6 +43,25 @@ ANYWHERE = 1e4
 """Standard deviation of what is not known at all, mm and rad."""
 WORLD_TURN, WORLD_SHIFT, MOUNTING_TURN, MOUNTING_SHIFT = (slice(k, k + 3) for k in (0, 3, 6, 9))
 CLOCK, MILLIMETRES, RIGID = 12, 13, 14
+
+
+@dataclass(frozen=True)
+class Wander:
+    """A slow error of Ornstein and Uhlenbeck's kind.
+
+    Attributes
+    ----------
+    size : ndarray, shape (3,)
+        Standard deviation along the world's axes, rad or mm.
+    time_s : float
+        In which it changes.
+    probability : float
+        Before anything is read.
+    """
+
+    size: FloatArray
+    time_s: float
+    probability: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -55,6 +80,8 @@ class SensorReadings:
         On the images' clock.
     jitter : ndarray, shape (2,)
         Standard deviation of a turn, rad, and of a place, mm, about each axis.
+    wander : Wander
+        Of an orientation sensor's turns or of a tracker's places.
     """
 
     name: str
@@ -66,6 +93,7 @@ class SensorReadings:
     frame_time_s: FloatArray
     settings: FusedSettings
     jitter: FloatArray
+    wander: Wander
 
     @classmethod
     def of(
@@ -91,6 +119,7 @@ class SensorReadings:
             return None
         places = isinstance(sensor, Tracker)
         centre = RigidTransform.from_translation(centre_mm if places else np.zeros(3))
+        slow = settings.inclination_sigma_rad, settings.inclination_sigma_rad, settings.heading_sigma_rad
         readings = cls(
             sensor.label,
             places,
@@ -101,6 +130,7 @@ class SensorReadings:
             frame_time_s,
             settings,
             np.ones(2),
+            Wander(np.array(slow), settings.wander_s),
         )
         readings = replace(readings, world=readings._consensus_world(path))
         second = [
@@ -112,12 +142,20 @@ class SensorReadings:
 
     @property
     def knots_s(self) -> FloatArray:
-        """Times at which the wandering error is unknown; none of a tracker."""
-        if self.places:
-            return np.zeros(0)
+        """Times at which the wandering error is unknown."""
         times = np.ptp(self.time_s) / self.settings.wander_s
         count = int(np.clip(np.ceil(WANDER_KNOTS_PER_TIME * times), 2, MOST_WANDER_KNOTS))
-        return np.linspace(self.time_s[0], self.time_s[-1], count)
+        return np.linspace(self.time_s[0], self.time_s[-1], MOST_WANDER_KNOTS if self.places else count)
+
+    def wanders(self) -> list[SensorReadings]:
+        """The readings with all that a tracker's wandering error may be; an orientation sensor's is known."""
+        if not self.places:
+            return [self]
+        span = float(np.ptp(self.time_s))
+        share = (1.0 - STEADY) / (len(WANDER_MM) * len(WANDER_TIMES))
+        sizes = [Wander(np.full(3, LEAST_JITTER[1]), span, STEADY)]
+        sizes += [Wander(np.full(3, mm), span * time, share) for mm in WANDER_MM for time in WANDER_TIMES]
+        return [replace(self, wander=wander) for wander in sizes]
 
     @property
     def size(self) -> int:
@@ -173,11 +211,12 @@ class SensorReadings:
         """Expected less measured turns, rad, and places, mm, along the world's axes, shape (m, 3) each."""
         expected = self._expected(path, unknowns)
         turn = (expected.rotation * self.world_from_sensor.rotation.inv()).as_rotvec()
+        wander = self._hats() @ unknowns[RIGID:].reshape(-1, 3)
         if not self.places:
-            return turn + self._hats() @ unknowns[RIGID:].reshape(-1, 3), np.zeros_like(turn)
+            return turn + wander, np.zeros_like(turn)
         place = expected.translation
         stretch = unknowns[MILLIMETRES] * (place - place.mean(axis=0))
-        return turn, place + stretch - self.world_from_sensor.translation
+        return turn, place + stretch + wander - self.world_from_sensor.translation
 
     def equations(
         self, path: ImagePath, coefficients: FloatArray, unknowns: FloatArray
@@ -222,8 +261,10 @@ class SensorReadings:
         slopes[:, :, WORLD_TURN] = np.eye(3)
         slopes[:, :, MOUNTING_TURN] = axes
         slopes[:, :, CLOCK] = ahead[0][rows]
-        slopes[:, :, RIGID:] = np.einsum("mk,ij->mikj", self._hats()[rows], np.eye(3)).reshape(len(at), 3, -1)
-        if self.places:
+        wander = np.einsum("mk,ij->mikj", self._hats()[rows], np.eye(3)).reshape(len(at), 3, -1)
+        if not self.places:
+            slopes[:, :, RIGID:] = wander
+        else:
             on_path = (world.inv() * expected[rows]).translation
             slopes = places[:, :, c:]
             places[:, :, :c] = to_world @ (shift - skew(on_path) @ turn)
@@ -232,6 +273,7 @@ class SensorReadings:
             slopes[:, :, MOUNTING_SHIFT] = axes
             slopes[:, :, CLOCK] = ahead[1][rows]
             slopes[:, :, MILLIMETRES] = place[rows] - place.mean(axis=0)
+            slopes[:, :, RIGID:] = wander
         return turns, places
 
     def prior(self, unknowns: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -242,30 +284,11 @@ class SensorReadings:
         k = self.knots_s.size
         matrix = np.zeros((self.size, self.size))
         matrix[range(RIGID), range(RIGID)] = rigid
-        size = np.array([s.inclination_sigma_rad, s.inclination_sigma_rad, s.heading_sigma_rad])
-        decay = np.exp(-np.diff(self.knots_s)[:1] / s.wander_s)
+        decay = np.exp(-np.diff(self.knots_s)[:1] / self.wander.time_s)
         change = np.eye(k) - decay * np.eye(k, k=-1)
         change[1:] /= np.sqrt(1.0 - decay**2)
-        matrix[RIGID:, RIGID:] = np.kron(change, np.diag(1.0 / size))
+        matrix[RIGID:, RIGID:] = np.kron(change, np.diag(1.0 / self.wander.size))
         return matrix @ unknowns, matrix
-
-    def strain(self, unknowns: FloatArray) -> float:
-        """Error of a tracker's millimetres over its standard deviation beforehand."""
-        return float(abs(unknowns[MILLIMETRES])) / self.settings.tracker_scale_sigma
-
-    def with_jitter_along(self, path: FloatArray, unknowns: FloatArray) -> SensorReadings:
-        """The readings with the jitter that is left of them along a path.
-
-        Parameters
-        ----------
-        path : ndarray, shape (n, 4, 4)
-            Too stiff to follow a sensor that wanders.
-        """
-        jitter = [
-            max(robust_sigma(error), least) * np.sqrt(correlated_readings(error))
-            for error, least in zip(self.errors(path, unknowns), self.jitter, strict=True)
-        ]
-        return replace(self, jitter=np.array(jitter))
 
 
 def _rigid(samples: RigidTransform | Rotation) -> RigidTransform:
