@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import RigidTransform
 from spoiled_images import first_vectors, in_order
 
@@ -12,6 +13,7 @@ from speckle3d.core.streams import TimedPoses
 from speckle3d.correction.fused import fuse
 from speckle3d.correction.scale import ScaleEvidence
 from speckle3d.corrections import correct
+from speckle3d.scoring.lengths import compare_modes
 from speckle3d.tracking import track
 
 
@@ -65,3 +67,15 @@ def test_outliers_of_a_tracker_move_the_poses_little(sweep, tracking):
     ends = [(fit.poses[0].inv() * fit.poses[-1]).apply(sweep.grid.centre_mm)[2] for fit in (clean, outliers)]
     # A tenth of the readings near the end are off by ten claimed deviations of it and more.
     assert abs(ends[1] - ends[0]) < 2 * np.sqrt(clean.covariance[-1, 2, 2])
+
+
+def test_a_tracker_that_wanders_is_claimed_to(sweep, tracking):
+    rng, times = np.random.default_rng(11), sweep.tracker.readings.time_s
+    errors = []
+    for _ in range(8):
+        wander = gaussian_filter1d(rng.normal(size=(times.size, 3)), times.size / 20, axis=0)
+        shifts = displace(sweep.tracker, 0.5 * wander / wander.std())
+        poses = fuse_images(tracking, sweep, 0.08, tracker=shifts)
+        (row,) = compare_modes({"fused": poses.poses}, sweep.truth, sweep.grid.centre_mm, end_frames=1)
+        errors.append(row.length_error_percent / 100 / poses.log_scale_sigma)
+    assert np.sqrt(np.mean(np.square(errors))) < 0.65
