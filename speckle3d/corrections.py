@@ -1,4 +1,4 @@
-"""Tracked sweeps corrected in every mode: by cubics, by a crossing sweep, by all that is known."""
+"""Correct tracked sweeps in every mode."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Two sweeps over the same tissue, tracked and crossed: each gives the other its length."""
+"""Track and register two crossing sweeps over the same tissue."""
 
 from __future__ import annotations
 

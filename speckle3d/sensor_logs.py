@@ -1,4 +1,4 @@
-"""Logs of the orientation sensor, whatever holds them: a file of its own, a sweep, the sensor in a probe."""
+"""Logs of the orientation sensor from log files, sweeps and handheld packages."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from xsens.logs.samples import ImuLog
 
 
 def held_log(path: Path) -> ImuLog | None:
-    """Log of the sensor that a recording holds; None of what is a log itself."""
+    """Log of the sensor in a recording; None if the file is itself a log."""
     if find_reader(path) is not READER:
         sensor = ridden_along(path)
         return None if sensor is None else log_of(sensor, path.name)

@@ -1,4 +1,4 @@
-"""Decorrelation curves of a probe of which nothing was measured but what its data sheet says."""
+"""Decorrelation curves calculated from a probe's data sheet."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ LEAST_AMPLITUDE = 1e-4
 
 
 class ProbeSheet(BaseModel):
-    """A probe as its data sheet and the scanner's settings have it (``probe.toml``)."""
+    """Data sheet of a probe and settings of the scanner (``probe.toml``)."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -102,7 +102,7 @@ class ProbeSheet(BaseModel):
 def data_sheet_curves(
     sheet: ProbeSheet, like: Sweep | None = None, config: Config | None = None
 ) -> DecorrelationCurves:
-    """Decorrelation curves of a probe that were not measured but calculated, by diffraction.
+    """Calculate decorrelation curves of a probe by diffraction.
 
     Parameters
     ----------
@@ -160,7 +160,7 @@ def data_sheet_curves(
 
 
 def _key(sheet: ProbeSheet, settings: Config) -> CurveKey:
-    """What curves are for that are made like no sweep."""
+    """Key of curves that are made without an example sweep."""
     for name in ("vector_pitch_mm", "sampling_rate_mhz"):
         if getattr(sheet, name) is None:
             raise InvalidInputError(f"{name}: expected in the probe's settings, or a sweep, got none")
@@ -185,7 +185,7 @@ def _interpolate(depth_mm: FloatArray, values: FloatArray) -> FloatArray:
 
 
 def sheet_sigma(sheet: ProbeSheet, depth_mm: FloatArray, has_spectrum: bool) -> float:
-    """Relative standard deviation that the sheet's tolerances and the model leave in all distances.
+    """Relative standard deviation of all distances by the sheet's tolerances and the model.
 
     Tissue is within the attenuation's tolerance. With the echo's spectrum known, neither attenuation nor
     frequency matters any more.

@@ -1,4 +1,4 @@
-"""The poses of a sweep's frames by its images, and all that is known of them."""
+"""Result of tracking a sweep: image-based poses with their errors."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 @shown
 @dataclass(frozen=True)
 class Tracked:
-    """What the image-based stages found.
+    """Image-based poses of a sweep with errors, curves, pairs and doubts.
 
     Attributes
     ----------
@@ -105,7 +105,7 @@ class Tracked:
         return pose_table(self.image, centre_mm, self.covariance, time_s=time_s, flags=self.flags)
 
     def facts(self) -> list[tuple[str, object]]:
-        """What the tracked sweep shows of itself."""
+        """Summary lines of the tracked sweep."""
         z = self.image.translation[:, 2]
         flag_count = int(np.count_nonzero(self.flags))
         doubts = "; ".join(f"{doubt.about}: {doubt.suspect or doubt.evidence}" for doubt in self.doubts)

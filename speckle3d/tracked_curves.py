@@ -1,4 +1,4 @@
-"""Decorrelation curves from sweeps whose length a tracker or a crossing sweep tells, and images the steps.
+"""Decorrelation curves corrected by sweeps of known length (tracker or crossing sweep).
 
 A tracker's jitter is a good part of the steps between frames, and smoothing it away takes the hand's pauses
 and tremor with it: curves fitted to smoothed positions come out 8 % too narrow. The images' own steps are far
@@ -90,7 +90,7 @@ def _fit_length(
     progress: Progress | None,
     rounds: int = ROUNDS,
 ) -> DecorrelationCurves:
-    """Curves with which the images of some sweeps have the length that the tracker has."""
+    """Curves scaled until the images' lengths of some sweeps equal the tracker's."""
     for _ in range(rounds):
         results = [track(sweep, curves, config, progress) for sweep in sweeps]
         lengths = [tracker_scale(sweep, result) for sweep, result in zip(sweeps, results, strict=True)]
@@ -99,7 +99,7 @@ def _fit_length(
 
 
 def jitters(sweep: Sweep) -> bool:
-    """Whether positions come from a tracker whose jitter counts, not from the truth or a stage."""
+    """Whether positions come from a noisy tracker, not from the truth or a stage."""
     if sweep.truth is not None or sweep.tracker is None or len(sweep) < 3:
         return False
     poses = sweep.tracker.world_from_image(sweep.frame_time_s)

@@ -1,4 +1,4 @@
-"""The public face of `speckle3d.pipeline.track`: arguments checked, and curves read that nobody names."""
+"""Public `track`: checks arguments and finds curves, then runs `speckle3d.pipeline.track`."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def track(
 
 
 def require_kind(value: Any, kind: type, name: str, made_by: str) -> None:
-    """Raise unless an argument is of a kind.
+    """Raise `InvalidInputError` unless an argument has a type.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""A calibration: where the image is relative to a sensor, how well it is known, and what it was made from."""
+"""A calibration: pose of the image relative to a sensor, with covariance and provenance."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _PIXELS = {"s_x": ", columns", "s_y": ", rows"}
 
 
 def readable(value: float, unit: str) -> tuple[str, str]:
-    """Format a number and its unit for people: angles in degrees, pixel sizes to 10 nm."""
+    """Format a number with its unit: angles in degrees, pixel sizes to 10 nm."""
     if unit == "rad":
         return f"{np.rad2deg(value):.3f}", "deg"
     return f"{value:.{5 if unit == 'mm/pixel' else 3}f}", unit
@@ -30,7 +30,7 @@ def readable(value: float, unit: str) -> tuple[str, str]:
 
 @dataclass(frozen=True)
 class Parameter:
-    """One estimated number with its standard error; zero where it was given and not estimated."""
+    """Estimated parameter with its standard error, which is zero if the parameter was fixed."""
 
     name: str
     value: float
@@ -38,7 +38,7 @@ class Parameter:
     unit: str
 
     def row(self) -> tuple[str, str, str]:
-        """Name, value with its 95 % interval, and unit, for people."""
+        """Name, value with its 95 % interval, and unit, as text."""
         value, unit = readable(self.value, self.unit)
         place = ", phantom" if self.name.endswith("_c") else _PIXELS.get(self.name, "")
         half = readable(1.96 * self.standard_error, self.unit)[0]
@@ -47,7 +47,7 @@ class Parameter:
 
 @dataclass(frozen=True)
 class FramesUsed:
-    """Frames that a calibration uses, and why the others were dropped.
+    """Frames used in a calibration, and the reasons for dropping the others.
 
     Attributes
     ----------
@@ -74,7 +74,7 @@ class FramesUsed:
 
 @dataclass(frozen=True)
 class Source:
-    """What a calibration was made from."""
+    """Provenance of a calibration: input file, package version, settings."""
 
     input_path: str = ""
     input_sha256: str = ""
@@ -85,7 +85,7 @@ class Source:
 @shown
 @dataclass(frozen=True)
 class Calibration:
-    """Where the image is relative to a sensor.
+    """Pose of the image relative to a sensor.
 
     Parameters
     ----------
@@ -145,7 +145,7 @@ class Calibration:
             raise InvalidInputError(f"pixel_mm: expected values above zero, got {self.pixel_mm}")
 
     def rows(self) -> list[tuple[str, str, str]]:
-        """Description, value with its 95 % interval, and unit, angles in degrees, for people."""
+        """Description, value with its 95 % interval, and unit as text, angles in degrees."""
         rows = [("method", self.method, ""), ("sensor", self.sensor, "")]
         rows += [parameter.row() for parameter in self.parameters if parameter.name not in _ANGLES]
         angles = np.rad2deg(roll_yaw_tilt(self.rotation))
@@ -184,7 +184,7 @@ class Calibration:
 
     @property
     def mounting(self) -> RigidTransform | Rotation:
-        """What of the image's pose in its sensor is known."""
+        """Calibrated part of the image's pose in its sensor: rotation, or rotation and place."""
         return self.sensor_from_image if self.sensor == "tracker" else self.rotation
 
     def pixel_matrix(self) -> FloatArray:
@@ -199,7 +199,7 @@ class Calibration:
 
 
 def calibrated(sweep: Sweep, calibration: Calibration) -> Sweep:
-    """Put a calibration on a sweep's sensor, in place of what the sweep says of it.
+    """Replace the mounting of a sweep's sensor by a calibration.
 
     The sensor's clock offset is replaced if the calibration knows one; the image grid stays as it is.
 

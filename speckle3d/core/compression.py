@@ -1,4 +1,4 @@
-"""Dynamic range of log-compressed images that nobody says, from their speckle.
+"""Estimate the unknown dynamic range of log-compressed images from their speckle.
 
 Where speckle is fully developed, the 10th and the 90th percentile of its decibels lie 13.4 dB apart, whatever
 is scanned [1]_; how many grey levels that is, the range says. Filters and compounding bring them nearer to

@@ -1,4 +1,4 @@
-"""What about a recording cannot be believed, and why."""
+"""Findings about a recording: what is contradicted, by what evidence."""
 
 from __future__ import annotations
 
@@ -40,5 +40,5 @@ class Doubt:
 
     @property
     def consequence(self) -> str:
-        """The doubt as a line, which says so where what is doubted is not used."""
+        """The finding as one line of text, with its consequence."""
         return f"{self}; refused" if self.refuted else str(self)

@@ -16,7 +16,7 @@ LABEL_TYPES = ("uint8", "uint16")
 
 @dataclass(frozen=True)
 class Segment:
-    """What one label means.
+    """Name and colour of one label.
 
     Parameters
     ----------

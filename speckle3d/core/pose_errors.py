@@ -1,4 +1,4 @@
-"""Errors that all frames' poses have together, and what they do to points and to integrals over surfaces."""
+"""Joint errors of all frames' poses, propagated to points and to integrals over surfaces."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from speckle3d.core.shown import shown
 
 
 class Belonging(NamedTuple):
-    """Which frames points belong to: two each, with weights that add up to one.
+    """Two frames for each point, with interpolation weights that sum to one.
 
     Attributes
     ----------
@@ -29,7 +29,7 @@ class Belonging(NamedTuple):
     gap_mm: FloatArray
 
     def of_points(self, rows: IntArray) -> Belonging:
-        """The same of some of the points."""
+        """Frames and weights of a subset of the points."""
         return Belonging(self.frames[rows], self.weights[rows], self.gap_mm[rows])
 
 
@@ -87,7 +87,7 @@ class PoseErrors:
         return np.asarray((along**2).sum(axis=(1, 2)))
 
     def of_gradient(self, points_mm: FloatArray, gradient: FloatArray, belonging: Belonging) -> FloatArray:
-        """What a quantity changes by for one deviation of each variable, shape (m,).
+        """Change of a quantity for one standard deviation of each variable, shape (m,).
 
         Parameters
         ----------
@@ -100,7 +100,7 @@ class PoseErrors:
 
     @property
     def _screws(self) -> FloatArray:
-        """What each variable moves and turns each frame by, about the world's origin, shape (n, 6, m).
+        """Displacement and rotation of each frame by each variable, about the origin, shape (n, 6, m).
 
         What it displaces a point by along a force is the product with the force and its moment.
         """
@@ -111,6 +111,6 @@ class PoseErrors:
 
 
 def _forces(points_mm: FloatArray, along: FloatArray, belonging: Belonging) -> FloatArray:
-    """Forces on points and their moments, shared out to the frames they belong to, shape (k, 2, 6)."""
+    """Gradients at points and their moments, distributed to the points' frames, shape (k, 2, 6)."""
     moments = np.hstack([along, np.cross(points_mm, along)])
     return np.asarray(belonging.weights[..., None] * moments[:, None])

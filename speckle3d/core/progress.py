@@ -1,4 +1,4 @@
-"""How far a long piece of work has come: told to a callable, shown as rich's bar."""
+"""Progress of long work, reported to a callable and shown as a progress bar."""
 
 from __future__ import annotations
 

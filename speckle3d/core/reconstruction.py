@@ -60,7 +60,7 @@ class FramePairs:
 
 @dataclass(frozen=True)
 class CalibrationFile:
-    """A calibration file that replaced what a sweep says of one of its sensors."""
+    """A calibration file that replaced the mounting of one of a sweep's sensors."""
 
     sensor: str
     path: str
@@ -77,7 +77,7 @@ class SourceFile:
 
 @dataclass(frozen=True)
 class ImportRecord:
-    """Settings over what a recording says itself, which were in force when it was read.
+    """Import settings that overrode or completed a recording's metadata.
 
     Attributes
     ----------
@@ -111,7 +111,7 @@ class Provenance:
 
 @dataclass(frozen=True)
 class SharedErrors:
-    """What the image-based distances of all frames have wrong together; see `speckle3d.motion.uncertainty`.
+    """Errors common to the image-based distances of all frames; see `speckle3d.motion.uncertainty`.
 
     Attributes
     ----------
@@ -137,7 +137,7 @@ class SharedErrors:
 @shown
 @dataclass(frozen=True)
 class ModeErrors:
-    """What a corrected mode claims of its poses' errors.
+    """Claimed errors of the poses of a corrected mode.
 
     Attributes
     ----------

@@ -51,5 +51,5 @@ class RelativePoses:
         return int(self.first.size)
 
     def mirrored(self) -> RelativePoses:
-        """The same edges of the sweep that went the other way."""
+        """Edges of the mirrored sweep."""
         return RelativePoses(self.first, self.second, mirrored(self.poses), MIRROR @ self.covariance @ MIRROR)

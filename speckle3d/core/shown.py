@@ -1,4 +1,4 @@
-"""How results show themselves: a few lines of text."""
+"""Text representation of results in a few lines."""
 
 from __future__ import annotations
 

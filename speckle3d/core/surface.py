@@ -19,7 +19,7 @@ from speckle3d.core.shown import shown
 @shown
 @dataclass(frozen=True)
 class Surface:
-    """Triangles whose corners, seen from outside, go round against the clock.
+    """Triangle mesh with corners counter-clockwise as seen from outside.
 
     Parameters
     ----------
@@ -73,12 +73,12 @@ class Surface:
 
     @property
     def volume_mm3(self) -> float:
-        """Volume inside, less that of cavities; of an open surface it means nothing."""
+        """Enclosed volume, less cavities; meaningless for an open surface."""
         middles = self.vertices_mm[self.triangles].sum(axis=1) / 3.0 - self.vertices_mm.mean(axis=0)
         return float((self.normals_mm2 * middles).sum() / 3.0)
 
     def open_edges(self) -> IntArray:
-        """Edges that only one triangle has, vertices of each, shape (e, 2): the border of an open surface."""
+        """Border edges, which only one triangle has, as pairs of vertices, shape (e, 2)."""
         edges, n = self._edges(), len(self.vertices_mm)
         # One number per edge: sorted ten times as fast as pairs.
         number, count = np.unique(edges.min(axis=1) * n + edges.max(axis=1), return_counts=True)
@@ -92,7 +92,7 @@ class Surface:
         return np.unique(part[self.triangles[:, 0]], return_inverse=True)[1].astype(np.int64)
 
     def of_triangles(self, chosen: IntArray | BoolArray) -> Surface:
-        """Only some of the triangles (numbers, or a mask), with only their vertices."""
+        """Subset of the triangles (indices or a mask), with their vertices only."""
         triangles = self.triangles[chosen]
         numbers, renumbered = np.unique(triangles, return_inverse=True)
         return Surface(self.vertices_mm[numbers], renumbered.reshape(-1, 3).astype(np.int64), self.fields)

@@ -1,4 +1,4 @@
-"""A sweep: frames read lazily, where their samples lie, their clock, and the sensors that rode along."""
+"""A sweep: frames read lazily, their grid and clock, and the recorded sensors."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ class _FramesPart:
 
 @dataclass(frozen=True)
 class RFSettings:
-    """How radio-frequency vectors, or their I and Q, were sampled.
+    """Sampling of radio-frequency vectors or their I/Q.
 
     Attributes
     ----------
@@ -145,7 +145,7 @@ class RFSettings:
 
 @dataclass(frozen=True)
 class BModeSettings:
-    """How log-compressed grey levels were made: full scale is 0 dB, zero is `-dynamic_range_db`.
+    """Log compression of grey levels: full scale is 0 dB, zero is `-dynamic_range_db`.
 
     Attributes
     ----------
@@ -230,7 +230,7 @@ class Tracker(_Sensor[RigidTransform]):
 @shown
 @dataclass(frozen=True)
 class Sweep:
-    """Frames of one freehand sweep with everything recorded beside them.
+    """Frames of one freehand sweep with their metadata and sensor streams.
 
     Parameters
     ----------
@@ -308,7 +308,7 @@ class Sweep:
         first_row_depth_mm: float = 0.0,
         **others: Any,
     ) -> Sweep:
-        """Make a sweep of images that a machine gives without a word about them.
+        """Make a sweep of bare images and their metadata.
 
         Parameters
         ----------

@@ -1,4 +1,4 @@
-"""Work shared out to the cores of this machine: kernels that release the interpreter, on one pool of threads.
+"""Thread pool for kernels that release the interpreter.
 
 Results do not depend on how many threads there are: each item is worked on alone, and fills its own place.
 Work that threads of the pool share out themselves is done on them, so that none waits for another.
@@ -89,7 +89,7 @@ def in_parallel(function: Callable[[int, int], None], count: int, grain: int = 1
 
 
 def ahead(function: Callable[[Item], Result], items: Iterable[Item], most: int = 3) -> Generator[Result]:
-    """Yield what a function makes of items, in order, `most` of them worked out before they are asked for.
+    """Map a function over items in order, computing up to `most` results ahead.
 
     Other threads work ahead; on one core nothing is done ahead.
     """

@@ -1,4 +1,4 @@
-"""A volume: voxels on a regular grid, and where that grid lies in the world."""
+"""A volume: voxels on a regular grid, with the grid's pose in the world."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What modes claim: covariances of poses by the scatter of readings and by what is known of the sensors.
+"""Claimed covariance of corrected poses: scatter of readings and errors of the sensors.
 
 All covariances are of (x, y, z, tilt, yaw, roll) of every frame about the image's centre, against the first
 frame and along its axes, mm and rad.
@@ -33,7 +33,7 @@ def length_sigma(poses: RigidTransform, covariance: FloatArray, centre_mm: Float
 
 
 def correlated_readings(error: FloatArray, shapes: int = 0) -> float:
-    """How many neighbouring readings err as one: the sum of their autocorrelation while it is positive.
+    """Autocorrelation time of residuals, in readings.
 
     Parameters
     ----------
@@ -56,7 +56,7 @@ def correlated_readings(error: FloatArray, shapes: int = 0) -> float:
 
 
 def curve_errors(error: FloatArray, frames: int) -> FloatArray:
-    """Covariance of poses that cubics in time have bent onto readings, by what these leave, shape (n, 6, 6).
+    """Covariance of poses corrected by cubics, from the readings' residuals, shape (n, 6, 6).
 
     A cubic through m readings of variance s2 errs at t in -1 to 1 by s2 / m times the sum of
     (2 k + 1) P_k(t)^2 over Legendre's polynomials of order 0 to 3. What it leaves beyond white jitter is an
@@ -83,7 +83,7 @@ def curve_errors(error: FloatArray, frames: int) -> FloatArray:
 def tracker_errors(
     poses: RigidTransform, centre_mm: FloatArray, time_s: FloatArray, errors: FusedSettings
 ) -> FloatArray:
-    """Covariance by a tracker's millimetres, mounting and clock, which none of its readings shows."""
+    """Covariance by the errors of a tracker's scale, mounting and clock."""
     from_first = poses[0].inv() * poses
     path, rotation = from_first.apply(centre_mm) - centre_mm, from_first.rotation.as_matrix() - np.eye(3)
     drift = np.gradient(path, time_s, axis=0)
@@ -103,7 +103,7 @@ def tracker_errors(
 def orientation_errors(
     poses: RigidTransform, centre_mm: FloatArray, time_s: FloatArray, errors: FusedSettings
 ) -> FloatArray:
-    """Covariance by an orientation sensor's slow errors, which bend the path, too.
+    """Covariance by an orientation sensor's slow errors, bending of the path included.
 
     Parameters
     ----------

@@ -29,7 +29,7 @@ from speckle3d.correction.curves import (
 
 
 class DriftSettings(BaseModel):
-    """How drift is corrected."""
+    """Settings of the drift correction."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 

@@ -45,7 +45,7 @@ FARTHEST = 2.0
 
 @dataclass(frozen=True)
 class FusionProblem:
-    """Everything that is known of a sweep. The unknowns are the path's coefficients, then each sensor's."""
+    """Least-squares problem of mode `fused`; unknowns of the path, then of each sensor."""
 
     path: ImagePath
     sensors: tuple[SensorReadings, ...]
@@ -53,7 +53,7 @@ class FusionProblem:
 
     @property
     def columns(self) -> list[slice]:
-        """Where the unknowns of the path and of each sensor are."""
+        """Slices of the unknowns of the path and of each sensor."""
         ends = np.cumsum([self.path.sigma.size, *(sensor.size for sensor in self.sensors)])
         return [slice(int(first), int(last)) for first, last in zip([0, *ends[:-1]], ends, strict=True)]
 
@@ -150,7 +150,7 @@ def fuse(
     evidence: Sequence[ScaleEvidence] = (),
     settings: FusedSettings | None = None,
 ) -> FusedPoses:
-    """Estimate poses from all that is known of a sweep.
+    """Estimate poses from images, sensors and crossing sweep together.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Poses whose length another source than the images has set, and what such a source says of their scale."""
+"""Poses whose length comes from a source other than the images, and the evidence for their scale."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class ScaleEvidence:
 @shown
 @dataclass(frozen=True)
 class ScaledPoses:
-    """Poses whose length another source than the images has set.
+    """Poses whose length comes from a source other than the images.
 
     Attributes
     ----------
@@ -75,7 +75,7 @@ class ScaledPoses:
 @shown
 @dataclass(frozen=True)
 class FusedPoses(ScaledPoses):
-    """Poses from all that is known of a sweep.
+    """Poses of mode `fused`.
 
     Attributes
     ----------

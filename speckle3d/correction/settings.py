@@ -1,4 +1,4 @@
-"""What is known of sensors beside their readings: the errors that calibrations, clocks and fields leave."""
+"""Settings of the sensors' systematic errors: mounting, clock, scale, slow drift."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 
 class FusedSettings(BaseModel):
-    """Errors of sensors that their readings do not show: for mode `fused` and the claims of all modes."""
+    """Systematic errors of sensors, for mode `fused` and the claims of all modes."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 

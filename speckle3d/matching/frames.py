@@ -1,4 +1,4 @@
-"""Frames of a sweep matched, one after the other, with the earlier ones that the schedule wants."""
+"""Match the frames of a sweep, one after the other, with earlier ones of a schedule."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ ImageSink = Callable[[int, Float32Array], None]
 
 @dataclass(frozen=True)
 class MatchedSweep:
-    """All that later stages need of a sweep's images.
+    """Result of matching a sweep: table of correlations, quality of frames, texture.
 
     Attributes
     ----------
@@ -63,7 +63,7 @@ def match_sweep(
     progress: Callable[[int, int], None] | None = None,
     images: ImageSink | None = None,
 ) -> MatchedSweep:
-    """Match every frame of a sweep with the earlier ones that the schedule wants.
+    """Match every frame of a sweep with the earlier ones of the schedule.
 
     Parameters
     ----------
@@ -106,7 +106,7 @@ class FrameByFrame:
         self._motion: dict[int, FloatArray] = {}
 
     def advance(self, number: int, frame: Frame) -> CorrelationTable:
-        """Match a frame with the earlier ones that the schedule wants; pairs by increasing first frame.
+        """Match a frame with the earlier ones of the schedule; pairs by increasing first frame.
 
         Parameters
         ----------

@@ -34,7 +34,7 @@ _RATIO_TOLERANCE = 1e-4
 
 
 class IntensitySettings(BaseModel):
-    """How frames become intensity."""
+    """Settings of band-pass and equalisation."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -158,7 +158,7 @@ class IntensityExtractor:
 
 
 def two_way_wavenumber(signal: RFSettings) -> float:
-    """Phase per depth, rad/mm, that the analytic signal was freed of: the band's centre, there and back."""
+    """Two-way wavenumber of the band's centre, rad/mm, removed by demodulation."""
     return float(4e-3 * np.pi * np.mean(signal.bandwidth_hz) / signal.speed_of_sound_m_s)
 
 
@@ -180,7 +180,7 @@ def _plan_resampling(signal: RFSettings, samples: int, edge_fraction: float) -> 
 
 
 def _transform_lengths(samples: int, ratio: float) -> tuple[int, int]:
-    """Lengths of the transforms, both fast, of which the first, even, is `ratio` times the second.
+    """Fast lengths of the two transforms, the first (even) `ratio` times the second.
 
     The first fast pair is taken that has that ratio to `_RATIO_TOLERANCE`.
     """

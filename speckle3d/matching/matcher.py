@@ -1,4 +1,4 @@
-"""Frames made ready for matching, and frame pairs matched: the work every pair of a sweep shares.
+"""Prepare frames and match frame pairs of one sweep.
 
 The in-plane shift comes from all patches together, and the correlation is read at that shift: taking each
 patch's own maximum over lags biases the correlation upward and distances short.
@@ -51,7 +51,7 @@ and twice of it move no length over tissue by more than 0.6 %, in RF or B-mode, 
 
 
 class MatchingSettings(BaseModel):
-    """What of two frames is correlated once their in-plane motion is known."""
+    """Settings of the correlation: complex echo or intensity."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -63,7 +63,7 @@ class MatchingSettings(BaseModel):
 
 
 class InPlaneSettings(BaseModel):
-    """How in-plane motion is searched."""
+    """Settings of the search for in-plane motion."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -74,7 +74,7 @@ class InPlaneSettings(BaseModel):
 
 
 class ImageSettings(BaseModel):
-    """Settings of all that looks at images."""
+    """Settings of all stages that use images."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -86,7 +86,7 @@ class ImageSettings(BaseModel):
 
 
 class ReadyFrame(NamedTuple):
-    """A frame as read, and what is made of it on the way to matching it."""
+    """A frame as read, with its echo, features and matching data."""
 
     samples: npt.NDArray[Any]
     echo: Echo
@@ -95,7 +95,7 @@ class ReadyFrame(NamedTuple):
 
 
 class Overlay:
-    """What stands still in frames far apart while the probe moves: text, a ruler, ringing without contact.
+    """Detector of static structures in images: text, a ruler, ringing without contact.
 
     Its patches tell nothing of the motion. In the others' local mean it would be a pattern that stays, as if
     the probe had moved less.
@@ -127,7 +127,7 @@ class Overlay:
 
     @property
     def standing(self) -> BoolArray:
-        """Which samples stand still, by the echo's mean or their level, shape (vector, grid.samples)."""
+        """Mask of static samples, by the echo's mean or their level, shape (vector, grid.samples)."""
         in_mean = np.abs(self._total) ** 2 > _STANDING * self._count * self.power
         unchanged = (self._brightest <= _UNCHANGED * self._darkest) & (self._darkest > np.min(self._darkest))
         return np.asarray(in_mean | unchanged)
@@ -206,7 +206,7 @@ class FrameMatcher:
         self.overlaid = np.zeros(len(self.patches), dtype=bool)
 
     def leave_out(self, overlay: Overlay) -> None:
-        """Leave out the patches on which something stands still, and that from the others' local mean."""
+        """Leave out patches with static structures, and these samples from other patches' local mean."""
         if not overlay.power.any():
             return
         standing, patches = overlay.standing, self.patches

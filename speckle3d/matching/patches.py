@@ -83,7 +83,7 @@ class PatchGrid:
         return np.asarray(by_column.swapaxes(-1, -2))
 
     def tiles(self, image: npt.NDArray[Any]) -> npt.NDArray[Any]:
-        """Every patch of an image, shape (..., vector, sample): (p, ..., v, s)."""
+        """Cut an image, shape (..., vector, sample), into its patches, shape (p, ..., v, s)."""
         wide, high = self.size
         return np.stack([image[..., v : v + wide, s : s + high] for v, s in self.first])
 

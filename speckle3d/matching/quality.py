@@ -1,4 +1,4 @@
-"""Frames on which speckle decorrelation cannot work, told by what is in the frame itself.
+"""Quality of single frames: speckle, clipping, contact, repeated frames.
 
 A patch is taken for speckle when its intensity varies as speckle does (its contrast, standard deviation over
 mean, is 1 where speckle is fully developed [1]_ and more beside reflectors), neighbouring vectors agree (the
@@ -66,7 +66,7 @@ _WORDS = {
 
 
 class QualitySettings(BaseModel):
-    """What is asked of a patch and of a frame; in comments what was measured to set it."""
+    """Thresholds for the quality of patches and frames; comments give their origin."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -103,7 +103,7 @@ class QualitySettings(BaseModel):
 
 @dataclass(frozen=True)
 class FrameFeatures:
-    """What is kept of a frame."""
+    """Quality features of one frame."""
 
     mean: FloatArray
     """Mean intensity of each patch, shape (p,): a frame that repeats the one before has the same."""

@@ -1,4 +1,4 @@
-"""Pair correlations: what two frames have in common, and all of a sweep's pairs as one table."""
+"""Table of patch correlations and in-plane motion of a sweep's frame pairs."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 
 @dataclass(frozen=True)
 class CorrelationTable:
-    """The correlations of a sweep's frame pairs: all that later stages need of the images.
+    """Patch correlations and in-plane motion of a sweep's frame pairs.
 
     A pair takes about a kilobyte, a frame a megabyte.
 
@@ -58,7 +58,7 @@ class CorrelationTable:
         return replace(table, first=table.first + shift, second=table.second + shift)
 
     def joins(self, frames: BoolArray) -> BoolArray:
-        """Which pairs have both frames among some, shape (e,)."""
+        """Mask of pairs both of whose frames are among some, shape (e,)."""
         return np.asarray(frames[self.first] & frames[self.second])
 
     @classmethod

@@ -1,4 +1,4 @@
-"""What some frames of a sweep show: speckle's size, spectra, grey levels, and echoes that stand still.
+"""Statistics of a sweep's images: speckle size, spectra, grey levels, static echoes.
 
 The size of speckle along the vectors is the pulse's, across them the aperture's over depth; neither depends
 on what is scanned as long as it scatters as a phantom does; patches whose contrast denies that do not count.
@@ -31,7 +31,7 @@ LEAST_PATCHES = 8
 
 
 class _Look(NamedTuple):
-    """What one frame shows.
+    """Statistics of one frame.
 
     Attributes
     ----------
@@ -56,7 +56,7 @@ class _Look(NamedTuple):
 
 
 class Texture:
-    """What the patches of some frames show, measured as they are matched.
+    """Image statistics of some frames, collected while they are matched.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Attenuation of tissue against that of the phantom the curves were measured on, from the echo's spectrum.
+"""Estimate tissue attenuation relative to the curves' phantom from echo spectra.
 
 Attenuation takes more of an echo the higher its frequency, so that the beam of what is left is wider: curves
 of a phantom must be stretched over tissue that attenuates more. With the phantom's power spectrum P at depth
@@ -85,11 +85,11 @@ class Attenuation:
 
     @property
     def log_length_sigma(self) -> float:
-        """Standard deviation of all distances together that the difference's leaves."""
+        """Relative standard deviation of all distances due to the attenuation's."""
         return float(LENGTH_PER_UNIT * self.sigma_db_cm_mhz)
 
     def applied(self, curves: DecorrelationCurves) -> DecorrelationCurves:
-        """Curves of the phantom, stretched for the tissue, and its spectrum with the tissue's attenuation."""
+        """Phantom curves stretched for the tissue's attenuation, with its spectrum."""
         old = curves.spectrum
         if old is None or not self.log_stretch.any():
             return curves
@@ -206,7 +206,7 @@ def _difference(
 
 
 def _log_likelihood(left: FloatArray, sigma: FloatArray) -> FloatArray:
-    """Logarithm of the likelihood of what attenuation leaves of rows' exponents, shape (..., r) to (...).
+    """Log-likelihood of the rows' residual exponents, shape (..., r) to (...).
 
     Normal about zero, or about an exponentially distributed exponent of structure; with any share of such
     rows as likely as any other.

@@ -1,4 +1,4 @@
-"""Scale of all distances, and how the echo of each patch departs from fully developed speckle's.
+"""Estimate the scale of distances and each patch's share of coherent structure.
 
 Tissue holds structure that stays correlated longer than speckle. Read with a phantom's curve, its echoes say
 that the probe hardly moved. With r the amplitude correlation of fully developed speckle, sqrt(rho_F), a patch
@@ -66,7 +66,7 @@ ROUNDS, LEAST_MEAN = 30, 1e-3
 
 @dataclass(frozen=True)
 class RowScales:
-    """Scale that each row of patches asks for, over that of all.
+    """Distance scale of each row of patches, relative to that of all.
 
     Attributes
     ----------
@@ -199,7 +199,7 @@ def _bin_correlations(
 def estimate_coherence(
     problem: MotionProblem, table: CorrelationTable, sound: BoolArray, path: FloatArray
 ) -> Coherence:
-    """Estimate shares of structure, gains, and the factor that distances along the path are still to get.
+    """Estimate shares of structure, gains, and the scale of distances along the path.
 
     Shares are exponentially distributed, their mean being that of all patches, and all powers alike likely.
     The scales of patches scatter about the common one as Cauchy's distribution has it, of half width
@@ -267,7 +267,7 @@ def _share_prior(by_share: FloatArray, share: FloatArray) -> FloatArray:
 
 
 def _peak(log_posterior: FloatArray) -> float:
-    """Likeliest ln s by the parabola about it, or the last of the scales tried that way."""
+    """Most likely ln s by a parabola through the maximum, clipped to the scales tried."""
     at = int(np.clip(log_posterior.argmax(), 1, LOG_SCALES.size - 2))
     low, middle, high = log_posterior[at - 1 : at + 2]
     steps = (high - low) / (2.0 * max(2.0 * middle - low - high, 1e-9))
@@ -275,7 +275,7 @@ def _peak(log_posterior: FloatArray) -> float:
 
 
 def _covariance(problem: MotionProblem, by_patch: FloatArray, log_scale: float) -> FloatArray:
-    """Covariance of the scale, and of the turns that are feigned, by the scatter of rows, shape (3, 3).
+    """Covariance of the scale and of false yaw and tilt from the scatter of rows, shape (3, 3).
 
     Structure lies in layers, and curves err by depth: the patches of a row err together.
 

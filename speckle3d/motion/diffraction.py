@@ -1,4 +1,4 @@
-"""Decorrelation curves from a probe's data sheet: the elevational field of a lens, two ways, broadband.
+"""Decorrelation curves from a probe's data sheet, by the two-way broadband field of a lens.
 
 The echo of fully developed speckle, moved by d along the elevational axis, keeps
 
@@ -115,7 +115,7 @@ def tilt_pivot(
     power: FloatArray,
     speed_m_s: float = SPEED_M_S,
 ) -> FloatArray:
-    """Where speckle of each depth seems to turn about when the probe tilts, mm from the patch, shape (y,).
+    """Pivot about which the speckle of each depth turns when the probe tilts, mm, shape (y,).
 
     By the distance at which slightly tilted speckle correlates best; see `TiltResponse`.
 

@@ -1,4 +1,4 @@
-"""From a sweep's correlations to the poses of its frames: what iterates between distances, scale and path."""
+"""Estimate frame poses from correlations, iterating over distances, scale and path."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ LENS_ROUNDS = 4
 
 @dataclass(frozen=True)
 class Motion:
-    """Poses of a sweep's frames by its images, and what they were solved from.
+    """Image-based poses of a sweep's frames, with the pairs they were solved from.
 
     Attributes
     ----------
@@ -92,7 +92,7 @@ class Motion:
         return shared, claimed_covariance(self.poses, self.covariance, centre_mm, shared, structure)
 
     def mirrored(self) -> Motion:
-        """The same sweep seen as if it had gone the other way."""
+        """The motion with the opposite elevational sign."""
         return replace(
             self,
             pairs=self.pairs.signed(-np.ones(len(self.pairs))),
@@ -103,7 +103,7 @@ class Motion:
 
 
 def estimate_motion(problem: MotionProblem, table: CorrelationTable, sound: BoolArray) -> Motion:
-    """Estimate shares of structure, the scale of distances and the path, each from the others, in turn.
+    """Estimate shares of structure, scale of distances and path by alternation.
 
     All that iterates does so here. Distances and their scale need the path, the path needs distances: both
     are repeated `ROUNDS` times. For curves from a data sheet the lens is fitted to what depths then disagree
@@ -154,7 +154,7 @@ def solve_planes(
 
 
 def alike_pairs(problem: MotionProblem, table: CorrelationTable) -> IntArray:
-    """Rows of frames' pairs with earlier frames that they resemble; without any, of their best pair."""
+    """Rows of correlated pairs; for frames without any, of their best pair."""
     alike = table.median >= problem.trajectory.least_correlation
     return np.flatnonzero(alike | _is_best(table.second, table.median))
 
@@ -199,7 +199,7 @@ def _near_pairs(
 
 
 def strangers(problem: MotionProblem, table: CorrelationTable) -> Strangers:
-    """Frames that were compared and do not resemble each other, and how far apart they are.
+    """Compared frame pairs without correlation, with their least distance.
 
     Speckle at half the distance at which it keeps `least_correlation` would keep two thirds of it: no
     error of curves makes the one look like the other, and what stays of echoes only adds to it.

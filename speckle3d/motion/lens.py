@@ -1,4 +1,4 @@
-"""Curves stretched by a factor at each depth, for another lens."""
+"""Stretch decorrelation curves by depth, for another lens."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def stretched(curves: DecorrelationCurves, log_factor: FloatArray) -> Decorrelat
 def with_fitted_lens(
     curves: DecorrelationCurves, rows: RowScales, sheet: NominalProbe
 ) -> DecorrelationCurves:
-    """Fit the focal length of a data sheet's probe to the scales that rows of patches ask for.
+    """Fit the focal length of a data sheet's probe to the distance scales of rows of patches.
 
     All depths of one image move together, so that rows show how far curves are wrong against each other; a
     lens that focuses elsewhere bends them in a known way, its common factor included.

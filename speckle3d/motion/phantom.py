@@ -1,4 +1,4 @@
-"""Decorrelation curves: how the correlation of speckle falls with elevational distance, by depth.
+"""Fit decorrelation curves by depth to phantom sweeps.
 
 The curves are measured on phantoms moved by known distances. They belong to a probe, its settings and
 a patch size; off the elevational focus it is the wavefront's curvature rather than the beam's width that
@@ -40,7 +40,7 @@ TURNED_RAD = 1e-5
 
 
 class CurveSettings(BaseModel):
-    """How curves are fitted."""
+    """Settings of the fit of decorrelation curves."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -56,7 +56,7 @@ class CurveSettings(BaseModel):
 
 @dataclass(frozen=True)
 class PhantomSamples:
-    """Correlations seen between phantom frames at known distances.
+    """Correlations between phantom frames at known distances.
 
     Attributes
     ----------
@@ -116,7 +116,7 @@ def fit_curves(
 def _fit_row(
     depth_mm: float, grid: FloatArray, terms: int, of_echo: bool, distance: FloatArray, rho: FloatArray
 ) -> tuple[FloatArray, float, float]:
-    """Curve of one depth on `grid`, the cells that explain the scatter about it, and its last distance.
+    """Curve of one depth on `grid`, its number of speckle cells, and its last distance.
 
     A curve that has fallen as low as can be told goes on; one whose phantom did not go so far ends there.
     """

@@ -52,7 +52,7 @@ tilt."""
 
 
 class PlaneSettings(BaseModel):
-    """How planes are fitted."""
+    """Settings of the fit of planes."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -76,7 +76,7 @@ class PlaneSettings(BaseModel):
 
 @dataclass(frozen=True)
 class MotionProblem:
-    """What the correlations of one sweep are read with.
+    """Curves, patches and settings by which one sweep's correlations are interpreted.
 
     Attributes
     ----------
@@ -107,7 +107,7 @@ class MotionProblem:
 
     @cached_property
     def levers(self) -> Levers:
-        """What slopes are multiplied by at each patch."""
+        """Lever arms of the slopes at each patch."""
         tilt = self.curves.at(self.patches.depth_mm).tilt
         (x, y) = (self.patches.centre_mm - self.centre_mm[:2]).T
         if tilt is None:
@@ -174,7 +174,7 @@ class PairPlanes:
         return int(self.row.size)
 
     def __getitem__(self, pairs: IntArray | BoolArray) -> PairPlanes:
-        """Some of the pairs."""
+        """Subset of the pairs."""
         return PairPlanes(*(getattr(self, field.name)[pairs] for field in fields(self)))
 
     @property
@@ -184,7 +184,7 @@ class PairPlanes:
 
     @property
     def sign_covariance(self) -> FloatArray:
-        """Covariance of (a, b) by which signs are told, shape (e, 2, 2)."""
+        """Covariance of (a, b) for the estimate of signs, shape (e, 2, 2)."""
         covariance = self.covariance[:, :2, :2].copy()
         covariance[:, 1, 1] += self.feigned_yaw**2
         return covariance
@@ -194,7 +194,7 @@ class PairPlanes:
         return replace(self, coefficients=self.coefficients * factor, covariance=self.covariance * factor**2)
 
     def signed(self, sign: FloatArray) -> PairPlanes:
-        """Return the planes on the sides of their first frames that signs of shape (e,) say."""
+        """Return the planes multiplied by signs of shape (e,)."""
         return replace(self, coefficients=self.coefficients * sign[:, None])
 
 
@@ -300,12 +300,12 @@ def pair_planes(
 
 
 def _lever_shift(problem: MotionProblem, shift_mm: FloatArray) -> FloatArray:
-    """What in-plane motion takes from the patches' lateral positions and levers, shape (e, 2)."""
+    """Shift of the patches' lateral positions and levers by in-plane motion, shape (e, 2)."""
     return shift_mm * [1.0, float(problem.curves.tilt is not None)]
 
 
 def raised(problem: MotionProblem, shift_mm: FloatArray, slopes: FloatArray) -> FloatArray:
-    """How much farther patches are than the image's centre on planes of some slopes, shape (e, p).
+    """Elevation of patches above the image's centre on planes of some slopes, shape (e, p).
 
     Parameters
     ----------

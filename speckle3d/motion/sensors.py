@@ -1,4 +1,4 @@
-"""What sensors tell of the images' motion: its sign, and the patches that agree with a sensed orientation."""
+"""Use of sensors by the image-based motion: its sign and the orientation-consistent patches."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ ROLL_SHARE = 0.6
 
 
 class SensorSettings(BaseModel):
-    """How sensor streams are used."""
+    """Settings for the use of sensor streams."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -88,13 +88,13 @@ def settle_direction(
 
 
 def _same_way(poses: RigidTransform, image: RigidTransform, centre_mm: FloatArray) -> int:
-    """Whether two records of poses go the same way along the first frame's normal (1) or not (-1)."""
+    """Sign of the correlation of two records of poses along the first frame's normal."""
     z, image_z = ((path[0].inv() * path).apply(centre_mm)[:, 2] for path in (poses, image))
     return 1 if (z - z.mean()) @ (image_z - image_z.mean()) >= 0 else -1
 
 
 def same_turns(sensor_turns: FloatArray, image_turns: FloatArray) -> int | None:
-    """Whether two records of turns go the same way (1) or opposite ways (-1); None if chance may tell so.
+    """Sign of the correlation of two records of turns; None if it is not significant.
 
     Told are a product that chance does not give records as slow as these, and the near correlation that the
     same motion gives.
@@ -202,7 +202,7 @@ def consistent_subset(
     either_side: BoolArray,
     support_sigma: float = 1.0,
 ) -> BoolArray:
-    """Patches of each pair whose distances agree on one plane of the orientation that the sensor measured.
+    """Patches of each pair whose distances agree with one plane of the sensed orientation.
 
     Every patch in turn places the plane, through +d and through -d; the placement that most others agree
     with, in magnitude and within `support_sigma` of their own deviations, keeps its supporters.

@@ -1,4 +1,4 @@
-"""Signs: on which side of each other frames lie, from unsigned planes, settled over the whole sweep.
+"""Signs of unsigned frame distances, estimated over the whole sweep.
 
 A distance has no sign. A frame is placed against several earlier ones at once, and only one side of them
 agrees with all the offsets and slopes. Where a pause or a turn leaves more than one path open, all of them
@@ -34,7 +34,7 @@ less and do not resemble each other are a pair that disagrees altogether."""
 
 
 class Strangers(NamedTuple):
-    """Pairs of frames that do not resemble each other, and so are not near each other.
+    """Pairs of uncorrelated frames, which therefore are not close together.
 
     Attributes
     ----------
@@ -104,7 +104,7 @@ def likeliest_path(
 
 
 def on_path(planes: PairPlanes, path: FloatArray) -> PairPlanes:
-    """Planes on the sides of their first frames that agree best with a path of shape (n, 2)."""
+    """Planes with the signs that agree best with a path of shape (n, 2)."""
     relative, moved = path[planes.second] - path[planes.first], planes.coefficients[:, :2]
     weight = np.linalg.inv(planes.sign_covariance)
     agreement = np.einsum("ei,eij,ej->e", relative, weight, moved)

@@ -1,4 +1,4 @@
-"""How a sweep's tissue, and what a scanner makes of its echoes, change the curves, and what that leaves open.
+"""Adapt curves to a sweep's tissue and a scanner's processing, with the remaining errors.
 
 Averaging of frames (persistence) widens the beam by what the probe goes meanwhile, so that lengths come out
 short. Where speckle has changed from one frame to the next, their mean varies less in grey: frames taken at
@@ -57,7 +57,7 @@ that are black for the most part, or of four levels. Lengths are then open by a 
 
 @dataclass(frozen=True)
 class TissueCurves:
-    """Curves as a sweep's tissue reads them.
+    """Curves adapted to a sweep's tissue.
 
     Attributes
     ----------
@@ -86,7 +86,7 @@ def tissue_curves(curves: DecorrelationCurves, texture: Texture) -> TissueCurves
 
 
 def structure_openness(texture: Texture) -> float:
-    """How much wider than speckle's curves those of a sweep that shows structure may be, as a logarithm.
+    """Logarithm of the factor by which structure may widen the curves of speckle.
 
     Structure only stays alike for longer: the curves' width lies between once and twice this above speckle's.
     """

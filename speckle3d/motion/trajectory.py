@@ -31,7 +31,7 @@ _TWIST = np.array([3, 4, 5, 0, 1, 2])
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Poses of all frames, and what the graph alone says of their errors.
+    """Poses of all frames with the graph's covariance.
 
     Attributes
     ----------
@@ -46,7 +46,7 @@ class Trajectory:
 
     @property
     def covariance(self) -> FloatArray:
-        """Of (x, y, z, tilt, yaw, roll) about the image's centre in each frame's own axes, shape (n, 6, 6).
+        """Covariance of each pose (x, y, z, tilt, yaw, roll) in its frame's axes, shape (n, 6, 6).
 
         As far as the pairs' errors are independent of each other. Of frames between those computed it is
         interpolated.
@@ -127,7 +127,7 @@ def loose_frames(second: IntArray, frames: int) -> BoolArray:
 
 
 def _with_loose_edges(pairs: RelativePoses, frames: int) -> RelativePoses:
-    """Join frames that no pair joins to others by edges that say no more than that a probe does not jump."""
+    """Join loose frames to their neighbours by edges of large covariance."""
     lone = np.flatnonzero(loose_frames(pairs.second, frames))
     after = lone[lone + 1 < frames]
     return RelativePoses(

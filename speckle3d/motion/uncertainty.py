@@ -1,4 +1,4 @@
-"""How far poses may be off: what frame pairs scatter by, and what all of them have wrong together."""
+"""Covariance of poses from the pairs' scatter and the errors common to all pairs."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def claimed_covariance(
 
 
 def shared_covariance(poses: RigidTransform, centre_mm: FloatArray, shared: SharedErrors) -> FloatArray:
-    """Covariance of every frame's pose by what all pairs have wrong together, shape (n, 6, 6)."""
+    """Covariance of every frame's pose by errors common to all pairs, shape (n, 6, 6)."""
     common, way = _common_factors(poses, centre_mm, shared), _travel(poses, centre_mm)[:, None]
     changing = np.zeros((len(poses), 6))
     changing[:, 2:3] = shared.scale_sigma**2 * SCALE_CHANGE_MM * way
@@ -70,7 +70,7 @@ def _common_factors(poses: RigidTransform, centre_mm: FloatArray, shared: Shared
 
 
 def _travel(poses: RigidTransform, centre_mm: FloatArray) -> FloatArray:
-    """Way that the image's centre has gone up to every frame, shape (n,), mm."""
+    """Path length of the image's centre up to every frame, shape (n,), mm."""
     steps = np.linalg.norm(np.diff(poses.apply(centre_mm), axis=0), axis=1)
     return np.append(0.0, np.cumsum(steps))
 
@@ -120,7 +120,7 @@ BEYOND_DOUBT = 2.0
 
 @dataclass(frozen=True)
 class SlopeWeights:
-    """Weights of the slopes that a sweep's planes have, and what is left of their errors.
+    """Weights of the slopes of a sweep's planes, with their remaining errors.
 
     Attributes
     ----------
@@ -142,7 +142,7 @@ class SlopeWeights:
         return float(np.linalg.norm(self.lever_mm * self.deviation_per_mm))
 
     def applied(self, planes: PairPlanes) -> PairPlanes:
-        """Keep only the believed shares of planes' slopes; their offsets follow as the fits have it."""
+        """Multiply planes' slopes by their weights and adjust the offsets by the fits' covariance."""
         covariance = planes.covariance
         keep = np.tile(np.diag([1.0, *self.share]), (len(planes), 1, 1))
         keep[:, :1, 1:] = -covariance[:, :1, 1:] @ np.linalg.inv(covariance[:, 1:, 1:]) * (1.0 - self.share)
@@ -154,7 +154,7 @@ class SlopeWeights:
 
 
 def weigh_slopes(planes: PairPlanes, covariance: FloatArray, settings: PlaneSettings) -> SlopeWeights:
-    """Weigh the slopes of all pairs of a sweep by what uneven errors of distances feign.
+    """Weights of all pairs' slopes against false slopes from uneven errors of distances.
 
     Parameters
     ----------

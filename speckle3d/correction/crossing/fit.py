@@ -1,4 +1,4 @@
-"""Two crossing sweeps brought to agree: Levenberg and Marquardt's steps, and how far the answer may be off.
+"""Registration of two crossing sweeps by Levenberg-Marquardt, with its covariance.
 
 Tissue that moved between the sweeps is partly taken up by scale, turns and place; what is left of it pulls
 neighbouring parts of the tissue alike, where speckle pulls each by itself. These two moments tell both.

@@ -1,4 +1,4 @@
-"""Scale and turns of two crossing sweeps, found by making their images agree."""
+"""Estimate scale and rotation of two crossing sweeps by registration of their images."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ _BETWEEN_INCLINATION_RAD, _BETWEEN_HEADING_RAD = np.deg2rad([1.0, 8.0])
 @shown
 @dataclass(frozen=True)
 class CrossingSoFar:
-    """How two sweeps lie to each other, whether or not a length can be claimed from it.
+    """Relative position of two sweeps so far, sufficient for a length or not.
 
     Attributes
     ----------
@@ -64,7 +64,7 @@ class CrossingSoFar:
 @shown
 @dataclass(frozen=True)
 class CrossedPair(CrossingSoFar):
-    """Two sweeps after their images have been made to agree.
+    """Two registered crossing sweeps.
 
     Attributes
     ----------

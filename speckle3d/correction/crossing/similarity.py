@@ -1,4 +1,4 @@
-"""How alike two sweeps look where they cross, and how that changes with scales, turns and place.
+"""Similarity of two crossing sweeps and its derivatives by scale, rotation and place.
 
 Points of either sweep's images are looked up in the other's. Both lists, without their mean and of unit
 length, differ by a vector whose squared length is 2 (1 - correlation): the residuals.
@@ -28,7 +28,7 @@ _LEAST_POINTS = 200
 
 @dataclass(frozen=True)
 class Placing:
-    """Where two paths lie against each other, and how both are bent.
+    """Relative pose of two paths and the bends of both.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""What is known of each of two crossing sweeps, and how they are compared."""
+"""Inputs and settings of the comparison of two crossing sweeps."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from speckle3d.correction.crossing.stack import ImageStack
 
 
 class CrossingSettings(BaseModel):
-    """How two crossing sweeps are brought to agree, and when they are refused."""
+    """Settings of the registration of two crossing sweeps and of its acceptance."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
