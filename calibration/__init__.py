@@ -1,4 +1,4 @@
-"""Where the image is relative to the sensor, from images of phantoms or of anything (`images`).
+"""Calibration of a sensor's mounting, from images of phantoms or of any tissue (`images`).
 
 `plane` is the model that all phantoms share, its least squares, and the plane itself; `solution` says which
 frames count and how certain an answer is, `motion` whether a scan's motion was sufficient. `orientation`,

@@ -1,4 +1,4 @@
-"""Bias along the beam that the beam's thickness causes in a calibration on a bare wall.
+"""Bias of a calibration on a bare wall by the beam's thickness.
 
 A sheet of thickness w that meets a wall at an angle meets it first with its nearer edge, so that the line
 lies (w / 2) |tan(tilt)| / cos(roll) too shallow. The Cambridge phantom, a thin bar, does not do this.
@@ -21,7 +21,7 @@ from speckle3d.core.errors import InvalidInputError
 
 @dataclass(frozen=True)
 class BeamBias:
-    """How a beam of some thickness would move the calibration that these motions give.
+    """Predicted bias of a calibration by the beam's thickness.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Which candidates show the one point that all frames should show: a consensus, judged against chance.
+"""Consensus on the candidates that show one common point, judged a contrario.
 
 A frame may offer several candidates, all of them wrong. Four candidates from four frames give a calibration
 by linear equations; the one with which most frames agree is kept if so much agreement is not to be expected
@@ -83,7 +83,7 @@ class Consensus:
 
     @property
     def is_significant(self) -> bool:
-        """Whether chance would not agree as well."""
+        """Whether agreement by chance is unlikely."""
         return self.false_alarms <= FALSE_ALARMS
 
     def require(self) -> Consensus:
@@ -130,7 +130,7 @@ def find_consensus(points: ImagePoints, pixel_mm: FloatArray | None = None) -> C
 
 
 def nearest_of_frames(frame: IntArray, away_mm: FloatArray) -> IntArray:
-    """Of each frame, ascending, the candidate that is least away."""
+    """Nearest candidate of each frame, frames ascending."""
     order = np.lexsort((away_mm, frame))
     return np.asarray(order[np.unique(frame[order], return_index=True)[1]])
 

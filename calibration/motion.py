@@ -1,4 +1,4 @@
-"""Whether the motion of a scan determines a calibration, which motions it lacks, and what it leaves open.
+"""Test whether a scan's motion determines a calibration, and name missing motions.
 
 References
 ----------
@@ -195,7 +195,7 @@ def least_certain(solution: Solution, deviations: FloatArray) -> str:
 
 
 def extents(solution: Solution) -> dict[str, float]:
-    """How much of each motion a scan has: standard deviation over that of a motion on purpose.
+    """Extent of each motion in a scan, relative to a deliberate motion.
 
     Lines tell roll and depth by themselves, and the sensor alone tells how far the plane's normal moved in
     its frame: the mounting, which is not known well where a motion is missing, hardly enters. Motions that

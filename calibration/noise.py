@@ -1,4 +1,4 @@
-"""Errors that wander: the answer and the covariance of a calibration whose sensor drifts over seconds.
+"""Calibration with sensor errors correlated in time: estimate and covariance.
 
 Plain least squares takes all errors for white and the sensor's poses for exact. But a sensor's error wanders
 (Ornstein and Uhlenbeck), so that neighbouring frames say the same: residuals are whitened for a grid of sizes
@@ -64,7 +64,7 @@ _SMALL_STEP = 0.05
 
 @dataclass(frozen=True)
 class Noise:
-    """Errors of a sensor and an image, and what they leave uncertain.
+    """Estimated noise of sensor and image, with the parameters' step and covariance.
 
     Attributes
     ----------
@@ -86,7 +86,7 @@ class Noise:
 def make_grid(
     effects: FloatArray, frame_time_s: FloatArray, proportions: Sequence[FloatArray], jitter: Sequence[float]
 ) -> FloatArray:
-    """All that is tried, shape (g, 4 + k).
+    """Grid of noise models, shape (g, 4 + k).
 
     Sizes of wandering and of jitter over the white noise, time constant, probability beforehand, and the
     variance of each component of an error whose root mean square effect is one.
@@ -213,7 +213,7 @@ def fit_noise(
     prior: Prior,
     slopes: FloatArray | None = None,
 ) -> tuple[Chain, FloatArray, FloatArray]:
-    """Go from a least-squares solution to the one that knows that the sensor's errors wander.
+    """Refit a least-squares solution with sensor errors correlated in time.
 
     Parameters
     ----------

@@ -77,12 +77,12 @@ class Chain:
 
     @cached_property
     def sensor_from_image(self) -> RigidTransform:
-        """The report's R_T_P."""
+        """Sensor from image: R_T_P of TR 303."""
         return RigidTransform.from_matrix(self.probe)
 
     @cached_property
     def target_from_world(self) -> RigidTransform:
-        """The report's C_T_T."""
+        """Target from world: C_T_T of TR 303."""
         return RigidTransform.from_matrix(self.target)
 
     def target_from_image(self, points: ImagePoints) -> RigidTransform:
@@ -115,7 +115,7 @@ class Chain:
 
 
 class Phantom(ABC):
-    """What must vanish in the phantom's frame.
+    """Residuals of a phantom in its own frame.
 
     Attributes
     ----------
@@ -133,7 +133,7 @@ class Phantom(ABC):
         """Rows, shape (n, r, 3), and offsets, (n, r): ``rows @ position - offsets`` is the residual, mm."""
 
     def equations(self, points: ImagePoints) -> Equations:
-        """What must vanish for each of some points."""
+        """Residual equations of some points."""
         return Equations(points, *self.vanishing(points))
 
 
@@ -164,7 +164,7 @@ def line_directions(level: bool = False) -> Plane:
 
 @dataclass(frozen=True)
 class Equations:
-    """What must vanish for each point of a phantom.
+    """Residual equations of points of a phantom.
 
     Attributes
     ----------
@@ -183,7 +183,7 @@ class Equations:
         return Equations(self.points[index], self.rows[index], self.offsets[index])
 
     def residuals(self, chain: Chain) -> FloatArray:
-        """What does not vanish, shape (n, r)."""
+        """Residuals, shape (n, r)."""
         return np.asarray(np.einsum("nri,ni->nr", self.rows, self._places(chain)[1]) - self.offsets)
 
     def at(self, chain: Chain) -> tuple[FloatArray, FloatArray]:
@@ -352,7 +352,7 @@ def calibrate_plane(
 
 
 def _from_stages(lines: ImagePoints, problem: Problem) -> Solution:
-    """Angles from line directions, then distances, then all."""
+    """Solve for angles from line directions, then distances, then all parameters."""
     few, pixel_mm = lines.of_some_frames(SOME_FRAMES), problem.prior.known_pixel_mm
     directions = as_directions(few, np.ones(2) if pixel_mm is None else pixel_mm)
     angles = angle_starts(directions, pixel_mm, hemisphere())

@@ -31,7 +31,7 @@ _UNREAD = "no sensor reading at its time"
 
 @dataclass(frozen=True)
 class Outcome:
-    """A calibration and what its report shows.
+    """A calibration with the contents of its report.
 
     Attributes
     ----------
@@ -54,7 +54,7 @@ def calibrate_recording(
     calibrate: Callable[[ImagePoints], Solution],
     time_offset_s: float | Literal["estimate"] | None = None,
 ) -> Outcome:
-    """Calibrate with what was detected in a recording.
+    """Calibrate from the detections in a recording.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""A calibration as it is saved, and its report: a table for people, one for programs, a page of pictures."""
+"""Report of a calibration: text, JSON and figure, and the form that is saved."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _MOST_ROWS = 20
 
 @dataclass(frozen=True)
 class Snapshot:
-    """An image to show, with what was found in it.
+    """An image with its detections, for the report.
 
     Attributes
     ----------
@@ -103,7 +103,7 @@ def _parameters(solution: Solution) -> tuple[Parameter, ...]:
 
 
 def text_report(calibration: Calibration, beam: Sequence[BeamBias] = (), notes: Sequence[str] = ()) -> str:
-    """Aligned table, the matrix in PLUS's form, and what a thick beam would do."""
+    """Text of the report: table, matrix in PLUS's form, and bias by the beam."""
     lines = text_rows(calibration.rows()).splitlines()
     if outliers := sorted(calibration.frames.dropped.items()):
         lines += ["", "Frames left out:"]

@@ -25,7 +25,7 @@ class _Settings(BaseModel):
 
 
 class FitSettings(_Settings):
-    """What all calibrations with a phantom are told."""
+    """Settings common to all calibrations with a phantom."""
 
     outlier_sigma: float = Field(
         OUTLIER_SIGMA, ge=1.0, description="Drop frames whose residual exceeds so many standard deviations."
@@ -33,13 +33,13 @@ class FitSettings(_Settings):
 
 
 class PixelSettings(FitSettings):
-    """Whether the pixel size is estimated."""
+    """Settings of the pixel size."""
 
     fixed_pixels: bool = Field(False, description="Keep the pixel size instead of estimating it.")
 
 
 class PlaneFit(PixelSettings):
-    """How a position sensor is calibrated with a plane."""
+    """Settings of the calibration of a position sensor with a plane."""
 
     pixel_error: float = Field(
         PIXEL_ERROR, gt=0.0, description="Standard error of the pixel size, as a share of it; inf if a guess."
@@ -47,14 +47,14 @@ class PlaneFit(PixelSettings):
 
 
 class OrientationFit(FitSettings):
-    """How an orientation sensor is calibrated with a plane."""
+    """Settings of the calibration of an orientation sensor with a plane."""
 
     level: bool = Field(False, description="The plane is level: three unknowns, not five.")
     viewed_from: Viewpoint = Field("above", description="Whether the beam points down on average, or up.")
 
 
 class WireFit(PixelSettings):
-    """How a position sensor is calibrated with wires."""
+    """Settings of the calibration of a position sensor with wires."""
 
     registration: Literal["auto", "held", "turned", "free"] = Field(
         "auto",
@@ -70,7 +70,7 @@ class WireFit(PixelSettings):
 
 
 class LineSettings(_Settings):
-    """How the line of a plane's echo is found, [1]_ appendix B.
+    """Settings of the detection of a plane's line, [1]_ appendix B.
 
     References
     ----------
@@ -105,7 +105,7 @@ class LineSettings(_Settings):
 
 
 class ImageFit(_Settings):
-    """How two crossing sweeps are calibrated with."""
+    """Settings of the calibration with two crossing sweeps."""
 
     capture_mm: float = Field(
         20.0,

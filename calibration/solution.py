@@ -1,4 +1,4 @@
-"""From a start to a calibration: frames that contradict the others, its certainty, and the other answer."""
+"""Solve a calibration from a start: outlying frames, covariance, alternative answers."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ _APART_RAD, _APART = np.deg2rad(5.0), 0.1
 
 @dataclass(frozen=True)
 class Prior:
-    """What is known of the pixel size and of the phantom's place before anything is measured.
+    """Prior of the pixel size and of the phantom's place.
 
     Attributes
     ----------
@@ -72,13 +72,13 @@ class Prior:
         return cls(size, np.eye(4), sigma)
 
     def with_place(self, world_from_target: FloatArray) -> Prior:
-        """And of a phantom's stated place."""
+        """The prior with a phantom's stated place."""
         sigma = np.append(self.sigma[:8], np.repeat(_STATED, 3))
         return replace(self, world_from_target=world_from_target, sigma=sigma)
 
     @property
     def known_pixel_mm(self) -> FloatArray | None:
-        """The pixel size, if anything is known of it."""
+        """Prior pixel size, if any."""
         return self.pixel_mm if np.isfinite(self.sigma[0]) else None
 
     def displacement(self, chain: Chain) -> FloatArray:
@@ -89,7 +89,7 @@ class Prior:
         return away
 
     def deviation(self, chain: Chain) -> FloatArray:
-        """The same in standard errors; zero where nothing is known."""
+        """Displacement from the prior in standard errors; zero without a prior."""
         return self.displacement(chain) / self.sigma
 
 
@@ -99,7 +99,7 @@ UNKNOWN = Prior.of()
 @shown
 @dataclass(frozen=True)
 class Solution:
-    """A calibration as the solver leaves it: the chain, its certainty, and the frames it is made from.
+    """Solution of a calibration: chain, covariance, and the frames used.
 
     Attributes
     ----------
@@ -146,12 +146,12 @@ class Solution:
 
     @property
     def contradicts_prior(self) -> bool:
-        """Whether something is far from what was known of it."""
+        """Whether the solution is far from the prior."""
         return bool(np.abs(self.prior.deviation(self.chain)).max() > _CONTRADICTS)
 
     @property
     def condition_number(self) -> float:
-        """Of the derivatives, columns scaled to one length."""
+        """Condition number of the Jacobian with columns of unit length."""
         return condition_number(self.jacobian)
 
     @property
@@ -194,7 +194,7 @@ class Solution:
 
 @dataclass(frozen=True)
 class Problem:
-    """What is solved, from whichever start.
+    """Calibration problem: phantom, free parameters and prior.
 
     Parameters
     ----------
@@ -334,7 +334,7 @@ class Problem:
         return ends
 
     def _sorted(self, points: ImagePoints, chains: Sequence[Chain]) -> list[Chain]:
-        """The best first."""
+        """Chains sorted by cost, the best first."""
         return [chains[k] for k in np.argsort(self._costs(points, chains), kind="stable")]
 
     def _costs(self, points: ImagePoints, chains: Sequence[Chain]) -> FloatArray:
@@ -360,7 +360,7 @@ def _within(residuals: FloatArray, frame: IntArray, limit: float) -> BoolArray:
 
 
 def together(residuals: FloatArray, frame: IntArray) -> float:
-    """How many residuals, shape (n, r), count as one: a sensor's error moves all of a frame, and wanders."""
+    """Number of residuals, shape (n, r), per independent one, by correlation in frames and time."""
     index = np.unique(frame, return_inverse=True)[1]
     sums = np.stack([np.bincount(index, column) for column in residuals.T])
     energy = float(np.sum(residuals**2))
@@ -369,7 +369,7 @@ def together(residuals: FloatArray, frame: IntArray) -> float:
 
 
 def autocorrelation_time(residuals: FloatArray) -> float:
-    """How many neighbouring residuals count as one: m / this many of m residuals are independent.
+    """Autocorrelation time of residuals: m residuals hold m / this independent ones.
 
     One plus twice the correlations with neighbours, up to the first lag at which there is none.
 

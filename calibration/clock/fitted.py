@@ -131,7 +131,7 @@ def _joint_fit(
 
 
 def _adequate_or_not(calibrate: Calibrate, points: ImagePoints) -> Solution:
-    """Calibrate, whatever the motion: at a wrong offset it may seem to determine too little."""
+    """Calibrate without the test of the motion, which fails at wrong offsets."""
     try:
         return calibrate(points)
     except InadequateError as refused:

@@ -95,7 +95,7 @@ def delay_from_images(
     )
 
     def correlations(number: int, delay_s: float) -> FloatArray:
-        """Of so many images of each way with cuts of the other; NaN without support."""
+        """Correlations of `number` images of each way with cuts of the other; NaN without support."""
         first, second = (
             replace(stack, world_from_sensor=steady.at(times[way] - delay_s))
             for stack, way in zip(stacks, ways, strict=True)

@@ -88,7 +88,7 @@ def delay_from_lines(
     steady = SmoothReadings(readings)
 
     def fit(delay_s: float) -> tuple[FloatArray, int]:
-        """What a constant, the rotation about its mean and the position leave of the line; their rank."""
+        """Residual of the line after a linear fit of rotation and position, and the fit's rank."""
         turns, places = (pose := steady.at(times - delay_s)).rotation, pose.translation
         motion = [(turns.mean().inv() * turns).as_rotvec(), places - places.mean(axis=0)]
         matrix = np.column_stack([np.ones(len(times)), *motion])

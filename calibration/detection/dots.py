@@ -109,7 +109,7 @@ def _along_lines(contrast: Float32Array, peaks: IntArray, pixel_mm: FloatArray) 
 
 
 def bright_centre(grey: Float32Array, pixel: FloatArray, pixel_mm: FloatArray) -> FloatArray:
-    """Centre of what is bright around a place, by mean shift.
+    """Centre of brightness around a place, by mean shift.
 
     Filters see the tail of ringing under a wire as part of it: 0.4 mm, where the centre is 0.15 mm too deep.
     """

@@ -291,7 +291,7 @@ def consensus_line(
 def _echo_rows(
     levels: Float32Array, slope: Float32Array, inside: BoolArray, edge: IntArray, sigma: float, place: Place
 ) -> FloatArray:
-    """Where on the echo behind each column's edge the line is put, rows; NaN without an echo."""
+    """Row of the line on the echo behind each column's edge; NaN without an echo."""
     column = np.arange(len(edge))
     steepest = edge + peak_between(slope, column, edge)
     if place == "slope":

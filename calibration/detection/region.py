@@ -1,4 +1,4 @@
-"""Where in images to look: frames one at a time, the pixels of a polygon, columns at regular intervals."""
+"""Region of interest: pixels of a polygon, and columns at regular intervals."""
 
 from __future__ import annotations
 

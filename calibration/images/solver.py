@@ -46,7 +46,7 @@ displaced such answers by up to a millimetre and two degrees, more than the cova
 @shown
 @dataclass(frozen=True)
 class ImageCalibration:
-    """Where the image is on the sensor, found from two crossing sweeps.
+    """Mounting of the image on the sensor from two crossing sweeps, with its errors.
 
     Attributes
     ----------
@@ -96,7 +96,7 @@ def calibrate_images(
     settings: ImageFit | None = None,
     progress: Progress | None = None,
 ) -> ImageCalibration:
-    """Find where the image is on the sensor from two crossing sweeps.
+    """Calibrate the image's mounting on the sensor from two crossing sweeps.
 
     Parameters
     ----------

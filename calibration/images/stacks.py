@@ -1,4 +1,4 @@
-"""Tracked images made ready for comparison: reduced, blurred, thinned.
+"""Tracked images reduced for comparison: blurred and resampled.
 
 Interpolation smooths, and smoothing alone changes a similarity. So both sides of every comparison are first
 brought to one resolution, coarser than speckle and than the distance between images: blurred within the

@@ -1,1 +1,1 @@
-"""What a recording, its images, curves and sensors say against each other; changes no estimate."""
+"""Checks of recording, images, curves and sensors against each other; change no estimate."""

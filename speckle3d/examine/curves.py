@@ -1,4 +1,4 @@
-"""Do the curves belong to the sweep? What its own correlations, patches and clock say.
+"""Check curves against a sweep's own correlations, speckle and patches.
 
 A factor that all of a curve's distances have in common cannot be told from images: the same frames are then
 seen as far apart, and everything below fits as well as before. What can be told is curves that are wrong by
@@ -45,7 +45,7 @@ TILT_FACTOR = 1.4
 
 
 def examine_key(curves: DecorrelationCurves, all_patches: PatchGrid, patches: PatchGrid) -> tuple[Doubt, ...]:
-    """Hold curves against what beams can do, and against the patches that were laid and those used.
+    """Check curves against physical beams and against the sweep's patches.
 
     Raises
     ------
@@ -56,7 +56,7 @@ def examine_key(curves: DecorrelationCurves, all_patches: PatchGrid, patches: Pa
 
 
 def doubt_depths(curves: DecorrelationCurves, all_patches: PatchGrid, patches: PatchGrid) -> Doubt | None:
-    """Tell that patches were left out because the curves did not measure their depths."""
+    """Report patches left out because the curves do not cover their depths."""
     rows, common = all_patches.row_depth_mm, patches.row_depth_mm
     if rows.size == common.size:
         return None
@@ -81,7 +81,7 @@ def doubt_widths(curves: DecorrelationCurves) -> Iterator[Doubt]:
 
 
 def require_usable(doubts: Iterable[Doubt | None], error: type[Speckle3DError]) -> tuple[Doubt, ...]:
-    """Return doubts that leave what is doubted usable; raise `error` with the first that does not."""
+    """Return the doubts; raise `error` with the first that refutes."""
     actual = tuple(doubt for doubt in doubts if doubt is not None)
     for doubt in actual:
         if doubt.refuted:
@@ -90,7 +90,7 @@ def require_usable(doubts: Iterable[Doubt | None], error: type[Speckle3DError]) 
 
 
 def examine_curves(texture: Texture, motion: Motion) -> tuple[Doubt | None, ...]:
-    """Hold the curves against a sweep's own speckle and steps."""
+    """Check curves against a sweep's own speckle and steps."""
     rows, patches = rows_without_tilt(motion), motion.problem.patches
     gain = np.ones(patches.row_depth_mm.size) if rows is None else np.nan_to_num(rows.gain)
     return (
@@ -101,7 +101,7 @@ def examine_curves(texture: Texture, motion: Motion) -> tuple[Doubt | None, ...]
 
 
 def rows_without_tilt(motion: Motion) -> RowScales | None:
-    """Scales of rows over the centre's distance alone: what tilt explains may be wrong curves."""
+    """Scales of rows without the part that tilt explains, which may be wrong curves."""
     rows, problem = motion.coherence.rows, motion.problem
     if rows is None:
         return None
@@ -113,7 +113,7 @@ def rows_without_tilt(motion: Motion) -> RowScales | None:
 
 
 def doubt_bend(rows: RowScales | None) -> Doubt | None:
-    """Doubt curves by which depths of one image are not as far from the next.
+    """Doubt curves with which depths of an image disagree smoothly.
 
     By the standard deviation of a parabola over depth through rows without noise: a lens or a depth that is
     wrong bends all rows smoothly; rows that stand out alone hold structure.

@@ -1,4 +1,4 @@
-"""Images and sensors that say different things: both numbers, side by side. Either may be wrong."""
+"""Disagreements of images and sensors: both numbers, without a verdict."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ SIDEWAYS = 0.05
 
 
 def disagreements(sweep: Sweep, image: RigidTransform, covariance: FloatArray) -> tuple[Doubt, ...]:
-    """Compare what the images and each sensor say of length, of motion in the image's plane, and of roll.
+    """Compare images with each sensor in length, in-plane motion and roll.
 
     Parameters
     ----------
@@ -120,7 +120,7 @@ def unit_of_length(image: RigidTransform, tracker: Tracker, poses: RigidTransfor
 
 
 def differing_lengths(lengths: Mapping[str, tuple[float, float]]) -> tuple[Doubt, ...]:
-    """Modes whose lengths differ by more than three joint claims: among these there is no best.
+    """Pairs of modes whose lengths differ by more than three joint claims.
 
     Those whose lengths are the images' own cannot contradict each other.
 

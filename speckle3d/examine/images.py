@@ -1,4 +1,4 @@
-"""Whether a sweep's images can be what they are taken for: one probe that moves past what it images.
+"""Check a sweep's images: one probe that moves past the tissue, with the stated signal.
 
 Each test asks for what no honest sweep shows, however noisy, and needs no truth: frames far apart that hold
 the same echoes in the same place, frames that resemble the one before less than the one before that, pairs
@@ -85,7 +85,7 @@ a half too short 0.41 and more; whole images have up to 0.05, with noise of a te
 
 
 def examine_echoes(matches: MatchedSweep) -> tuple[Doubt, ...]:
-    """Hold a sweep's samples against the band, the sampling rate and the gain that are claimed of them.
+    """Check a sweep's samples against the stated band, sampling rate and gain.
 
     Raises
     ------
@@ -146,7 +146,7 @@ def doubt_gain(features: Sequence[FrameFeatures]) -> Doubt | None:
 
 
 def examine_processing(structure: float, short: float) -> tuple[Doubt, ...]:
-    """Tell images that are not speckle alone, or not of one moment each.
+    """Report filtered images and averaged frames.
 
     Parameters
     ----------
@@ -183,7 +183,7 @@ def examine_images(
     curves: DecorrelationCurves,
     usable: BoolArray,
 ) -> tuple[Doubt, ...]:
-    """Hold a sweep's images against the motion and the curves that they were read with.
+    """Check a sweep's images against the motion and the curves.
 
     Parameters
     ----------
@@ -224,7 +224,7 @@ def examine_images(
 
 
 def doubt_shadow(echoless: FloatArray) -> Doubt | None:
-    """Tell that patches without an echo were left out.
+    """Report patches without an echo, which are left out.
 
     Parameters
     ----------
@@ -294,7 +294,7 @@ def far_apart(position_mm: FloatArray, frames: IntArray, curves: DecorrelationCu
 
 
 def doubt_clutter(share: FloatArray, pairs: int, cells: float, of_echo: bool = True) -> Doubt | None:
-    """Doubt images that hold the same echoes in the same place however far apart they are.
+    """Doubt images with static echoes in frames far apart.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Sensors against themselves. A sensor is left out only for contradicting itself, by a `refuted` doubt.
+"""Check sensors against their own readings; only self-contradiction leaves one out.
 
 What images and sensors say differently is in `speckle3d.examine.disagreements`: either may be wrong.
 """
@@ -58,7 +58,7 @@ TILTED_DEG = 10.0
 def examine_sensors(
     sweep: Sweep, image: RigidTransform, examine: bool = True
 ) -> tuple[Sweep, tuple[Doubt, ...]]:
-    """The sweep without what its sensors contradict themselves in, and the doubts; or trust them all.
+    """Check a sweep's sensors; return the sweep without contradicted readings, and the doubts.
 
     Parameters
     ----------
@@ -80,7 +80,7 @@ def examine_sensors(
 
 
 def repair_readings(sweep: Sweep) -> tuple[Sweep, tuple[Doubt, ...]]:
-    """Leave out single wild readings, and count them and jumps."""
+    """Remove spikes from readings; report spikes and jumps."""
     doubts: list[Doubt] = []
     for name in ("tracker", "orientation"):
         sensor = getattr(sweep, name)
@@ -100,7 +100,7 @@ def repair_readings(sweep: Sweep) -> tuple[Sweep, tuple[Doubt, ...]]:
 
 
 def credible_sensors(sweep: Sweep, doubts: Iterable[Doubt]) -> Sweep:
-    """The sweep without the sensors that are refuted."""
+    """The sweep without refuted sensors."""
     refuted = {doubt.about for doubt in doubts if doubt.refuted}
     return replace(
         sweep,
@@ -110,7 +110,7 @@ def credible_sensors(sweep: Sweep, doubts: Iterable[Doubt]) -> Sweep:
 
 
 def require_credible(doubts: Iterable[Doubt], sensor: OrientationSensor | Tracker | None, where: str) -> None:
-    """Raise `MismatchError` for what rests on a sensor that is refuted."""
+    """Raise `MismatchError` if a sensor is refuted."""
     for doubt in doubts:
         if sensor is not None and doubt.refuted and doubt.about == sensor.label:
             raise MismatchError(f"{where}: {doubt}; sensors.examine = false uses it as it is")
@@ -125,7 +125,7 @@ def _doubt_jitter(label: str, place_mm: float, turn_rad: float) -> Iterator[Doub
 
 
 def _doubt_jumps(sensor: OrientationSensor | Tracker, frame_time_s: FloatArray) -> Iterator[Doubt]:
-    """Readings that go on elsewhere, faster than any hand: it slipped, or a tracker found itself anew."""
+    """Doubt readings that jump and stay: a slipped sensor, or a tracker that recovered."""
     poses = rigid(sensor.readings.world_from_sensor)
     if len(poses) < 2:
         return
@@ -139,7 +139,7 @@ def _doubt_jumps(sensor: OrientationSensor | Tracker, frame_time_s: FloatArray) 
 
 
 def _doubt_still(sensor: OrientationSensor | Tracker, sweep: Sweep, image: RigidTransform) -> Iterator[Doubt]:
-    """Readings that are all the same while the images move."""
+    """Doubt identical readings while the images move."""
     poses, read_s = rigid(sensor.readings.world_from_sensor), sensor.readings.time_s
     still = (_steps(poses[:-1], poses[1:]) < _STILL).all(axis=0)
     runs = [(read_s[first], read_s[last + 1]) for first, last in runs_of(np.flatnonzero(still))]

@@ -1,4 +1,4 @@
-"""Directions for voxels: the images' mean lateral, axial and elevational, or those of the smallest box."""
+"""Axes for voxels: mean axes of the images, or those of the smallest box."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ def principal_axes(grid: ImageGrid, world_from_image: RigidTransform) -> Rotatio
 
 
 def line_along(directions: FloatArray) -> FloatArray:
-    """Line that directions lie along best, whichever way along it they point.
+    """Axis of unsigned directions by least squares.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Images nearest to points of the world, one on either side: what reslices and backward volumes blend."""
+"""Nearest images on either side of points, blended by reslices and backward volumes."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _GRAIN = 32
 
 
 class NearestImages:
-    """Points along straight lines, and the images nearest to them so far, one behind and one in front.
+    """Nearest images so far, one on either side, of points along straight lines.
 
     Parameters
     ----------
@@ -67,7 +67,7 @@ class NearestImages:
         self._grey = np.full(self._distance_mm.shape, np.nan, dtype=np.float32)
 
     def add(self, batch: Mapping[int, Float32Array]) -> None:
-        """Look at some of the images."""
+        """Update the nearest images with some more images."""
         from speckle3d.kernels.cuts import keep_nearest
 
         looks = [(image, self._index_from_world[i].copy()) for i, image in batch.items() if self.near[i]]

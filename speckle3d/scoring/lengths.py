@@ -60,7 +60,7 @@ class MotionSums(NamedTuple):
 
 @dataclass(frozen=True)
 class Part:
-    """A stretch of a sweep in which the probe moves one way; neighbours share their turning frame."""
+    """Monotone part of a sweep; neighbouring parts share their turning frame."""
 
     name: str
     first: int
@@ -253,7 +253,7 @@ def part_lengths(
 
 
 def read_end(values: FloatArray, end_frames: int = END_FRAMES) -> float:
-    """Last of some values, read off a Theil-Sen line through the last of them.
+    """Value at the end, from a Theil-Sen line through the last values.
 
     Parameters
     ----------

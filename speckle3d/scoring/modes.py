@@ -1,4 +1,4 @@
-"""The mode to take where a reconstruction has several: that which claims the smallest error of length."""
+"""Default mode of a reconstruction: the one with the smallest claimed error of length."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def length_claims(
 
 
 def default_mode(reconstruction: Reconstruction) -> tuple[str, str]:
-    """Choose a mode where nobody did; returns it and why, in words that are empty if there is no choice.
+    """Choose the default mode; returns it and the reason, empty if there is no choice.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""What a sweep's reconstruction is compared with: the simulation's truth, or the position sensor.
+"""Reference of a reconstruction: the simulation's truth, or the position sensor.
 
 `sweep_curves` accumulates the motion of both, frame by frame, as figures show them.
 """

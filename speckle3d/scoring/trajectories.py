@@ -70,7 +70,7 @@ class PoseError:
 
     @classmethod
     def of(cls, errors: RigidTransform) -> PoseError:
-        """Sum up poses that would be the identity if nothing were wrong."""
+        """Errors of relative poses, which are the identity where the estimate is right."""
         sizes = np.linalg.norm(errors.translation, axis=1), np.rad2deg(errors.rotation.magnitude())
         return cls(*(float(v) for e in sizes for v in (np.sqrt(np.mean(e**2)), e.mean(), e.max())))
 

@@ -26,7 +26,7 @@ def measure(
     mode: str | None = None,
     pick_mm: float | None = None,
 ) -> list[Measurement]:
-    """Say how long it is between points of a reconstructed sweep, and how sure that is.
+    """Measure distances and angles between points of a reconstructed sweep with their errors.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""A sweep with the poses of its frames: by a reconstruction's mode, or by what the recording itself says."""
+"""A sweep with the poses of its frames, from a reconstruction or the recording itself."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ _LEAST_REACH_MM = 0.5
 @shown
 @dataclass(frozen=True)
 class PosedSweep:
-    """A sweep, and where its frames are.
+    """A sweep with the poses of its frames.
 
     Attributes
     ----------
@@ -125,7 +125,7 @@ MARK = "poses_mark"
 
 
 def pose_mark(world_from_image: RigidTransform) -> str:
-    """Mark of poses, the same for the same ones to a millionth of a millimetre."""
+    """Hash of poses rounded to a millionth of a millimetre."""
     matrices = np.round(world_from_image.as_matrix(), 6) + 0.0  # no negative zeros
     return sha256(np.ascontiguousarray(matrices).tobytes()).hexdigest()[:16]
 

@@ -91,14 +91,14 @@ class Summary:
 
     @property
     def lines(self) -> list[str]:
-        """What stands below the table: doubts, modes left out, and remarks on rows."""
+        """Notes below the table: doubts, modes left out, and remarks on rows."""
         remarks = dict.fromkeys(f"{row.mode}: {self.remark(row)}" for row in self.rows if self.remark(row))
         left_out = (f"mode {mode} is left out" for mode in self.left_out)
         words = (*(doubt.consequence for doubt in self.doubts), *left_out, *remarks)
         return [f"{self.sweep}: {text}" for text in words]
 
     def remark(self, row: ModeError) -> str:
-        """What a reader of a row must know beside its numbers; empty for nothing."""
+        """Remark on a row; empty for none."""
         words = []
         if row.mode == self.reference:
             words.append("the reference itself")
@@ -163,7 +163,7 @@ class Study:
 
     @property
     def summaries(self) -> list[Summary]:
-        """Of the sweeps with results."""
+        """Summaries of the sweeps with results."""
         return [outcome.summary for outcome in self.outcomes if outcome.summary]
 
     @cached_property

@@ -1,4 +1,4 @@
-"""Where a study's jobs run: in this process, in processes of this machine, or on a Dask cluster.
+"""Schedulers of a study's jobs: this process, local processes, or a Dask cluster.
 
 A job is a function of one argument that returns a result; all ways call the same function with the same
 argument, so the results are the same.
@@ -44,7 +44,7 @@ class Scheduler:
     def run(
         self, function: Callable[[Job], Result], jobs: Sequence[Job], failure: Callable[[Job, str], Result]
     ) -> Iterator[Result]:
-        """Yield the result of each job as it comes; of one whose worker dies what `failure` makes of it."""
+        """Yield the result of each job as it completes, or `failure` of one whose worker died."""
         if self.client is None and self.workers == 1:
             yield from map(function, jobs)
             return
@@ -65,7 +65,7 @@ class Scheduler:
 
 @contextmanager
 def scheduler_for(address: str | None, workers: int | None) -> Iterator[Scheduler]:
-    """Open where to run: the cluster at `address`, that many processes here, or this process.
+    """Open a scheduler: the cluster at `address`, local processes, or this process.
 
     A cluster's security is its own: what Dask's configuration says of certificates is used.
 

@@ -1,4 +1,4 @@
-"""Oblique planes, placed anywhere, and as large as what a sweep shows of them."""
+"""Oblique planes, sized to what a sweep shows of them."""
 
 from __future__ import annotations
 

@@ -54,7 +54,7 @@ class Cut:
 
     @property
     def extent_mm(self) -> tuple[float, float, float, float]:
-        """What the axes say at the outer borders of the pixels: left, right, bottom and top."""
+        """Coordinates of the outer borders of the pixels: left, right, bottom and top."""
         rows, columns = self.shape
         left, top = (first - self.pixel_mm / 2 for first in self.first_mm)
         return left, left + columns * self.pixel_mm, top + rows * self.pixel_mm, top
@@ -71,7 +71,7 @@ class Cut:
         return np.concatenate([self.base_mm, self.base_mm + below])
 
     def moved(self, move: RigidTransform) -> Cut:
-        """The same cut elsewhere in the world."""
+        """The cut moved by a rigid transform."""
         plane = self.world_from_picture
         return replace(
             self,
@@ -113,7 +113,7 @@ def require_pixels(width_mm: float, height_mm: float, pixel_mm: float) -> None:
 
 
 def image_plane(world_from_image: RigidTransform, grid: ImageGrid, pixel_mm: float) -> Cut:
-    """The plane of one image, as large as the image: what another sweep shows there."""
+    """Plane of one image, of the image's size."""
     low, high = grid.extent_mm
     return plane_cut(world_from_image, low, high, pixel_mm)
 

@@ -1,1 +1,1 @@
-"""Surfaces, lengths, areas and volumes, and how far they may be off."""
+"""Surfaces, lengths, areas and volumes with their standard errors."""

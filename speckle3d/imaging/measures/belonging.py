@@ -1,4 +1,4 @@
-"""Which frames a point of the world belongs to: the two on either side of it, as reslices blend them."""
+"""Assign points to frames: the two on either side of a point, as reslices blend them."""
 
 from __future__ import annotations
 

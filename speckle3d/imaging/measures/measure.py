@@ -20,7 +20,7 @@ LEAST_MM = 1e-6
 
 @dataclass(frozen=True)
 class Measurement:
-    """A length or an angle and how sure it is.
+    """A length or an angle with its standard error.
 
     Attributes
     ----------
@@ -53,7 +53,7 @@ class Measurement:
 
     @property
     def shown_in(self) -> tuple[float, str]:
-        """Factor to the unit that people read, and that unit: mm or degrees."""
+        """Factor to the displayed unit, and that unit: mm or degrees."""
         return (1.0, "mm") if self.unit == "mm" else (math.degrees(1.0), "degrees")
 
     @property

@@ -118,7 +118,7 @@ def surfaces_of_labels(volume: Volume) -> dict[int, Surface]:
 
 
 def known_voxels(volume: Volume) -> BoolArray:
-    """Voxels that have a value, as far as the volume itself shows, in its shape.
+    """Mask of voxels that have a value, as far as the volume itself shows.
 
     Of float32 those that are not NaN. Of whole numbers an empty voxel is 0, and so is black: zeros that are
     connected with the border of the grid are taken for empty, and those enclosed for black.
@@ -222,7 +222,7 @@ def _closed_part(surface: Surface, open_edges: IntArray) -> Surface:
 
 
 def _sigma(surface: Surface, gradient: FloatArray, errors: PoseErrors, grid: ImageGrid) -> float:
-    """Standard error of what has this derivative with respect to each triangle's corners."""
+    """Standard error of a quantity from its derivative by each triangle's corners."""
     near = belonging_of(surface.vertices_mm, grid, errors.world_from_image)
     corner = surface.triangles.ravel()
     points, gradient = surface.vertices_mm[corner], gradient.reshape(-1, 3)

@@ -1,4 +1,4 @@
-"""Where voxels lie: grids around a sweep's images, or as asked for."""
+"""Grids of voxels around a sweep's images."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Triple = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class VoxelGrid:
-    """Where voxels lie.
+    """Grid of voxels: shape, spacing and pose.
 
     Parameters
     ----------

@@ -14,7 +14,7 @@ VoxelType = Literal["float32", "uint8", "int16", "uint16"]
 
 
 class CompoundingSettings(BaseModel):
-    """How images become voxels."""
+    """Settings of compounding."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 

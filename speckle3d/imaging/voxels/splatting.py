@@ -1,4 +1,4 @@
-"""Images given to the voxels of a grid: ways of splatting, and rules for several samples in one voxel.
+"""Splatting of images into voxels, with rules for several samples in one voxel.
 
 The rule "plus" keeps means in whole grey levels, as PLUS and 3D Slicer do, for comparing volumes with theirs
 voxel by voxel. Both stand on IGSIO, whose ``vtkIGSIOPasteSliceIntoVolume`` differs from the mean of the
@@ -55,7 +55,7 @@ def splat_images(
     weights: FloatArray | None = None,
     mask: BoolArray | None = None,
 ) -> tuple[Float32Array, ByteArray]:
-    """Give images to the voxels of a grid.
+    """Splat images into the voxels of a grid.
 
     Parameters
     ----------
@@ -116,7 +116,7 @@ def splat_images(
 def _kernel(
     splat: Splat, rule: Rule, shape: tuple[int, ...]
 ) -> tuple[Callable[..., None], tuple[npt.NDArray[Any], ...]]:
-    """What adds samples to the voxels of a box, and the tables that it adds them to."""
+    """Kernel that adds samples to the voxels of a box, with its tables."""
     from speckle3d.kernels import splatting as kernels
     from speckle3d.kernels.whole_levels import add_whole
 
@@ -129,7 +129,7 @@ def _kernel(
 
 
 def _levels(rule: Rule, tables: tuple[npt.NDArray[Any], ...]) -> Float32Array:
-    """Levels of voxels by what was added; NaN where no sample was."""
+    """Levels of voxels from the accumulated samples; NaN where there was none."""
     table, weights = tables[0], tables[-1]
     if rule == "maximum":
         return np.asarray(table)

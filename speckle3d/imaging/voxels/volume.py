@@ -1,4 +1,4 @@
-"""Voxels from a sweep's images, all of them in memory.
+"""Compound a sweep's images into voxels, in memory.
 
 Voxels are indexed ``[i, j, k]`` along the grid's x, y and z, which are the world's axes unless asked
 otherwise: in the mode `image` lateral, axial and elevational of the first frame.
@@ -34,7 +34,7 @@ _BYTES_PER_VOXEL = 25
 @shown
 @dataclass(frozen=True)
 class CompoundedVolume(Volume):
-    """A volume and where its voxels are from.
+    """A volume with the state of its voxels: measured, filled or empty.
 
     Attributes
     ----------
@@ -171,7 +171,7 @@ def compound_onto(
 def look_up_voxels(
     source: PosedImages, voxel_grid: VoxelGrid, reach_mm: float, region: BoolArray | None = None
 ) -> tuple[Float32Array, ByteArray]:
-    """Give each voxel of a sparse sweep the level between the images nearest to it on either side.
+    """Interpolate each voxel of a sparse sweep between the nearest images on either side.
 
     Where images lie farther apart than voxels, samples put into voxels leave gaps, which hole filling closes
     with means of what is near. Here it is linear between two images, bilinear in either.

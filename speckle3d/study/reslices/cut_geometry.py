@@ -1,4 +1,4 @@
-"""Where the cuts in a picture lie in the world, kept in the picture itself: a PNG's text under one keyword.
+"""Geometry of the cuts in a picture, stored in the PNG's text.
 
 Whoever picks points in the picture, by its axes, gets points of the world.
 """

@@ -1,4 +1,4 @@
-"""Cuts through a sweep at the poses of one or several modes, as a person asks for them."""
+"""Cuts through a sweep at the poses of one or several modes."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from speckle3d.study.reslices.places import Place
 
 @dataclass(frozen=True)
 class DrawnCut:
-    """A cut as it is drawn.
+    """A cut with its image and the frames' lines on it.
 
     Attributes
     ----------
@@ -46,7 +46,7 @@ class DrawnCut:
 
 @dataclass(frozen=True)
 class CutPicture:
-    """Cuts of one place at the poses of several modes, and what a picture of them says.
+    """Cuts of one place at the poses of several modes, with the picture's text.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Where to cut a sweep, at the poses of every mode, and what the cut's axes are called."""
+"""Places of cuts in a sweep at the poses of every mode, with the names of their axes."""
 
 from __future__ import annotations
 

@@ -34,7 +34,7 @@ Axes = Literal["sweep", "world", "principal"]
 
 @dataclass(frozen=True)
 class GridRequest:
-    """Grid of voxels, or what to choose it by.
+    """Requested grid of voxels, whole or in part.
 
     Attributes
     ----------
@@ -137,7 +137,7 @@ class VolumeReport:
         return {"measured": parts[MEASURED], "filled": parts[FILLED], "empty": parts[EMPTY]}
 
     def summary(self) -> dict[str, Any]:
-        """Everything as JSON has it."""
+        """Summary as JSON."""
         return {
             "file": str(self.path),
             "size_bytes": self.path.stat().st_size,
