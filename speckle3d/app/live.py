@@ -61,7 +61,7 @@ def watch(session: Session, status: Callable[[], str]) -> Iterator[tuple[str, st
 
 
 class _Viewer:
-    """What one viewer sees."""
+    """View of one viewer."""
 
     def __init__(self, session: Session, status: Callable[[], str]) -> None:
         self._session, self._status, self._counts = session, status, (-1, -1)

@@ -1,4 +1,4 @@
-"""How all pages look: a line with the file's name, tabs below it, one sober style."""
+"""Style of all pages: a line with the file's name, and tabs below it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which pages a file has."""
+"""Choose the pages of a file."""
 
 from __future__ import annotations
 

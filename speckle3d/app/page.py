@@ -10,7 +10,7 @@ from panel.viewable import Viewable
 
 
 class Page(Protocol):
-    """What one tab of the app shows."""
+    """A page, shown as one tab of the app."""
 
     title: str
 

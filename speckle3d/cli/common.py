@@ -1,4 +1,4 @@
-"""What the commands share: options, settings, and output."""
+"""Options, settings and output common to commands."""
 
 from __future__ import annotations
 

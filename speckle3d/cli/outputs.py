@@ -1,4 +1,4 @@
-"""What a command may write over: never an input, and of other files only its own kind."""
+"""Overwrite rules: never an input, and only files of the command's own kind."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Signals that ask a command for its end: heard once, and ignored where the parent says so."""
+"""Handling of signals that ask a command to end."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _AGAIN_S = 0.01
 
 
 class ToldToStopError(KeyboardInterrupt):
-    """A signal asks for the end.
+    """A signal asked the command to end.
 
     A plain `KeyboardInterrupt` that passes through code run from C makes Python end by SIGINT, with its code.
     """

@@ -1,4 +1,4 @@
-"""Where the samples of an image lie, on parallel vectors or a fan's, and which parts of it count.
+"""Grid of an image's samples on parallel vectors or a fan, and regions of it.
 
 Positions are millimetres in the image: x lateral from the first vector, y axial, the depth.
 """
@@ -50,7 +50,7 @@ class FanLines:
 
 @dataclass(frozen=True)
 class ImageGrid:
-    """Where the samples of a frame lie in the image plane P, mm.
+    """Grid of a frame's samples in the image plane P, mm.
 
     Attributes
     ----------

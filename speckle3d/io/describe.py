@@ -1,4 +1,4 @@
-"""What a file holds, told in rows of description, value and unit."""
+"""Describe a file in rows of description, value and unit."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from speckle3d.io.voxels.volumes import is_volume, read_volume
 
 
 def describe(path: PathLike) -> list[Row]:
-    """Tell what a file holds as rows of description, value and unit.
+    """Describe a file as rows of description, value and unit.
 
     Of a recording, rows tell what its reader found, also where there is no sweep in it, and why.
 

@@ -22,7 +22,7 @@ from speckle3d.io.hdf5 import make_folder, require_target
 
 @dataclass(frozen=True)
 class FileSet:
-    """Files of one folder that are one result.
+    """Files of one result in one folder.
 
     Attributes
     ----------

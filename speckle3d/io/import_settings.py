@@ -1,4 +1,4 @@
-"""Settings for what a recording's own files do not say: from options, or a TOML file beside them.
+"""Import settings: metadata that a recording lacks, from options or a TOML file.
 
 The numbers for ``scan.mha`` are looked for in ``scan.mha.toml`` and else in ``import.toml``, which serves
 every recording of its folder; those for a folder ``scan`` in ``scan.toml``, ``scan/import.toml``, or
@@ -116,7 +116,7 @@ class ImportSettings(BaseModel):
 
 
 class MissingSettingsError(InvalidInputError):
-    """A recording does not say values that are needed, and nothing gives them.
+    """A recording lacks required metadata.
 
     Attributes
     ----------

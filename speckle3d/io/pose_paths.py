@@ -1,4 +1,4 @@
-"""Rows and poses of others' recordings: what is of no use is left out and told, the rest is kept."""
+"""Filter rows and poses of recordings: leave out invalid ones, with a note."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def rising(times: FloatArray) -> IntArray:
 
 
 def usable(noun: str, time_s: FloatArray, faults: Sequence[str] | None = None) -> tuple[IntArray, list[str]]:
-    """Choose the rows of a recording that are of use, and tell what is left out and why.
+    """Choose the valid rows of a recording, with a note of those left out.
 
     Parameters
     ----------
@@ -126,7 +126,7 @@ def _loss(noun: str, total: int, reasons: Mapping[str, int], time_s: FloatArray)
 
 
 def checked_path(sweep: Sweep, chain: str) -> tuple[Sweep, list[str]]:
-    """Leave jumps out of a sweep's tracker, and tell what is odd of its path and how many poses match.
+    """Remove jumps from a sweep's tracker, with notes on its path and matching poses.
 
     Parameters
     ----------

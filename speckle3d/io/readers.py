@@ -1,4 +1,4 @@
-"""Readers of sweeps: one object a format, found by what a file holds. Other packages add theirs.
+"""Readers of sweeps, one for each format, chosen by content; other packages add theirs.
 
 A package adds a format by an entry point of the group ``speckle3d.readers`` that names a `Reader`.
 """
@@ -37,7 +37,7 @@ _MODULES = (
 
 @dataclass(frozen=True)
 class Reader:
-    """How sweeps of one format are told and read.
+    """Reader of one format: recognises recordings and reads sweeps.
 
     Attributes
     ----------

@@ -27,7 +27,7 @@ on a grid of a hundred by a hundred patches that do not it is above 1e-5."""
 
 
 class Frame(NamedTuple):
-    """What is kept of a frame while pairs with it may still be matched.
+    """Matching data of a frame: usable patches, equalised image and echo, spectrum.
 
     Attributes
     ----------
@@ -48,7 +48,7 @@ class Frame(NamedTuple):
 
 
 class Geometry(NamedTuple):
-    """Where patches lie and how they are read.
+    """Geometry of patches and rules of matching.
 
     Attributes
     ----------
@@ -80,7 +80,7 @@ class Geometry(NamedTuple):
 
 
 class Matches(NamedTuple):
-    """What frame pairs have in common; a row each.
+    """Correlation and in-plane motion of frame pairs, a row each.
 
     Attributes
     ----------
@@ -117,7 +117,7 @@ def _vertex(before: float, at: float, after: float) -> float:
 
 @njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
 def _peak(z: FloatArray, logarithmic: bool) -> tuple[float, float, float]:
-    """Sub-sample peak of a patch from parabolas through ln(rho), and how much it is worth."""
+    """Sub-sample peak of a patch from parabolas through ln(rho), with its weight."""
     lateral, axial = _vertex(z[0], z[2], z[4]), _vertex(z[1], z[2], z[3])
     if not (abs(lateral) <= 1.5 and abs(axial) <= 1.5):
         return lateral, axial, 0.0

@@ -1,4 +1,4 @@
-"""How well a plane explains the correlations of a pair's patches, and the plane nearby that does so best."""
+"""Misfit of a plane to the correlations of a pair's patches, and its minimisation."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class EchoModels(NamedTuple):
 
 
 class Levers(NamedTuple):
-    """What a plane's coefficients are multiplied by at each patch.
+    """Lever arms of a plane's coefficients at each patch.
 
     Attributes
     ----------
@@ -53,7 +53,7 @@ class Levers(NamedTuple):
 
 
 class FitRules(NamedTuple):
-    """How planes are fitted; see `speckle3d.motion.planes`.
+    """Rules of the fit of planes; see `speckle3d.motion.planes`.
 
     Attributes
     ----------
@@ -134,7 +134,7 @@ def predict_correlation(
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
 def _distance(plane: FloatArray, i: int, patches: PairPatches) -> tuple[float, float, float]:
-    """Distance of a patch without and with what turning alone decorrelates, and the latter's part."""
+    """Distance of a patch without and with the decorrelation by rotation, and its part."""
     t = patches.table
     z = plane[0] + t[LATERAL, i] * plane[1] + t[_LEVER, i] * plane[2]
     turned = t[_SPREAD, i] * plane[2]

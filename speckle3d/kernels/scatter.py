@@ -43,7 +43,7 @@ class FieldTable(NamedTuple):
 
 
 class EchoGrid(NamedTuple):
-    """Where echoes are summed: depth of the first sample and per sample, and the carrier's cycles, per mm."""
+    """Sampling of echoes: depths and the carrier's cycles per mm."""
 
     first_depth_mm: float
     sample_mm: float

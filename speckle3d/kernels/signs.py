@@ -12,7 +12,7 @@ from speckle3d.kernels.copying import copy_into
 
 
 class PathRules(NamedTuple):
-    """How paths are followed; see `speckle3d.motion.signs`."""
+    """Rules for following paths; see `speckle3d.motion.signs`."""
 
     hypotheses: int
     relative_error: float

@@ -59,7 +59,7 @@ class PatchGrid(NamedTuple):
 
 
 class PatchScores(NamedTuple):
-    """What `compare_patches` fills.
+    """Results of `compare_patches`.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Samples of frames given to the voxels that they lie in, or to the eight around them.
+"""Splat samples of frames into the voxels in which they lie, or the eight around them.
 
 Positions are whole numbers of 2^-40 voxel, so that stepping along a line adds no error and a part of the
 voxels gets exactly what it gets as part of all. Lines are cut to the voxels wanted before they are walked.

@@ -1,4 +1,4 @@
-"""Least squares with a sensor's wandering error: a Kalman filter that passes through a recording."""
+"""Whiten residuals for sensor errors correlated in time, by a Kalman filter."""
 
 import math
 

@@ -40,7 +40,7 @@ def words_for(pose: LivePose, settings: TrajectorySettings) -> str:
 
 @dataclass
 class Words:
-    """Advice that changes slowly enough to be read.
+    """Advice with a minimum display time.
 
     Attributes
     ----------
@@ -53,7 +53,7 @@ class Words:
     _text_s: float = float("-inf")
 
     def take(self, words: str, time_s: float) -> bool:
-        """Take what there is to say at a time; true if something else is said from now on."""
+        """Update the advice at a time; true if the displayed text changes."""
         if words != self._next:
             self._next, self._since_s = words, time_s
         lasts = time_s - self._since_s >= SEEN_S and time_s - self._text_s >= STAYS_S

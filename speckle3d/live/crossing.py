@@ -30,7 +30,7 @@ PAUSE_S = 5.0
 
 
 def words_of(crossing: CrossingSoFar, settings: CrossingSettings) -> str:
-    """What to say of two sweeps, by the limits below which the reconstruction refuses them."""
+    """Advice on two crossing sweeps, by the limits of the reconstruction."""
     if crossing.similarity < settings.least_similarity:
         return NO_PLACE
     if crossing.angle_deg < settings.least_angle_deg:

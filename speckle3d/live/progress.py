@@ -62,7 +62,7 @@ class Progress:
 
     @property
     def line(self) -> str:
-        """All of it in one line."""
+        """Progress as one line of text."""
         parts = [
             f"{self.frames} frames",
             self.length.replace("±", "+-"),

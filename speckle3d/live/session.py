@@ -50,7 +50,7 @@ VOLUME_EVERY_S = 1.0
 
 
 class Source(Protocol):
-    """Where messages come from."""
+    """Source of messages."""
 
     def receive(self, timeout_s: float) -> list[Received]:
         """Take all messages in order, waiting for the first one; empty if none came in time."""
@@ -58,7 +58,7 @@ class Source(Protocol):
 
 @dataclass(frozen=True)
 class SessionSettings:
-    """What a session is to do.
+    """Settings of a live session.
 
     Attributes
     ----------
@@ -138,7 +138,7 @@ class Session:
         self._words, self._sent_s = Words(), 0.0
 
     def end(self) -> None:
-        """Let `run` end with what it has."""
+        """Ask `run` to end."""
         self._over.set()
 
     def picture(self) -> tuple[Float32Array, ImageGrid] | None:

@@ -1,4 +1,4 @@
-"""A sweep tracked as it is made: each frame matched and placed when it comes, poses revised as more is known.
+"""Track a sweep as it is made: match and place each frame, and revise earlier poses.
 
 A frame is matched by the functions that match recordings, in one block however long the sweep becomes, and
 placed by its planes against the frames it was matched with. Meanwhile, in another thread, the motion of the
@@ -56,7 +56,7 @@ LAST = 10**9
 
 @dataclass(frozen=True)
 class LivePose:
-    """Where a frame is, as far as is known when it has come.
+    """Pose of a frame as estimated on its arrival.
 
     Attributes
     ----------
@@ -82,7 +82,7 @@ class LivePose:
 
 
 class LiveTracker:
-    """Places frames as they come.
+    """Match and place frames as they arrive.
 
     Parameters
     ----------
@@ -221,7 +221,7 @@ class LiveTracker:
         self._revise(len(self))
 
     def _keep(self, features: FrameFeatures, table: CorrelationTable) -> None:
-        """Take a frame's features and pairs; it stands where the last one was."""
+        """Store a frame's features and pairs, with the pose of the last frame."""
         number = len(self._tables)
         self._features.append(features)
         self._tables.append(table)

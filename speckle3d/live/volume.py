@@ -1,4 +1,4 @@
-"""A volume that grows with a sweep: made anew from small images, at the poses as they are known by then."""
+"""Growing volume of a live sweep, compounded from small images at the current poses."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class GrowingVolume:
 
     @property
     def grid(self) -> ImageGrid:
-        """Of the small images."""
+        """Grid of the small images."""
         return self._pooled.grid
 
     def keep(self, index: int, intensity: Float32Array) -> None:

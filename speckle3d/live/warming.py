@@ -1,4 +1,4 @@
-"""Load what placing a frame needs before the first one comes: kernels take seconds to load."""
+"""Load kernels before the first frame arrives."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the report shows of each sweep of a study: its results, its curves and its patches."""
+"""Data of the report for each sweep of a study: results, curves, patches."""
 
 from __future__ import annotations
 

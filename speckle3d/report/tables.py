@@ -1,4 +1,4 @@
-"""The report's words: its first sentences, and the cells of its tables for the page's template."""
+"""Sentences and table cells of the report."""
 
 from __future__ import annotations
 

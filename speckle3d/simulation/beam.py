@@ -73,7 +73,7 @@ class Probe:
 
     @property
     def signal(self) -> RFSettings:
-        """How this probe's vectors are sampled."""
+        """Sampling of this probe's vectors."""
         return RFSettings(
             self.sampling_rate_hz, self.speed_of_sound_m_s, self.centre_frequency_hz, self.bandwidth_hz
         )

@@ -60,7 +60,7 @@ _OFF_POINT_MM = 0.15
 
 @dataclass(frozen=True)
 class HandMotion:
-    """What a hand-held sweep does beside going straight on.
+    """Deliberate motion of a hand-held sweep: start angles, turns, reversal.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What a scanner makes of the echoes before it stores them: I/Q, or grey levels of a B-mode image."""
+"""Receiver of a scanner: RF to I/Q, or to grey levels of a B-mode image."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _GREY_DECIMATION = 4
 
 @dataclass(frozen=True)
 class ReceivedFrames:
-    """What is stored of RF frames: I/Q in whole counts of 16 bits, or the log-compressed envelope in 8 bits.
+    """Frames received from RF: 16-bit I/Q, or the 8-bit log-compressed envelope.
 
     Parameters
     ----------

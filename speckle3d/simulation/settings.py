@@ -12,7 +12,7 @@ Preset = Literal["phantom", "tissue", "reversal", "rotation", "crossed", "steppe
 
 
 class SimulationSettings(BaseModel):
-    """What to simulate. The same settings give the same sweep."""
+    """Settings of a simulated sweep; the same settings give the same samples."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 

@@ -31,7 +31,7 @@ from speckle3d.study.schedulers import Scheduler
 
 @dataclass(frozen=True)
 class StudyRequest:
-    """What is done with each sweep; with the input's bytes it determines the result.
+    """Request of a study: modes, settings and reference of each sweep.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""What a summary says of a reconstruction beside its errors: fits, claims, doubts."""
+"""Details of a reconstruction for its summary: fits, claims, doubts."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def recorded_doubts(path: Path, provenance: Provenance) -> tuple[Doubt, ...] | N
 
 
 def doubted_modes(sweep: Sweep, doubts: Sequence[Doubt], modes: Collection[str]) -> dict[str, str]:
-    """What is suspected of the sensor that each mode rests on; images are under all but the tracker alone."""
+    """Suspected causes of doubts by mode, from the images and sensors each mode uses."""
     suspicions = {}
     for mode in modes:
         sensor = None if mode == "image" else sensor_of(sweep, "pose" if mode == TRACKER else mode)
@@ -58,7 +58,7 @@ def doubted_modes(sweep: Sweep, doubts: Sequence[Doubt], modes: Collection[str])
 def details_of(
     tracked: Tracked, corrections: Mapping[str, Correction], provenance: Provenance
 ) -> dict[str, Any]:
-    """Everything worth keeping of a reconstruction beside its errors, by name."""
+    """Details of a reconstruction beside its errors, by name."""
     fits: dict[str, dict[str, Any]] = {}
     for mode, fit in corrections.items():
         if isinstance(fit, DriftCorrection):

@@ -81,7 +81,7 @@ class JobResult:
 
     @property
     def table(self) -> str:
-        """The same errors as text."""
+        """Table of the errors as text."""
         return summary_text([self.summary])
 
     @property
@@ -110,7 +110,7 @@ def run_job(
     calibrations: Sequence[PathLike] = (),
     crossing: tuple[Sweep, Path] | None = None,
 ) -> JobResult:
-    """Reconstruct a sweep and put everything that belongs to it into `directory`.
+    """Reconstruct a sweep and write all results into `directory`.
 
     Written: ``reconstruction.h5``, ``summary.json``, ``table.txt``, ``table.csv``, ``drift.png``,
     ``reslice.png`` and ``enlarged.png``. A new folder appears whole; in one that is there, all of them take

@@ -122,7 +122,7 @@ def means_table(intervals: Sequence[Row]) -> list[list[str]]:
 
 
 def better_modes(comparisons: Sequence[Row]) -> list[str]:
-    """Which modes have less of what error than others, a line for each pair; one line if none has."""
+    """Significant differences of modes, a line for each pair; one line if there are none."""
     less: dict[str, list[str]] = {}
     for row in comparisons:
         if row["better"]:

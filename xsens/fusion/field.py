@@ -1,4 +1,4 @@
-"""Whether the magnetometer can be trusted where a sensor was used, by what its fusion found of the field."""
+"""Judge whether the magnetometer can be trusted, by the field found in the fusion."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Trust(StrEnum):
 
 @dataclass(frozen=True)
 class FieldFound:
-    """What a fusion found of the magnetic field.
+    """Properties of the magnetic field estimated by a fusion.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Whether a log's gyroscope, accelerometer, magnetometer and own orientation tell of the same movement.
+"""Consistency of a log's gyroscope, accelerometer, magnetometer and own orientation.
 
 A direction u that rests in the world changes in the sensor's axes at the rate u x w, with w the gyroscope's.
 Three are read: up by the accelerometer, north by the magnetometer, and any by the sensor's own orientation.

@@ -1,4 +1,4 @@
-"""What all readers of logs hand over: samples as they were sent; and their assembly to an `ImuLog`."""
+"""Samples as sent, from all readers of logs, and their assembly to an `ImuLog`."""
 
 from __future__ import annotations
 

@@ -104,7 +104,7 @@ class ReconstructionPage:
 
 
 class _Viewer(param.Parameterized):  # type: ignore[misc]
-    """What one viewer sees: modes, where the cross hair is, and measured points."""
+    """View of one viewer: modes, cross hair, and measured points."""
 
     mode = param.Selector(label="mode")
     overlay = param.Selector(label="compared with")

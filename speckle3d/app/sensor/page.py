@@ -82,7 +82,7 @@ class SensorPage:
 
 
 class _Viewer(param.Parameterized):  # type: ignore[misc]
-    """What one viewer sees of a sensor."""
+    """View of a sensor for one viewer."""
 
     step = param.Integer(0, label="time / 0.1 s")
 

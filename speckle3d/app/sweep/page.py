@@ -81,7 +81,7 @@ class SweepPage:
 
 
 class _Player(param.Parameterized):  # type: ignore[misc]
-    """What one viewer sees of a sweep."""
+    """View of a sweep for one viewer."""
 
     frame = param.Integer(0)
     colour = param.Selector(label="patches coloured by")

@@ -27,7 +27,7 @@ def measure(
     mode: MaybeText = None,
     pick_mm: Annotated[MaybeNumber, typer.Option(min=0.0)] = None,
 ) -> Result:
-    """Measure distances, a line's length and angles between points, and how sure they are.
+    """Measure distances, a line's length and angles between points, with their errors.
 
     One of --point or --points. Errors are those of the poses of the frames on either side of each point,
     jointly, and of the picking.

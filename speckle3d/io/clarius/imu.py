@@ -1,4 +1,4 @@
-"""The sensor of a Clarius scanner: samples of ``*_imu.yml``, and what their quaternion means.
+"""Sensor of a Clarius scanner: samples of ``*_imu.yml`` and their conventions.
 
 Units as read: gyroscope in rad/s, accelerometer in g (stored x 9.80665 as m/s^2), magnetometer in gauss
 (stored as it is, in arbitrary units), time in nanoseconds on the clock of the frames. That the gyroscope is
@@ -60,7 +60,7 @@ _LEAST_G, _MOST_G = 0.8, 1.2
 
 @dataclass(frozen=True)
 class SensorSamples:
-    """Samples of the sensor; those of no use are left out.
+    """Valid samples of the sensor.
 
     Attributes
     ----------

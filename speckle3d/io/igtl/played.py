@@ -1,4 +1,4 @@
-"""A sweep as the messages that PLUS would have sent while it was recorded.
+"""Convert a sweep to the messages that PLUS sends while recording.
 
 RF has the samples of a vector as the columns of its images, as PLUS sends it, B-mode stands upright.
 """

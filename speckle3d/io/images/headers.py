@@ -1,4 +1,4 @@
-"""What the header of a MetaImage or NRRD file says of its axes, frames and pixels; the pixels themselves.
+"""Headers of MetaImage and NRRD files: axes, frames, pixels.
 
 Pixels are read here: pynrrd reads all of a raw sequence into memory and stops at the first member of packed
 pixels.
@@ -51,7 +51,7 @@ _SPACE, _TIME = ("domain", "space", "", "???", "none", "?"), ("list", "time")
 
 @dataclass(frozen=True)
 class SequenceHeader:
-    """What the header of an image file says.
+    """Contents of the header of an image file.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Documents of PLUS: what a device set says about images, and what other documents are for.
+"""XML documents of PLUS: device sets, and recognition of other documents.
 
 A device set tells the place of the images on the probe, their pixels and their clip. A result of PLUS's probe
 calibration, whose transforms are in ``CalibrationResults``, is read alike.
@@ -66,7 +66,7 @@ def vector(element: Element, attribute: str, count: int) -> tuple[float, ...]:
 
 @dataclass(frozen=True)
 class DeviceSet:
-    """What a device set says; by default, what PLUS takes for granted.
+    """Contents of a device set; by default, PLUS's own defaults.
 
     Attributes
     ----------

@@ -28,7 +28,7 @@ _PATTERNS = ("NWire", "CoplanarParallelWires")
 
 @dataclass(frozen=True)
 class WireConfig:
-    """What a device set says about a wire phantom and the images of it.
+    """Wire phantom of a device set, with the pixel size of its images.
 
     Attributes
     ----------
