@@ -77,7 +77,7 @@ _WORDS = (
 
 @dataclass(frozen=True)
 class Adequacy:
-    """How well the motion determines a calibration, if the phantom explains the images.
+    """Adequacy of a scan's motion: standard error, missing motions, verdict.
 
     Attributes
     ----------

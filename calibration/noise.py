@@ -185,7 +185,7 @@ def fit_wandering(
 
 
 def sensor_effects(equations: Equations, chain: Chain) -> FloatArray:
-    """How residuals move with turns of the sensor about the world's axes, rad, and shifts, mm; (n, r, 6)."""
+    """Derivatives of residuals by the sensor's turns (rad) and shifts (mm), shape (n, r, 6)."""
     points, in_world = equations.points, equations.rows @ chain.target[:3, :3]
     in_sensor = (points.pixels * chain.pixel_mm) @ chain.probe[:3, :2].T + chain.probe[:3, 3]
     arm = np.einsum("nij,nj->ni", points.turns, in_sensor)

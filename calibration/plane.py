@@ -451,7 +451,7 @@ def _with_distances(lines: ImagePoints, angles: Chain, pixel_mm: FloatArray | No
 
 
 def _facing_up(solution: Solution) -> Solution:
-    """The same solution with the plane's normal on the probe's side: heights of images are positive."""
+    """Solution with the plane's normal on the probe's side: heights of images are positive."""
     chain, points = solution.chain, solution.points
     origins = points.turns @ chain.probe[:3, 3] + points.shifts_mm
     if np.median(origins @ chain.target[2, :3]) + chain.target[2, 3] >= 0:

@@ -36,7 +36,7 @@ CHAIN = (*PROBE, *TARGET)
 
 
 def columns_of(names: Sequence[str]) -> list[int]:
-    """Where parameters are in `CHAIN`."""
+    """Columns of parameters in `CHAIN`."""
     return [CHAIN.index(name) for name in names]
 
 

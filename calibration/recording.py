@@ -1,4 +1,4 @@
-"""From a recording of a phantom to a calibration: images and readings joined by the clock."""
+"""Calibrate from a recording of a phantom: join images and readings by the clock."""
 
 from __future__ import annotations
 

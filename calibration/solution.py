@@ -64,7 +64,7 @@ class Prior:
 
     @classmethod
     def of(cls, pixel_mm: FloatArray | None = None, pixel_error: float = np.inf) -> Prior:
-        """Of a pixel size, with its error as a share of it, if it is known at all."""
+        """Prior of a pixel size, if known, with its relative error."""
         size, sigma = np.ones(2), np.full(len(CHAIN), np.inf)
         if pixel_mm is not None:
             size = np.asarray(pixel_mm, dtype=float)
@@ -82,7 +82,7 @@ class Prior:
         return self.pixel_mm if np.isfinite(self.sigma[0]) else None
 
     def displacement(self, chain: Chain) -> FloatArray:
-        """By how much a chain differs from what is known, in the order of `CHAIN`, shape (14,)."""
+        """Displacement of a chain from the prior, in the order of `CHAIN`, shape (14,)."""
         away, offset = np.zeros(len(CHAIN)), chain.target @ self.world_from_target
         away[:2], away[8:11] = chain.pixel_mm - self.pixel_mm, offset[:3, 3]
         away[11:] = 0.5 * (offset - offset.T)[[1, 0, 2], [0, 2, 1]]

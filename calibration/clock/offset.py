@@ -40,7 +40,7 @@ class ClockOffset:
 def covered(
     readings: TimedPoses | TimedRotations, frame_time_s: FloatArray, offset_s: float, slack_s: float = 0.0
 ) -> BoolArray:
-    """Which frames have a reading, for any offset within `slack_s` of `offset_s`."""
+    """Mask of frames with a reading, for any offset within `slack_s` of `offset_s`."""
     times, sample_s = np.asarray(frame_time_s) - offset_s, readings.time_s
     inside = (times - slack_s >= sample_s[0]) & (times + slack_s <= sample_s[-1])
     gaps = np.flatnonzero(np.diff(sample_s) > readings.max_gap_s)

@@ -192,7 +192,7 @@ class LineFinder:
         return max(upper, key=lambda line: line.consensus)
 
     def _least_consensus(self, line: EchoLine) -> int:
-        """How many columns must agree on a line."""
+        """Least number of columns that must agree on a line."""
         s = self.settings
         shares = s.consensus * line.possible, _LEAST_SHARE * len(self.columns.column)
         return max(3, *(int(np.ceil(share - 1e-9)) for share in shares))
@@ -325,7 +325,7 @@ def _echo_rows(
 
 
 def peak_between(values: Float32Array, column: IntArray, row: IntArray) -> FloatArray:
-    """How far from a row its maximum lies, by the parabola through its neighbours; zero without one."""
+    """Offset of the maximum from a row, by the parabola through its neighbours."""
     row = np.clip(row, 1, values.shape[1] - 2)
     before, middle, after = (values[column, row + step].astype(float) for step in (-1, 0, 1))
     bend = before - 2.0 * middle + after

@@ -57,7 +57,7 @@ class Columns:
 
 
 def region_mask(shape: tuple[int, ...], region_px: npt.ArrayLike) -> BoolArray:
-    """Which pixels of an image are in a polygon, its sides included.
+    """Mask of an image's pixels in a polygon, its sides included.
 
     Parameters
     ----------

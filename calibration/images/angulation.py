@@ -40,7 +40,7 @@ _FRAMES = 12
 
 @dataclass(frozen=True)
 class Angulation:
-    """How strongly errors of a calibration show where two sweeps see the same points.
+    """Sensitivity of two sweeps' disagreement to errors of a calibration.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""From a rough start to where the fit takes over: a box of calibrations searched from coarse to fine.
+"""Search of a box of calibrations about a rough start, from coarse to fine.
 
 Many places are looked at at a coarse resolution, and the best of them followed up by Gauss-Newton at finer
 and finer ones.

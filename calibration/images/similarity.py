@@ -58,7 +58,7 @@ class Similarity(PatchScores):
 
     @property
     def valid(self) -> BoolArray:
-        """Which patches have enough support."""
+        """Mask of patches with enough support."""
         return np.asarray(np.isfinite(self.alike))
 
     @property

@@ -78,7 +78,7 @@ class WireSetup:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the wires, in their order."""
+        """Names of the wires, in order."""
         return () if self.phantom is None else self.phantom.names
 
     @classmethod
@@ -182,7 +182,7 @@ def solve_phantom(recording: Recording, detections: Detections, settings: ScanSe
 
 
 def remarks(outcome: Outcome) -> list[str]:
-    """What the report says beside the numbers: the clock's offset, 3-D errors."""
+    """Remarks of the report: the clock's offset, 3-D errors."""
     notes = _nwire_notes(outcome, outcome.solution.points)
     if (offset := outcome.offset) is not None:
         half_s = 1.96 * offset.standard_error_s

@@ -71,7 +71,7 @@ def _readable(parse: Callable[[str], object]) -> AfterValidator:
 
 
 class ScanSettings(BaseModel):
-    """Which readings go with the images of a phantom, and what of them counts."""
+    """Settings of a phantom's scan: sensor readings, region, and frames left out."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -101,7 +101,7 @@ class ScanSettings(BaseModel):
 
     @property
     def corners(self) -> Corners | None:
-        """Of the region, as `region_of`."""
+        """Corners of the region, as `region_of`."""
         return region_of(self.region)
 
     @property
@@ -153,7 +153,7 @@ def model_of(method: str) -> type[ScanSettings]:
 
 
 def with_values(settings: Model, values: Mapping[str, Any]) -> Model:
-    """The same settings with other values.
+    """Copy of the settings with other values.
 
     Raises
     ------

@@ -91,7 +91,7 @@ def _load(place: str) -> Any:
 
 
 class Words(NamedTuple):
-    """What a function's docstring says of its command: text, common options, all options' help, examples."""
+    """Help of a command from its docstring: text, common options, options' help, examples."""
 
     text: str
     common: Sequence[str]

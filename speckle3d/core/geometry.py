@@ -62,7 +62,7 @@ def elevational_steps(world_from_image: RigidTransform, centre_mm: FloatArray) -
 
 
 def mirrored(world_from_image: RigidTransform) -> RigidTransform:
-    """The same motion seen in a mirror in the first image's plane: elevation, tilt and yaw change sign.
+    """Motion mirrored in the first image's plane: elevation, tilt and yaw change sign.
 
     Images cannot tell a sweep from its mirror image, since distances from decorrelation have no sign. The
     world must be the frame of the first image, or parallel to it.

@@ -150,7 +150,7 @@ class ImageGrid:
         return np.stack([vector, depth / self.sample_spacing_mm], axis=-1)
 
     def holds(self, place_mm: npt.ArrayLike) -> BoolArray:
-        """Which places in P, shape (..., 2), lie among the samples, the outermost included."""
+        """Mask of places in P, shape (..., 2), among the samples, the outermost included."""
         sample, last = self.sample_at(place_mm), [self.vectors - 1, self.samples - 1]
         return np.asarray((np.abs(sample - np.clip(sample, 0, last)) < _ROUNDING).all(axis=-1))
 
@@ -242,7 +242,7 @@ class Region:
         self._inside(ImageGrid(1, 1, 1.0, 1.0))
 
     def mask(self, grid: ImageGrid) -> BoolArray:
-        """Which samples count, shape (vector, sample).
+        """Mask of the samples in the region, shape (vector, sample).
 
         Raises
         ------
@@ -290,7 +290,7 @@ class Region:
 
 
 def polygon_mask(places: FloatArray, corners: npt.ArrayLike, name: str = "polygon") -> BoolArray:
-    """Which places are in a polygon, its sides included.
+    """Mask of places in a polygon, its sides included.
 
     Parameters
     ----------

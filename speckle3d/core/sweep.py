@@ -67,7 +67,7 @@ def spread_frames(count: int, most: int) -> IntArray:
 
 @dataclass(frozen=True)
 class _FramesPart:
-    """Some frames of others, from `first` on, still read one at a time, on any thread.
+    """Part of some frames, from `first` on, read one at a time, on any thread.
 
     Those that do not say ``any_thread = True`` may reuse their memory or hold a place in a file: each is read
     while no other is, and copied.
@@ -178,7 +178,7 @@ class _Sensor(Generic[Samples]):
         return f"the {self.label} is not calibrated to the image (its attribute sensor_from_image)"
 
     def covers(self, frame_time_s: npt.ArrayLike) -> BoolArray:
-        """Which frames have a reading."""
+        """Mask of frames with a reading."""
         return self.readings.covers(np.asarray(frame_time_s) - self.time_offset_s)
 
     def world_from_image(self, frame_time_s: npt.ArrayLike) -> Samples:

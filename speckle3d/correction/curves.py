@@ -120,7 +120,7 @@ class CorrectedChain:
         return cumulative_product(self.steps @ correction_matrices(self.values(coefficients)))
 
     def twists(self, coefficients: FloatArray, poses: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """How every frame moves with every coefficient.
+        """Twist of every frame by every coefficient.
 
         Parameters
         ----------
@@ -137,7 +137,7 @@ class CorrectedChain:
         return self._accumulate(turning[:, :, columns]), self._accumulate(moving[:, :, columns])
 
     def frame_errors(self, coefficients: FloatArray, poses: FloatArray) -> FloatArray:
-        """How every frame's origin moves against the first with every coefficient, along the first's axes.
+        """Motion of every frame's origin against the first by every coefficient.
 
         Returns
         -------

@@ -171,7 +171,7 @@ class SensorReadings:
         return RigidTransform.from_components(place, turn)
 
     def travel_ratio(self, path: FloatArray) -> float:
-        """How many times as far as the images the sensor travels, along the path that both have."""
+        """Ratio of the sensor's travel to the images', along their common path."""
         expected = self._expected(path, np.zeros(self.size)) * self.centre_from_sensor.inv()
         image_path, sensor_path = (
             poses.translation - poses.translation.mean(axis=0)

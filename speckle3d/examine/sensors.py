@@ -255,7 +255,7 @@ def _steps(poses: RigidTransform, targets: RigidTransform) -> FloatArray:
 
 
 def spikes(sensor: OrientationSensor | Tracker) -> BoolArray:
-    """Which readings lie far off the median of those around them, shape (m,)."""
+    """Mask of readings far off the median of those around them, shape (m,)."""
     poses = rigid(sensor.readings.world_from_sensor)
     place = median_filter(poses.translation, (_WINDOW, 1), mode="mirror")
     matrix = median_filter(poses.rotation.as_matrix(), (_WINDOW, 1, 1), mode="mirror")

@@ -88,7 +88,7 @@ class PosedImages:
 
 @dataclass(frozen=True)
 class ChosenImages:
-    """Some of the images, counted from zero.
+    """Subset of images, counted from zero.
 
     Parameters
     ----------

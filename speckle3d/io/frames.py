@@ -79,7 +79,7 @@ class FileFrames:
         return frame
 
     def take(self, rows: AnyArray, axis: int = 0) -> FileFrames:
-        """Some of the frames, as `numpy.take` along the axis of frames."""
+        """Subset of the frames, as by `numpy.take`."""
         return FileFrames(self.path, *self._arguments, [self.numbers[i] for i in rows.tolist()])
 
     def __reduce__(self) -> tuple[Any, ...]:

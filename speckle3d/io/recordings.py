@@ -87,7 +87,7 @@ ASSUMPTIONS = {
 
 @dataclass(frozen=True)
 class Recording:
-    """What a reader found in a recording.
+    """A recording as read: frames, metadata with sources, sensors, notes.
 
     Attributes
     ----------
@@ -153,7 +153,7 @@ class Recording:
 
     @property
     def notes(self) -> list[str]:
-        """What a user should know of how the sweep was made."""
+        """Notes on how the sweep was made."""
         return self.notes_without()
 
     def notes_without(self, *settings: str) -> list[str]:
@@ -175,7 +175,7 @@ class Recording:
 
     @cached_property
     def _oddities(self) -> list[str]:
-        """What is odd of frames, file and path."""
+        """Notes on oddities of frames, file and path."""
         remarks = [*self._frame_times[2], *self.remarks]
         with suppress(InvalidInputError, FileError):  # which is told by who asks for the sweep
             remarks += self._sweep_and_notes[1]

@@ -1,4 +1,4 @@
-"""What is placed in space as files: surfaces (STL, PLY, VTK), lines (VTK), poses (transforms of ITK).
+"""Files of shapes: surfaces (STL, PLY, VTK), lines (VTK), poses (transforms of ITK).
 
 World axes lead left, posterior and superior, as headers say for 3D Slicer. A transform file of ITK (.tfm)
 holds what takes points of the parent to those of the child, as for resampling [1]_; Slicer shows its inverse

@@ -18,7 +18,7 @@ _QUARTER, _QUARTER_REST = 1.5707963267948966, 6.123233995736766e-17
 
 @njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
 def _cosine_and_sine(angle: float) -> tuple[float, float]:
-    """To a few rounding errors, without a branch, so that loops over it run in vector registers.
+    """Cosine and sine to a few rounding errors, without a branch, for vectorised loops.
 
     Taylor's series within an eighth of a turn, then the quadrant.
     """

@@ -23,7 +23,7 @@ _RHO, LATERAL, _LEVER, _SPREAD, _SHARE, _GAIN, _CELLS = range(7)
 
 
 class EchoModels(NamedTuple):
-    """How patches' correlations depart from fully developed speckle's, rho_F, in each pair.
+    """Departure of patches' correlations from fully developed speckle's, rho_F, by pair.
 
     rho(d) = gain (share + (1 - share) sqrt(rho_F(d)))^2; see `speckle3d.motion.coherence`.
 

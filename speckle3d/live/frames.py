@@ -21,7 +21,7 @@ _ECHOES, _GREY_LEVELS = ("int16", "float32"), "uint8"
 
 @dataclass(frozen=True)
 class ImageLayout:
-    """How IMAGE messages of one device become frames of a sweep.
+    """Layout of a device's IMAGE messages, and their conversion to frames.
 
     Attributes
     ----------

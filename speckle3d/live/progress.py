@@ -75,7 +75,7 @@ class Progress:
 
 
 class Devices:
-    """Which devices were asked for, and which have sent something.
+    """Devices requested, and those heard from.
 
     Parameters
     ----------
@@ -97,7 +97,7 @@ class Devices:
 
     @property
     def missing(self) -> str:
-        """Which of those that were asked for have sent nothing, beside others that have; empty if none."""
+        """Requested devices that have sent nothing, beside others that have; empty if none."""
         sentences = []
         for kind, name in self._wanted:
             if (kind, name) not in self._heard:

@@ -1,4 +1,4 @@
-"""Which frame pairs are measured as a sweep is read."""
+"""Schedule of the frame pairs measured as a sweep is read."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from speckle3d.core.arrays import IntArray
 
 
 class TrajectorySettings(BaseModel):
-    """Which frame pairs are measured and how they are joined."""
+    """Settings of the choice of frame pairs and of the pose graph."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 

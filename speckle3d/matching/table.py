@@ -49,11 +49,11 @@ class CorrelationTable:
         return np.where(count > 0, median, 0.0)
 
     def among(self, usable: BoolArray) -> CorrelationTable:
-        """The same pairs without the correlations of some patches."""
+        """Copy of the table without the correlations of some patches."""
         return replace(self, correlation=np.where(usable, self.correlation, np.float32(np.nan)))
 
     def where(self, rows: BoolArray, shift: int = 0) -> CorrelationTable:
-        """Some of the pairs, their frames numbered `shift` higher."""
+        """Subset of the pairs, their frames numbered `shift` higher."""
         table = CorrelationTable(*(column[rows] for column in self._columns))
         return replace(table, first=table.first + shift, second=table.second + shift)
 

@@ -1,1 +1,1 @@
-"""From RF frames to a trajectory, one module per stage."""
+"""Correlations of frame pairs to a trajectory, one module per stage."""

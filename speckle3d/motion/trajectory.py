@@ -1,4 +1,4 @@
-"""From frame pairs to the poses of all frames: robust least squares on the graph of relative poses."""
+"""Poses of all frames by robust least squares on the graph of relative poses."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""How far a reconstruction is from a reference: lengths, displacements, trajectories, statistics."""
+"""Errors of a reconstruction against a reference: lengths, displacements, statistics."""

@@ -110,7 +110,7 @@ class SimulatedFrames:
 
     @cached_property
     def _frequency_hz(self) -> FloatArray:
-        """Of the FFT's bins."""
+        """Frequencies of the FFT's bins."""
         return np.arange(self._length // 2 + 1) * self.beam.probe.sampling_rate_hz / self._length
 
     @property

@@ -50,7 +50,7 @@ _REFLECTORS = {"(choose before the first run)": "", "a bare wall": "wall", "a th
 
 
 class PhantomViewer:
-    """What one viewer sees of a phantom's recording, and has set: the values of its widgets.
+    """View of a phantom's recording for one viewer, with the values of its widgets.
 
     Parameters
     ----------

@@ -223,7 +223,7 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
 
     @property
     def _cross_mm(self) -> FloatArray:
-        """Where the cross hair is in the world of the mode, shape (3,)."""
+        """Position of the cross hair in the world of the mode, shape (3,)."""
         return np.asarray(self._poses[self.frame].apply([self.lateral_mm, self.depth_mm, 0.0]))
 
     @property

@@ -97,7 +97,7 @@ class LogReadings:
         return Slerp(times, rotations)(float(np.clip(time_s + self._start_s, times[0], times[-1])))
 
     def facts(self, time_s: float) -> list[tuple[str, str]]:
-        """How it was held at a time, and what the log is."""
+        """Facts about the log and the orientation at a time."""
         log, orientation, rotation = self._log, self._orientation, self.orientation_at(time_s)
         rows = [] if rotation is None else [angles(rotation)]
         north, notes, losses = "magnetic north, y west", log.notes, "none"

@@ -50,7 +50,7 @@ _KEY = (
 
 
 class SensorPage:
-    """What an orientation sensor reads, and what follows from it.
+    """Page of an orientation sensor: readings, orientation, and trust in its field.
 
     Parameters
     ----------

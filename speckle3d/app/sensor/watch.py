@@ -92,7 +92,7 @@ class SensorWatch:
         return []
 
     def judgement(self) -> tuple[Trust, str]:
-        """By the filter's last state and what it disbelieved lately."""
+        """Judgement by the filter's last state and its recent rejections."""
         if self._failure:
             return Trust.NO, f"The recording has ended: {self._failure}"
         states = list(self.states)
@@ -117,7 +117,7 @@ class SensorWatch:
         return self.states[-1].world_from_sensor if self.states else None
 
     def facts(self, time_s: float) -> list[tuple[str, str]]:
-        """How it is held, and what has arrived."""
+        """Facts about the present orientation and the received samples."""
         if not self.states:
             return []
         last = self.states[-1]

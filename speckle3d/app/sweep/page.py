@@ -150,7 +150,7 @@ class _Player(param.Parameterized):  # type: ignore[misc]
         self._text.object = "<br>".join(self._words(frame, partner, values))
 
     def _words(self, frame: int, partner: int, values: PatchValues | None) -> Iterator[str]:
-        """What is shown, as HTML."""
+        """Displayed text, as HTML."""
         time_s, flags = self._page.sweep.frame_time_s, self._page.flags
         yield f"<b>Frame {frame}</b> of 0 to {len(time_s) - 1}, at {time_s[frame] - time_s[0]:.3f} s"
         if flags is not None:
@@ -170,7 +170,7 @@ class _Player(param.Parameterized):  # type: ignore[misc]
 
 
 def streams_of(sweep: Sweep) -> Iterator[Stream]:
-    """How a sweep's sensors turned and moved the image, or themselves where they are not calibrated to it."""
+    """Rotation and motion of the image by a sweep's sensors, or of uncalibrated sensors."""
     orientation, tracker = sweep.orientation, sweep.tracker
     if orientation is not None:
         turns, names = orientation.readings.world_from_sensor, ("x", "y", "z")

@@ -196,7 +196,7 @@ def live(
 
 
 def _trouble(state: LinkState, name: str) -> str:
-    """What is wrong with a server; empty if nothing is."""
+    """Trouble of a server in words; empty if there is none."""
     words = []
     if not state.peers:
         why = f" ({state.last_failure})" if state.last_failure else ""

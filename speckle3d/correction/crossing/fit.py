@@ -117,7 +117,7 @@ class CrossingFit:
 
     @property
     def log_likelihood(self) -> float:
-        """Of the placing and its bends, up to what all placings of one pair share."""
+        """Log-likelihood of the placing and its bends, up to a constant of the pair."""
         return -0.5 * self.independent * float(np.log(max(1.0 - self.correlation, 1e-3))) - self.strain
 
     @cached_property

@@ -198,7 +198,7 @@ class _Crossing:
 
     @property
     def so_far(self) -> CrossingSoFar:
-        """How the sweeps lie to each other."""
+        """Relative position of the two sweeps."""
         return CrossingSoFar(self.fit.correlation, self.fit.angle_deg, self.fit.overlap_mm)
 
     def pair(self) -> CrossedPair:

@@ -1,4 +1,4 @@
-"""Where the sweeps may lie against each other: masked correlation of coarse volumes at many turns."""
+"""Search for the relative position of two sweeps by masked correlation of coarse volumes."""
 
 from __future__ import annotations
 

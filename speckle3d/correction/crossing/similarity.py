@@ -106,7 +106,7 @@ class OneWay:
 
     @property
     def valid(self) -> BoolArray:
-        """Which points the other sweep shows."""
+        """Mask of the points that the other sweep shows."""
         return np.isfinite(self.levels)
 
     def residuals(self) -> tuple[FloatArray, FloatArray]:
@@ -119,7 +119,7 @@ class OneWay:
         return b - a, (rows - np.outer(b, b @ rows)) / size_b
 
     def correlation(self, points: BoolArray) -> float:
-        """Of both lists at some valid points; zero if there are too few."""
+        """Correlation of both lists at some valid points; zero if there are too few."""
         if int(points.sum()) < _LEAST_POINTS:
             return 0.0
         return float(_unit_vector(self.values[points])[0] @ _unit_vector(self.levels[points])[0])

@@ -1,4 +1,4 @@
-"""How the pixels of a PLUS image are laid out, and turning them to vectors and samples and back.
+"""Layout of a PLUS image's pixels, and its conversion to vectors and samples and back.
 
 PLUS's orientations name where the first and the second axis of an image lead: to the marked (M) or unmarked
 (U) side of the probe, far from (F) or near to (N) it [1]_.

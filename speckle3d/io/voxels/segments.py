@@ -1,4 +1,4 @@
-"""What labels mean, as fields that Slicer writes into and reads from .seg.nrrd files.
+"""Names and colours of labels, as Slicer's fields of .seg.nrrd files.
 
 References
 ----------

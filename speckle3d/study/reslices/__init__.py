@@ -1,1 +1,1 @@
-"""Where a sweep is cut, what shows there in every mode, and its figures."""
+"""Cuts of a sweep in every mode, and their figures."""
