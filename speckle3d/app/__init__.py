@@ -42,8 +42,8 @@ def view(path: PathLike, reconstruction: PathLike | None = None, sweep: PathLike
     >>> from speckle3d.app import view
     >>> shown = view("data/phantom.h5")
     """
-    from speckle3d.app.look import in_notebook
+    from speckle3d.app.look import shell
     from speckle3d.app.opened import pages_of
 
-    files = [None if file is None else Path(file) for file in (reconstruction, sweep)]
-    return in_notebook(pages_of(Path(path), files[0], files[1]))
+    result_file, sweep_file = (Path(file) if file else None for file in (reconstruction, sweep))
+    return shell(pages_of(Path(path), result_file, sweep_file))

@@ -13,8 +13,7 @@ import panel as pn
 from bokeh.models import ColumnDataSource
 from panel.viewable import Viewable
 
-from speckle3d.app.look import batch_changes
-from speckle3d.app.page import SimplePage
+from speckle3d.app.look import SimplePage, batch_changes
 from speckle3d.app.plots import ImagePlot, empty_plot, greys
 from speckle3d.app.server import AppServer
 from speckle3d.core.geometry import roll_yaw_tilt

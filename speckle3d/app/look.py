@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial, wraps
 from html import escape
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import panel as pn
 from panel.viewable import Viewable
 
-from speckle3d.app.page import Page
 from speckle3d.core.errors import Speckle3DError
 
 _Act = TypeVar("_Act", bound=Callable[..., Any])
@@ -34,6 +34,23 @@ white-space:nowrap" title="{name}">{name}</span></div>
 _BODY = "html, body { background: #fff; overflow-x: hidden; }"
 
 
+class Page(Protocol):
+    """A page, shown as one tab of the app."""
+
+    title: str
+
+    def view(self) -> Viewable:
+        """Return what is shown, made anew for every viewer."""
+
+
+@dataclass
+class SimplePage:
+    """A page of a function that makes its view."""
+
+    title: str
+    view: Callable[[], Viewable]
+
+
 def batch_changes(act: _Act) -> _Act:
     """Have the changes of an act sent together; figures may be changed by the event of a widget only so."""
 
@@ -45,27 +62,21 @@ def batch_changes(act: _Act) -> _Act:
     return run  # type: ignore[return-value]
 
 
-def shell(pages: Sequence[Page], title: str) -> Viewable:
+def shell(pages: Sequence[Page], title: str = "") -> Viewable:
     """Pages as tabs below the name of what is looked at, as high as the window; a single one without tabs.
 
-    A page's view is made when its tab is first opened.
+    Without a name, as in a notebook, they have a height of their own. A page's view is made when its tab is
+    first opened.
     """
-    pn.extension("plotly", raw_css=[_BODY])
-    header = pn.pane.HTML(
-        _HEADER.format(name=escape(title, quote=True)), sizing_mode="stretch_width", margin=0
-    )
-    return _column("100vh", header, _tabs(pages))
-
-
-def in_notebook(pages: Sequence[Page]) -> Viewable:
-    """Pages as tabs, in the app's style."""
-    pn.extension("plotly")
-    return _column("720px", _tabs(pages))
-
-
-def _column(height: str, *parts: Viewable) -> Viewable:
+    pn.extension("plotly", raw_css=[_BODY] if title else [])
+    header = pn.pane.HTML(_HEADER.format(name=escape(title)), sizing_mode="stretch_width", margin=0)
     return pn.Column(
-        *parts, stylesheets=[STYLE], styles={"height": height}, sizing_mode="stretch_both", margin=0
+        *([header] if title else []),
+        _tabs(pages),
+        stylesheets=[STYLE],
+        styles={"height": "100vh" if title else "720px"},
+        sizing_mode="stretch_both",
+        margin=0,
     )
 
 
@@ -73,8 +84,9 @@ def _tabs(pages: Sequence[Page]) -> Viewable:
     """Pages as tabs, or a single one, without the line of the app."""
     if len(pages) == 1:
         return _view(pages[0])
-    views = [pn.Column(_view(pages[0]), sizing_mode="stretch_both", margin=0)]
-    views += [pn.Column(_opening(page.title), sizing_mode="stretch_both", margin=0) for page in pages[1:]]
+    opening = "Opening ... (the first time after an installation: up to a minute)"
+    parts = [_view(pages[0]), *(_message(opening) for _ in pages[1:])]
+    views = [pn.Column(part, sizing_mode="stretch_both", margin=0) for part in parts]
     tabs = pn.Tabs(*zip((page.title for page in pages), views, strict=True), sizing_mode="stretch_both")
     closed = {*range(1, len(pages))}
 
@@ -96,15 +108,10 @@ def _view(page: Page) -> Viewable:
     try:
         return page.view()
     except Speckle3DError as error:
-        return message(str(error))
+        return _message(str(error))
 
 
-def _opening(title: str) -> Viewable:
-    words = f"Opening {escape(title)} ... (the first time after an installation: up to a minute)"
-    return pn.pane.HTML(f'<div role="status" style="color:#6b7780;padding:8px 12px">{words}</div>', margin=10)
-
-
-def message(words: str) -> Viewable:
-    """Words of an error, or in place of what there is nothing to show of."""
+def _message(words: str) -> Viewable:
+    """Words in place of a page."""
     box = "border-left:4px solid #b3541e;background:#fdf3ec;padding:8px 12px;max-width:60em"
     return pn.pane.HTML(f'<div role="status" style="{box}">{escape(words)}</div>', margin=10)

@@ -9,13 +9,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from speckle3d.app.page import Page
+from speckle3d.app.look import Page
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
 from speckle3d.io.hdf5 import SIGNATURE
 from speckle3d.io.import_settings import ImportSettings, MissingSettingsError
 from speckle3d.io.load import kind_of, load_sweep
 from speckle3d.io.readers import find_reader, first_bytes
 from speckle3d.io.reconstructions import FORMAT, read_reconstruction
+from xsens.logs.read import read_log
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
@@ -27,8 +28,6 @@ if TYPE_CHECKING:
 
 RECONSTRUCTION = "reconstruction.h5"
 """File of a results folder."""
-
-_WINDOWS_PORT = re.compile(r"COM\d+", re.IGNORECASE)
 
 
 def pages_of(
@@ -70,12 +69,11 @@ def pages_of(
         if kind != FORMAT:
             raise InvalidInputError(f"{path}: expected a recording, a reconstruction or a log, got {kind}")
         return _result_pages(place, sweep, place)
-    return _log_pages(place)
-
-
-def is_port(path: Path) -> bool:
-    """Whether a path is that of a serial port: a device, or a name as COM3."""
-    return path.is_char_device() or _WINDOWS_PORT.fullmatch(str(path)) is not None
+    if path.is_dir():
+        raise InvalidInputError(
+            f"{path}: expected a recording, a log, or a results folder with {RECONSTRUCTION}, got another"
+        )
+    return [_sensor(read_log(path))]
 
 
 @contextmanager
@@ -89,7 +87,7 @@ def open_pages(path: Path, record: Path | None = None, **of_file: Any) -> Iterat
     InvalidInputError
         Also if a file is to be recorded.
     """
-    if is_port(path):
+    if path.is_char_device() or re.fullmatch(r"COM\d+", str(path), re.IGNORECASE):
         from speckle3d.app.sensor.page import SensorPage
         from speckle3d.app.sensor.watch import SensorWatch
 
@@ -138,8 +136,8 @@ def _sweep_pages(
 def _result_pages(path: Path, sweep_file: Path | None, file: Path) -> list[Page]:
     from speckle3d.app.reconstruction.page import ReconstructionPage
     from speckle3d.scoring.modes import default_mode
-    from speckle3d.study.details import recorded_doubts
     from speckle3d.study.images import open_reconstruction
+    from speckle3d.study.results import recorded_doubts
 
     result, sweep = open_reconstruction(path, sweep_file)
     result = replace(result, pairs=read_reconstruction(path).pairs)
@@ -150,16 +148,6 @@ def _result_pages(path: Path, sweep_file: Path | None, file: Path) -> list[Page]
     viewer = ReconstructionPage(result, sweep, path, sweep_file, mode)
     # First what was asked for.
     return [viewer, *pages] if file == path else [pages[0], viewer, *pages[1:]]
-
-
-def _log_pages(path: Path) -> list[Page]:
-    from xsens.logs.read import read_log
-
-    if path.is_dir():
-        raise InvalidInputError(
-            f"{path}: expected a recording, a log, or a results folder with {RECONSTRUCTION}, got another"
-        )
-    return [_sensor(read_log(path))]
 
 
 def _sensor(log: ImuLog, mounting: Rotation | None = None) -> Page:

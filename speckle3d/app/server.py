@@ -16,8 +16,7 @@ from tornado.ioloop import IOLoop, PeriodicCallback
 from tornado.netutil import bind_sockets
 from tornado.web import HTTPError, RequestHandler
 
-from speckle3d.app.look import shell
-from speckle3d.app.page import Page
+from speckle3d.app.look import Page, shell
 from speckle3d.core.errors import FileError
 
 LOOPBACK = "127.0.0.1"
@@ -57,14 +56,14 @@ class AppServer:
             sockets = bind_sockets(port, LOOPBACK)
         except OSError as error:
             raise FileError(f"port {port}: expected a free one: {error.strerror or error}") from error
-        self._origin = f"http://{LOOPBACK}:{sockets[0].getsockname()[1]}"
+        own_port = sockets[0].getsockname()[1]
+        self._origin = f"http://{LOOPBACK}:{own_port}"
         key = secrets.token_bytes(32)
         self.address = f"{self._origin}/?bokeh-session-id={generate_session_id(key, signed=True)}"
         self._tickets: dict[str, str] = {}
-        own_port = self._origin.rpartition(":")[2]
         application = BokehTornado(
             build_applications(lambda: shell(pages, title), title=f"{title} - speckle3d"),
-            extra_websocket_origins=[f"{LOOPBACK}:{own_port}", f"localhost:{own_port}"],
+            extra_websocket_origins=[f"{host}:{own_port}" for host in (LOOPBACK, "localhost")],
             extra_patterns=[(r"/once/([\w-]+)", _Once, {"addresses": self._tickets})],
             secret_key=key,
             sign_sessions=True,

@@ -24,7 +24,7 @@ _CALIBRATE: Table = {
     "orientation": "calibrate.phantoms:orientation",
     "wires": "calibrate.phantoms:wires",
     "images": "calibrate.images:images",
-    "clock": "calibrate.clock:clock",
+    "clock": "calibrate.images:clock",
     "repeatability": "calibrate.phantoms:repeatability",
 }
 _TRAJECTORY: Table = {"export": "trajectory:export", "score": "trajectory:score"}
@@ -32,7 +32,7 @@ _IMU: Table = {
     "info": "sensors.imu:info",
     "convert": "sensors.imu:convert",
     "orient": "sensors.imu:orient",
-    "accuracy": "sensors.accuracy:accuracy",
+    "accuracy": "sensors.imu:accuracy",
     "record": "sensors.imu:record",
 }
 _COMMANDS: Table = {
@@ -43,17 +43,17 @@ _COMMANDS: Table = {
     ),
     "volume": "look.volumes:volume",
     "view": "look.view:view",
-    "reslice": "look.reslices:reslice",
+    "reslice": "look.volumes:reslice",
     "measure": "look.measures:measure",
     "surface": "look.measures:surface",
     "scene": "look.volumes:scene",
     "info": "files:info",
     "convert": "files:convert",
     "trajectory": ("Trajectories as TUM text, and scores of them.", _TRAJECTORY),
-    "compare": "compare:compare",
+    "compare": "reconstruction:compare",
     "imu": ("The orientation sensor: logs, live data, orientation.", _IMU),
-    "live": "stream.live:live",
-    "play": "stream.play:play",
+    "live": "stream:live",
+    "play": "stream:play",
     "simulate": "files:simulate",
     "config": "files:config",
 }

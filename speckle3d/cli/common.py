@@ -1,10 +1,12 @@
-"""Options, settings and output common to commands."""
+"""Options, settings and output common to commands, and calibrations of a sweep."""
 
 from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -15,7 +17,10 @@ from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.printable import printable
 
 if TYPE_CHECKING:
+    from calibration.beam import BeamBias
+    from speckle3d.calibrating.written import Written
     from speckle3d.config import Config
+    from speckle3d.core.grid import ImageGrid
     from speckle3d.core.sweep import Sweep
 
 
@@ -117,6 +122,18 @@ def emit(text: str) -> None:
         raise FileError(f"standard output: cannot be written: {error.strerror}") from error
 
 
+@contextmanager
+def status_line() -> Iterator[Callable[[str], None]]:
+    """A line on a terminal's stderr that is written anew at every call, and goes at the end of the block."""
+    from rich.console import Console
+    from rich.live import Live
+    from rich.text import Text
+
+    # A status of rich's would wrap where the terminal is narrow.
+    with Live(console=Console(stderr=True), transient=True) as line:
+        yield lambda text: line.update(Text(printable(text), no_wrap=True, overflow="ellipsis"))
+
+
 def rows_of(rows: Sequence[tuple[str, Any, str]]) -> Result:
     """Rows of description, value and unit, for JSON and aligned."""
     from speckle3d.core.tables import text_rows
@@ -139,3 +156,40 @@ def part_of(sweep: Sweep, frames: str | None, option: str) -> Sweep:
     if match is None:
         raise InvalidInputError(f"{option}: expected FIRST-LAST, two frame numbers, got {frames!r}")
     return sweep.part(int(match[1]), int(match[2]) + 1)
+
+
+NOTED_DEG, NOTED_MM = 5.0, 10.0
+"""Difference of mountings that is reported: calibrations of one mounting differ by less."""
+
+
+def report_of(written: Written, notes: Sequence[str], beam: Sequence[BeamBias] = ()) -> Result:
+    """Table of a calibration that was written; its place is noted on stderr."""
+    from calibration.report import json_report
+
+    out, text, pictures = written.files
+    note(f"calibration in {out}, report in {text} and {pictures}")
+    return json_report(written.calibration, beam) | {"notes": notes}, written.table
+
+
+def clip_of(config: str | None, grid: ImageGrid, skew_rad: float) -> str | None:
+    """Region to which a device set of PLUS clips volumes."""
+    from speckle3d.io.plus.device_set import read_device_set
+
+    return None if config is None else read_device_set(config).clip_region(replace(grid, skew_rad=skew_rad))
+
+
+def mount(sweep: Sweep, paths: Sequence[Path]) -> Sweep:
+    """Put calibration files on a sweep's sensors, and report on stderr where they contradict the sweep."""
+    from speckle3d.core.calibration import mounting_difference
+    from speckle3d.io.calibrations import apply_calibrations, read_calibration
+
+    for path in paths:
+        calibration = read_calibration(path)
+        angle_deg, shift_mm = mounting_difference(sweep, calibration)
+        if angle_deg > NOTED_DEG or shift_mm > NOTED_MM:
+            shift = f" and {shift_mm:.0f} mm" if calibration.sensor == "tracker" else ""
+            note(
+                f"{path}: puts the image {angle_deg:.0f} degrees{shift} from where the sweep has it on the "
+                f"{calibration.sensor} sensor, and is used: is it of this mounting?"
+            )
+    return apply_calibrations(sweep, paths)[0]

@@ -7,7 +7,6 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from speckle3d.cli.calibrations import clip_of, mount
 from speckle3d.cli.commands import Fields
 from speckle3d.cli.common import (
     MaybePath,
@@ -15,7 +14,9 @@ from speckle3d.cli.common import (
     OutArgument,
     Paths,
     Result,
+    clip_of,
     emit,
+    mount,
     note,
     notes,
     rows_of,
@@ -113,7 +114,7 @@ def convert(
     from speckle3d.io.reconstructions import FORMAT
     from speckle3d.io.sweep_writer import COMPRESSIONS, write_sweep
     from speckle3d.study.posed import USUAL_RANGE_DB, open_posed
-    from speckle3d.study.scenes.sequences import slicer_sequence
+    from speckle3d.study.scenes.scene import slicer_sequence
 
     is_reconstruction = source.is_file() and kind_of(source) == FORMAT
     suffix = require_suffix(out, SUFFIXES if is_reconstruction else (".h5", ".hdf5", *SUFFIXES))

@@ -18,8 +18,6 @@ class Progress:
     ----------
     frames, poses, left : int
         Frames in the file, frames with a pose, and frames left for later.
-    waiting : int
-        Frames about to be matched.
     delay_s : float
         From a frame's message to its pose's, the last one.
     length_mm : float
@@ -42,7 +40,6 @@ class Progress:
     frames: int = 0
     poses: int = 0
     left: int = 0
-    waiting: int = 0
     delay_s: float = 0.0
     length_mm: float = 0.0
     length_sigma: float = float("nan")

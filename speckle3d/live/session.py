@@ -240,7 +240,6 @@ class Session:
                 count = len(self._queue)
                 self._queue = deque(list(self._queue)[::-2][::-1])
                 self.progress.left += count - len(self._queue)
-            self.progress.waiting = len(self._queue)
             self._changed.notify()
 
     @contextmanager
@@ -285,7 +284,6 @@ class Session:
                 if not self._queue:
                     return
                 waiting = self._queue.popleft()
-                self.progress.waiting = len(self._queue)
             tracker.hurry = bool(self._queue)
             pose = tracker.append(waiting.frame, waiting.time_s)
             self._send(pose_message(pose.world_from_image, image_from_pixel, waiting.sent_s))

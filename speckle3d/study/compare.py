@@ -21,7 +21,7 @@ from speckle3d.core.errors import Speckle3DError
 from speckle3d.core.printable import printable
 from speckle3d.core.progress import Progress
 from speckle3d.io.calibrations import apply_calibrations
-from speckle3d.io.curves import read_curves
+from speckle3d.io.curves import curves_beside, read_curves
 from speckle3d.io.hdf5 import make_folder, one_line, sha256_of
 from speckle3d.io.load import load_sweep, recording_sha256
 from speckle3d.study.job import RESULTS, available_modes, run_job
@@ -94,7 +94,7 @@ class StudyRequest:
         )
 
     def _curves(self, path: Path) -> Path:
-        return self.curves or path.parent / "curves.h5"
+        return self.curves or curves_beside(path)
 
     def _crossing(self, path: Path) -> Path | None:
         """``SWEEP-crossing.h5`` of ``SWEEP.h5``, and the other way round, if mode `crossed` is asked for."""

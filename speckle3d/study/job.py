@@ -29,6 +29,7 @@ from speckle3d.core.reconstruction import (
 from speckle3d.core.shown import shown
 from speckle3d.core.sweep import Sweep
 from speckle3d.correction.crossing.pair import CrossedPair
+from speckle3d.correction.drift import DriftCorrection
 from speckle3d.correction.modes import CUBIC_MODES, require_modes
 from speckle3d.corrections import Correction, correct
 from speckle3d.crossing_sweeps import cross_with, require_pair, stack_for
@@ -39,6 +40,7 @@ from speckle3d.io.fileset import FileSet
 from speckle3d.io.hdf5 import PathLike
 from speckle3d.io.load import import_record, load_landmarks, load_sweep, recording_sha256
 from speckle3d.io.reconstructions import write_reconstruction
+from speckle3d.matching.quality import describe
 from speckle3d.motion.sensors import sensed_orientation
 from speckle3d.scoring.displacements import score_row
 from speckle3d.scoring.lengths import TRACKER
@@ -50,7 +52,6 @@ from speckle3d.scoring.references import (
     sweep_curves,
     tracker_alone,
 )
-from speckle3d.study.details import details_of, doubted_modes
 from speckle3d.study.figures import figure_drift, save_figure
 from speckle3d.study.posed import PosedSweep, SweepModes, pose_mark
 from speckle3d.study.reslices.cuts import length_words
@@ -199,7 +200,7 @@ def run_job(
             replace(row, sigma_mm=claims[row.mode] * abs(row.estimate_mm)) if row.mode in claims else row
             for row in error_rows(estimates, reference_poses, centre)
         ]
-        details = details_of(tracked, corrections, provenance)
+        details = _details_of(tracked, corrections, provenance)
         summary = Summary(
             sweep.name,
             "none" if reference_poses is None else reference_poses.name,
@@ -208,7 +209,6 @@ def run_job(
             rows,
             details,
             doubts,
-            doubted_modes(sweep, doubts, estimates),
             left_out,
             claims,
             _drift_rows(estimates, reference_poses, sweep, source),
@@ -291,8 +291,8 @@ def _correct_modes(
 
 def _title(summary: Summary) -> str:
     """Name of the sweep and what is in doubt, for figures."""
-    doubts = ", ".join(dict.fromkeys(summary.doubted.values()))
-    return f"{summary.sweep}; in doubt: {doubts}" if doubts else summary.sweep
+    suspects = ", ".join(dict.fromkeys(doubt.suspect for doubt in summary.doubts if doubt.suspect))
+    return f"{summary.sweep}; in doubt: {suspects}" if suspects else summary.sweep
 
 
 def _drift_rows(
@@ -312,3 +312,26 @@ def _drift_rows(
             if mode != reference.name
         ]
     return []
+
+
+def _details_of(
+    tracked: Tracked, corrections: Mapping[str, Correction], provenance: Provenance
+) -> dict[str, Any]:
+    """Details of a reconstruction beside its errors, by name."""
+    fits: dict[str, dict[str, Any]] = {}
+    for mode, fit in corrections.items():
+        if isinstance(fit, DriftCorrection):
+            parameters = dict(zip(fit.names, fit.fit.x.tolist(), strict=True))
+            fits[mode] = {"curves": fit.settings.curves, "coverage": fit.coverage, "parameters": parameters}
+        else:
+            sources = [evidence.source for evidence in fit.evidence]
+            fits[mode] = {"length_over_images": fit.scale, "rests_on": sources, **fit.details}
+    return {
+        "provenance": provenance,
+        "pairs": tracked.pairs,
+        "flagged_frames": describe(tracked.flags),
+        "rejected_patch_share": tracked.rejected_share,
+        "direction": tracked.direction,
+        "direction_from": tracked.direction_from,
+        "corrections": fits,
+    }

@@ -64,6 +64,11 @@ def measure(
     )
 
 
+def how_measured(mode: str, pick_mm: float) -> str:
+    """What the errors of measurements are."""
+    return f"mode {mode}; points are picked to +- {1.96 * pick_mm:.2g} mm per axis; every +- is 95 %"
+
+
 def caution(reconstruction: Reconstruction, mode: str) -> str | None:
     """Warning beside errors of a mode that claims none of its own; None if it does.
 

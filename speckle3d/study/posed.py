@@ -20,10 +20,9 @@ from speckle3d.imaging.images import ChosenImages, PosedImages
 from speckle3d.imaging.voxels.settings import Levels
 from speckle3d.io.calibrations import apply_calibrations, fitted_pixels, resized
 from speckle3d.io.hdf5 import PathLike
-from speckle3d.io.import_settings import ImportSettings, MissingSettingsError
+from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.load import kind_of, open_recording
 from speckle3d.io.reconstructions import FORMAT
-from speckle3d.io.recordings import Recording
 from speckle3d.matching.quality import describe
 from speckle3d.scoring.modes import default_mode
 from speckle3d.scoring.references import REFERENCES, find_reference
@@ -53,8 +52,7 @@ class PosedSweep:
     reconstruction : Reconstruction or None
         None where the recording itself says where its frames are.
     has_range : bool
-        Whether the dynamic range of its B-mode is known, from the recording or given; levels as stored need
-        none.
+        Whether the dynamic range of its B-mode is known; levels as stored need none.
     remarks : sequence of str
         Why this mode, where nobody chose it; what was assumed of the recording.
     """
@@ -94,8 +92,8 @@ class PosedSweep:
         if not self.has_range and levels != "stored":
             raise InvalidInputError(
                 f"{self.sweep.name}: levels {levels}: expected the dynamic range of its B-mode, got none: "
-                "give --dynamic-range-db (decibels from black to white, beside the image on the scanner's "
-                "screen), or take levels stored"
+                "give `speckle3d convert` --dynamic-range-db (beside the image on the scanner's screen), or "
+                "take levels stored"
             )
         images = grey_images(self.sweep, dynamic_range_db, self.reconstruction, levels)
         grid = replace(images.grid, skew_rad=self.skew_rad)
@@ -145,7 +143,6 @@ def open_posed(
     sweep_file: Path | None = None,
     settings: ImportSettings | None = None,
     calibrations: Sequence[PathLike] = (),
-    dynamic_range_db: float | None = None,
 ) -> PosedSweep:
     """Open a reconstruction with its sweep, or a recording whose poses are known.
 
@@ -163,8 +160,6 @@ def open_posed(
     calibrations : sequence of path
         Calibration files to use in place of what the recording says of its sensors and, unless settings
         give it, of its pixels' size.
-    dynamic_range_db : float, optional
-        Of B-mode that does not say its own, and only of that.
 
     Raises
     ------
@@ -193,24 +188,15 @@ def open_posed(
         )
     settings = settings or ImportSettings()
     sizes = {k: v for k, v in fitted_pixels(calibrations).items() if k not in settings.model_fields_set}
-    recording, has_range = _open(path, settings.model_copy(update=sizes), dynamic_range_db)
+    recording = open_recording(path, settings.model_copy(update=sizes))
+    value, settings = recording.numbers.get(_RANGE), recording.settings
+    has_range = value is None or (value.value or settings.dynamic_range_db) is not None
+    if not has_range:
+        settings = settings.model_copy(update={_RANGE: USUAL_RANGE_DB})
+        recording = replace(recording, settings=settings)
     sweep, _ = apply_calibrations(resized(recording.sweep, sizes), calibrations)
     # Grey levels as stored need no dynamic range.
     return replace(posed_at(sweep, mode), has_range=has_range, remarks=recording.notes_without(_RANGE))
-
-
-def _open(path: Path, settings: ImportSettings, dynamic_range_db: float | None) -> tuple[Recording, bool]:
-    """Open a recording whose grey levels may do as they are; whether their dynamic range is known."""
-    try:
-        recording = open_recording(path, settings)
-        _ = recording.sweep  # which asks for what is not said
-        return recording, True
-    except MissingSettingsError as error:
-        if error.settings != (_RANGE,):
-            lacking = tuple(name for name in error.settings if name != _RANGE)
-            raise MissingSettingsError(path, lacking) from None
-    settings = settings.model_copy(update={_RANGE: dynamic_range_db or USUAL_RANGE_DB})
-    return open_recording(path, settings), dynamic_range_db is not None
 
 
 def posed_at(

@@ -20,6 +20,7 @@ from pydantic_core import to_json
 
 from speckle3d.core.doubts import Doubt
 from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.reconstruction import Provenance
 from speckle3d.core.tables import text_table
 from speckle3d.io.fileset import FileSet
 from speckle3d.io.hdf5 import atomic_path, make_folder, require_target
@@ -67,8 +68,6 @@ class Summary:
         Drift and displacement by ``mode``, as `speckle3d.scoring.displacements.score_row` has them.
     doubts : sequence of Doubt
         About the recording.
-    doubted : mapping of str to str
-        Modes that rest on a sensor in doubt, and what is suspected.
     left_out : mapping of str to str
         Modes that were asked for and refused, and why.
     claims : mapping of str to float
@@ -84,7 +83,6 @@ class Summary:
     rows: Sequence[ModeError]
     details: dict[str, Any] = field(default_factory=dict)
     doubts: Sequence[Doubt] = ()
-    doubted: Mapping[str, str] = field(default_factory=dict)
     left_out: Mapping[str, str] = field(default_factory=dict)
     claims: Mapping[str, float] = field(default_factory=dict)
     drift: Sequence[Mapping[str, Any]] = ()
@@ -104,8 +102,6 @@ class Summary:
             words.append("the reference itself")
         if row.mode in FITTED_TO_TRACKER and self.reference == "tracker":
             words.append("fitted to this tracker")
-        if row.mode in self.doubted:
-            words.append(f"in doubt: {self.doubted[row.mode]}")
         return "; ".join(words)
 
     def records(self) -> list[dict[str, Any]]:
@@ -301,7 +297,31 @@ def read_summary(folder: Path, name: str) -> Summary:
     ]
     rows = [ModeError(**row) for row in values]
     doubts = [Doubt(**doubt) for doubt in record["doubts"]]
+    record.pop("doubted", None)  # of older versions
     return Summary(**record | {"sweep": name, "rows": rows, "doubts": doubts})
+
+
+def recorded_doubts(path: Path, provenance: Provenance) -> tuple[Doubt, ...] | None:
+    """Read the doubts in the ``summary.json`` beside a reconstruction.
+
+    Parameters
+    ----------
+    path : path
+        The reconstruction's file.
+    provenance : Provenance
+        Of the reconstruction: a summary of another recording does not count.
+
+    Returns
+    -------
+    tuple of Doubt, or None
+        None if no summary of this reconstruction is there.
+    """
+    try:
+        summary = read_summary(path.parent, "")
+        input_sha256 = summary.details["provenance"]["input_sha256"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    return tuple(summary.doubts) if input_sha256 == provenance.input_sha256 else None
 
 
 def write_texts(directory: Path, texts: Mapping[str, str]) -> None:

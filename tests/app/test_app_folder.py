@@ -4,7 +4,7 @@ import os
 
 import pytest
 
-from speckle3d.app.folder import new_path
+from speckle3d.app.phantom.viewer import new_path
 from speckle3d.core.errors import InvalidInputError
 
 
@@ -15,7 +15,7 @@ def folder(tmp_path):
 
 
 def test_a_name_must_be_new_and_in_the_folder(folder, tmp_path):
-    os.symlink(tmp_path.parent / "elsewhere.csv", tmp_path / "link.csv")
-    for wrong in ("", "../a.csv", "/x/a.csv", ".hidden", "a\0.csv", "sweep.h5", "link.csv"):
+    os.symlink(tmp_path.parent / "elsewhere.csv", tmp_path / "link.h5")
+    for wrong in ("", "../a.h5", "/x/a.h5", ".hidden", "a\0.h5", "sweep.h5", "sweep", "link"):
         with pytest.raises(InvalidInputError):
-            new_path(folder, wrong)
+            new_path(folder, wrong, ".h5")

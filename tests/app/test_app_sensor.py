@@ -62,7 +62,7 @@ def test_live_columns_run_to_now_without_a_jump_of_the_heading():
     columns = source.columns()
     assert (columns["t"][0], columns["t"][-1]) == (pytest.approx(-1.9), 0.0)
     np.testing.assert_allclose(np.diff(columns["heading"]), 1.0, atol=1e-6)
-    np.testing.assert_allclose(columns["high"] - columns["low"], 2 * 1.96 * np.degrees(0.02))
+    np.testing.assert_allclose(columns["half"], 1.96 * np.degrees(0.02))
     SensorPage(source).view()
     assert len(watch([]).columns()["t"]) == 0
 

@@ -5,7 +5,7 @@ import pytest
 
 from speckle3d.io.load import load_sweep
 from speckle3d.io.voxels.volumes import read_volume
-from speckle3d.study.reslices.cut_geometry import read_plane
+from speckle3d.study.reslices.cuts import read_plane
 
 
 @pytest.fixture

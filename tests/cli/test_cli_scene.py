@@ -29,5 +29,5 @@ def test_a_scene_of_two_modes(run, refuse, reconstruction, tmp_path):
     assert run("scene", reconstruction, "-o", target, "--voxel-mm", 0.5)[0] == 0
     assert not (target / "volume-pose.nrrd").exists()
     (tmp_path / "other").mkdir()
-    (tmp_path / "other" / "mine.txt").write_text("precious")
-    assert "another folder" in refuse("scene", reconstruction, "-o", tmp_path / "other")
+    (tmp_path / "other" / "volume-pose.nrrd").write_text("precious")
+    assert "another origin" in refuse("scene", reconstruction, "-o", tmp_path / "other")

@@ -40,7 +40,7 @@ class Messages:
         self.until_s = time.monotonic() + 300
 
     def receive(self, timeout_s):
-        if self.batches and self.session.progress.waiting < 3:
+        if self.batches and len(self.session._queue) < 3:
             return self.batches.pop(0)
         time.sleep(0.005)
         if self.until(self.session.progress) or time.monotonic() > self.until_s:

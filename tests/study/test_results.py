@@ -3,17 +3,15 @@
 import json
 from dataclasses import replace
 
-import sweep_examples
-
 from speckle3d.core.doubts import Doubt
 from speckle3d.core.reconstruction import Provenance
 from speckle3d.scoring.lengths import ModeError
-from speckle3d.study.details import doubted_modes, recorded_doubts
 from speckle3d.study.results import (
     Study,
     Summary,
     SweepOutcome,
     read_summary,
+    recorded_doubts,
     write_study,
     write_summary,
 )
@@ -35,20 +33,11 @@ def summary(reference="tracker", rows=None, **fields):
     return Summary("beef, 1", reference, 100, 0.95, rows or [row(), row("orientation")], **fields)
 
 
-def test_a_doubt_is_of_the_modes_that_rest_on_its_sensor():
-    images = Doubt("images", "frozen", "...", False)
-    modes = ["image", "orientation", "pose", "tracker"]
-    suspects = doubted_modes(sweep_examples.rf_sweep(), [SPIKES, METRES, images], modes)
-    assert suspects == {
-        "image": "frozen", "orientation": "spikes, frozen", "pose": "units, frozen", "tracker": "units",
-    }  # fmt: skip
-
-
 def test_what_is_in_doubt_and_left_out_stands_below_the_table_and_is_read_back(tmp_path):
     left_out = {"pose": "s: drift mode pose: tracker: ..."}
     doubts, details = [METRES, SPIKES], {"provenance": Provenance("s.h5", "ab12", "1.0"), "seconds": 2.0}
     rows = [row(sigma_mm=1.0)]
-    of = Summary("s", "truth", 9, 1.0, rows, details, doubts, {"image": "x"}, left_out, {"image": 0.1})
+    of = Summary("s", "truth", 9, 1.0, rows, details, doubts, left_out, {"image": 0.1})
     write_summary(tmp_path, of)
     provenance = Provenance("s.h5", "ab12", "1.0")
     assert recorded_doubts(tmp_path / "reconstruction.h5", provenance) == (METRES, SPIKES)

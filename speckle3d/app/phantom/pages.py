@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import partial
 from pathlib import Path
 
-from speckle3d.app.page import SimplePage
+from speckle3d.app.look import SimplePage
 from speckle3d.app.phantom.lines import LinesViewer
 from speckle3d.app.phantom.points import PointsViewer
 from speckle3d.calibrating.phantoms import open_phantom, require_frames

@@ -15,11 +15,9 @@ from panel.viewable import Viewable
 
 from calibration.points import Detections, Recording
 from calibration.recording import choose_crossings
-from speckle3d.app.folder import new_path
 from speckle3d.app.look import batch_changes
 from speckle3d.app.phantom.plots import BLUE, ORANGE, SKY_BLUE
-from speckle3d.app.phantom.run import run_in_thread, sentence
-from speckle3d.app.phantom.viewer import PhantomViewer
+from speckle3d.app.phantom.viewer import PhantomViewer, new_path, run_in_thread, sentence
 from speckle3d.calibrating.phantoms import WireSetup, detect_phantom, detections_by_hand
 from speckle3d.calibrating.settings import ScanSettings, WireSettings, with_values
 from speckle3d.core.errors import InvalidInputError, Speckle3DError
@@ -124,15 +122,11 @@ class PointsViewer(PhantomViewer):
 
     def view(self) -> Viewable:
         """Lay out what finds, picks and saves points."""
-        clear, save = (
-            pn.widgets.Button(name="Clear this frame"),
-            pn.widgets.Button(name="Save points", width=110, align="end"),
-        )
-        clear.on_click(lambda _: self._set_points([]))
+        save = pn.widgets.Button(name="Save points", width=110, align="end")
         save.on_click(self._save_points)
         self._search.on_click(self._find_all)
         wires = [self._wire] if self._phantom.names else []
-        buttons = pn.Row(self._search, clear, *wires)
+        buttons = pn.Row(self._search, *wires)
         files = pn.Row(save, self._points_name)
         return self.layout(pn.pane.HTML(_HINT, width=600), buttons, files, self._points_note)
 
@@ -159,15 +153,12 @@ class PointsViewer(PhantomViewer):
 
     def before_saving(self, settings: ScanSettings, out: Path) -> ScanSettings:
         """Save the points, which are those of the calibration, for the command to be given them."""
-        return with_values(settings, {"points": self._write(f"{out.stem}-points.csv")})
+        return with_values(settings, {"points": self._write(f"{out.stem}-points")})
 
     def _edit(self, attribute: str, old: object, new: Any) -> None:
         if not self._drawing:
-            self._set_points(list(zip(new["column"], new["row"], new["wire"], strict=True)))
-
-    def _set_points(self, points: list[tuple[float, float, str]]) -> None:
-        self.picks.set_frame(self.frame, points)
-        self._mark_picks()
+            self.picks.set_frame(self.frame, zip(new["column"], new["row"], new["wire"], strict=True))
+            self._mark_picks()
 
     def _mark_picks(self) -> None:
         self.mark_frames(dict.fromkeys((frame for frame, _ in self.picks), "has points"))
@@ -203,7 +194,6 @@ class PointsViewer(PhantomViewer):
     def _write(self, name: str) -> Path:
         if not self.picks:
             raise InvalidInputError("expected points to save, got none")
-        name = name if name.endswith(".csv") else f"{name}.csv"
-        path = new_path(self.folder, name)
+        path = new_path(self.folder, name, ".csv")
         write_points(path, self.picks.points(), self._phantom.names)
         return path

@@ -2,24 +2,25 @@
 
 from __future__ import annotations
 
+import asyncio
 import html
+import os
+from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, TypeVar, get_args, get_origin
 
 import numpy.typing as npt
 import panel as pn
 from panel.viewable import Viewable
+from pydantic import BaseModel
 
 from calibration.points import Detections, Recording
 from calibration.recording import Outcome
 from calibration.report import text_report
-from speckle3d.app.folder import new_path
 from speckle3d.app.look import batch_changes
 from speckle3d.app.phantom.plots import BLUE, ORANGE, FramePlot, FrameStrip
-from speckle3d.app.phantom.run import run_in_thread, sentence
-from speckle3d.app.phantom.widgets import WIDTH_PX, widget
 from speckle3d.calibrating.phantoms import (
     BY_HAND,
     detect_phantom,
@@ -28,24 +29,14 @@ from speckle3d.calibrating.phantoms import (
     solve_phantom,
     write_outcome,
 )
-from speckle3d.calibrating.settings import (
-    OrientationSettings,
-    PlaneSettings,
-    ScanSettings,
-    WireSettings,
-    with_values,
-)
+from speckle3d.calibrating.settings import PlaneSettings, ScanSettings, with_values
 from speckle3d.calibrating.written import BESIDE
 from speckle3d.core.errors import InvalidInputError, Speckle3DError
 
+_Result = TypeVar("_Result")
+
 _AMBER = "#9a6700"
 """Of a result that more motion would improve."""
-_DETAILS: dict[type[ScanSettings], tuple[str, ...]] = {
-    PlaneSettings: ("time_offset_s", "pixel_error", "fixed_pixels", "outlier_sigma"),
-    OrientationSettings: ("time_offset_s", "viewed_from", "level", "outlier_sigma"),
-    WireSettings: ("time_offset_s", "registration", "fixed_pixels", "beside_mm", "outlier_sigma"),
-}
-"""Settings of the calibration that are folded away."""
 _REFLECTORS = {"(choose before the first run)": "", "a bare wall": "wall", "a thin bar (Cambridge)": "bar"}
 
 
@@ -68,8 +59,7 @@ class PhantomViewer:
         self.recording, self.images, self._start = recording, images, settings
         self.folder = images.resolve().parent
         count = recording.images.shape[0]
-        self._details = _DETAILS[type(settings)]
-        names = (*self.detection, "region", "leave_out", *self._details)
+        names = (*self.detection, "region", "leave_out")
         self.widgets = {name: widget(settings, name) for name in names}
         if isinstance(settings, PlaneSettings):
             # A thin bar that is taken for a wall is warned of for a bias that it does not have.
@@ -111,7 +101,6 @@ class PhantomViewer:
             pn.pane.Bokeh(self._strip.plot, sizing_mode="stretch_width"),
             sizing_mode="stretch_both",
         )
-        details = [self.widgets[name] for name in self._details]
         right = pn.Column(
             *parts,
             pn.Row(self.widgets["region"], self.widgets["leave_out"]),
@@ -122,7 +111,6 @@ class PhantomViewer:
             pn.Row(self._save, self._name),
             self._note,
             self._table,
-            pn.Card(*details, title="More settings of the calibration", collapsed=True, width=610),
             scroll="y-auto",
             sizing_mode="stretch_both",
         )
@@ -147,13 +135,10 @@ class PhantomViewer:
             If they are none, or do not fit the recording.
         """
         values: dict[str, Any] = {name: control.value for name, control in self.widgets.items()}
-        # A slider at zero, and what is not chosen yet.
-        unset = {
-            name
-            for name in ("threshold", "reflector", "time_offset_s")
-            if name in values and not values[name]
-        }
-        settings = with_values(self._start, {name: values[name] for name in values if name not in unset})
+        for name in ("threshold", "reflector"):  # a slider at zero, and what is not chosen yet
+            if not values.get(name):
+                values.pop(name, None)
+        settings = with_values(self._start, values)
         require_frames(settings.frames_left_out, self.recording.images.shape[0])
         return settings
 
@@ -234,11 +219,11 @@ class PhantomViewer:
     def _write_result(self, _: object) -> None:
         if self._result is None:
             return
-        (settings, outcome), name = self._result, self._name.value or ""
+        settings, outcome = self._result
         try:
-            out = new_path(self.folder, name if name.endswith(".h5") else f"{name}.h5")
+            out = new_path(self.folder, self._name.value or "", ".h5")
             for suffix in BESIDE:
-                new_path(self.folder, out.with_suffix(suffix).name)
+                new_path(self.folder, out.stem, suffix)
             settings = self.before_saving(settings, out)
             files = write_outcome(outcome, settings, self.images, out, remarks(outcome)).files
         except Speckle3DError as error:
@@ -246,3 +231,62 @@ class PhantomViewer:
             return
         names = ", ".join(path.name for path in files)
         self._note.object = sentence(f"Saved {names} in {self.folder}", BLUE)
+
+
+async def run_in_thread(button: pn.widgets.Button, work: Callable[[], _Result]) -> _Result:
+    """Do work in a thread; the button turns and cannot be clicked meanwhile."""
+    button.disabled = button.loading = True
+    try:
+        return await asyncio.to_thread(work)
+    finally:
+        button.disabled = button.loading = False
+
+
+def sentence(words: str, colour: str, name: str = "verdict") -> str:
+    """HTML of a sentence."""
+    return f"<div class='{name}' style='color:{colour};font-weight:600'>{html.escape(words)}</div>"
+
+
+def new_path(folder: Path, name: str, suffix: str) -> Path:
+    """Path of a new file in a folder, named in a save dialogue with or without its suffix.
+
+    Raises
+    ------
+    InvalidInputError
+        If the name is not that of a file in the folder itself, or is taken.
+    """
+    path = folder / f"{name.removesuffix(suffix)}{suffix}"
+    if path.parent != folder or path.name.startswith(".") or not name.isprintable():
+        raise InvalidInputError(f"expected the name of a file in {folder}, got {name!r}")
+    if os.path.lexists(path):
+        raise InvalidInputError(f"{path}: expected a new name, got one that is taken")
+    return path
+
+
+WIDTH_PX = 285
+_SLIDERS: dict[str, tuple[str, float, float, float]] = {
+    "columns": ("n, columns", 5, 240, 1),
+    "smoothing_mm": ("σ, smoothing / mm", 0.05, 3.05, 0.05),
+    "threshold": ("T / levels per mm, 0: auto", 0.0, 300.0, 1.0),
+    "tolerance_mm": ("d, tolerance / mm", 0.05, 3.05, 0.05),
+    "consensus": ("p, share that agrees", 0.05, 1.0, 0.01),
+}
+"""Label, least, greatest and step of settings that are tuned by sliders."""
+
+
+def widget(settings: BaseModel, name: str) -> Any:
+    """Make the widget of a setting, which has its value; its description is the field's."""
+    field, value = type(settings).model_fields[name], getattr(settings, name)
+    label, look = name.replace("_", " "), {"width": WIDTH_PX, "margin": (2, 8)}
+    if name in _SLIDERS:
+        label, low, high, step = _SLIDERS[name]
+        kind = pn.widgets.IntSlider if isinstance(field.default, int) else pn.widgets.FloatSlider
+        value, default = value or 0.0, field.default or 0.0
+        ends = {"start": min(low, value), "end": max(high, value), "step": step}
+        return kind(name=f"{label} (default {default:g})", value=value, **ends, **look)
+    if get_origin(field.annotation) is Literal:
+        choices = list(get_args(field.annotation))
+        return pn.widgets.Select(
+            name=label, options=choices, value=value, description=field.description, **look
+        )
+    return pn.widgets.TextInput(name=label, value=value, placeholder=field.description, **look)

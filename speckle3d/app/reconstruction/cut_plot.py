@@ -12,7 +12,6 @@ from scipy.spatial.transform import RigidTransform
 
 from speckle3d.app.plots import ImagePlot, greys
 from speckle3d.core.arrays import FloatArray
-from speckle3d.imaging.cuts.planes import Cut
 from speckle3d.study.reslices.cuts import CutPicture
 
 _OVERLAY_PERCENTILES = (5.0, 99.5)
@@ -36,8 +35,7 @@ class CutPlot(ImagePlot):
 
     def __init__(self, name: str, colours: tuple[str, str], on_tap: Callable[[FloatArray], None]) -> None:
         super().__init__("", "", name=f"cut-{name}", title=" ", active_drag=None)
-        self.plane: Cut | None = None
-        self._world_from_picture = RigidTransform.identity()
+        self._world_from_picture: RigidTransform | None = None
         self.plot.title.update(text_font_size="12px", text_font_style="normal")
         self._lines = tuple(
             Span(dimension=dimension, line_color=colour, line_width=1.5)
@@ -54,7 +52,6 @@ class CutPlot(ImagePlot):
     def show_cut(self, picture: CutPicture, mode: str, overlay: str | None) -> None:
         """Show a cut at the poses of one mode, or of another (magenta) laid over it (green)."""
         image, plane = picture.cuts[mode].image, picture.cuts[mode].cut
-        assert plane.world_from_picture is not None  # as only along a curve
         if overlay is None:
             colours = greys(image, *picture.levels)
         else:
@@ -65,13 +62,13 @@ class CutPlot(ImagePlot):
             alpha = np.isfinite(layers).any(axis=0)
             colours = np.rint(255 * np.dstack([magenta, green, magenta, alpha])).astype(np.uint8)
         self.show(colours, plane.first_mm, (plane.pixel_mm,) * 2)
-        self.plane, self._world_from_picture = plane, plane.world_from_picture
+        self._world_from_picture = plane.world_from_picture
         self.plot.title.text = picture.place.split(", seen")[0]
         self.plot.xaxis.axis_label, self.plot.yaxis.axis_label = (f"{name} / mm" for name in picture.axes)
 
     def show_points(self, cross_mm: FloatArray, points_mm: FloatArray) -> None:
         """Put the cross hair at a point of the world, shape (3,), and draw others, shape (k, 3), mm."""
-        if self.plane is None:
+        if self._world_from_picture is None:
             return
         inside = self._world_from_picture.inv().apply(np.vstack([cross_mm, points_mm]))
         x, y = inside[:, :2].T
@@ -82,5 +79,5 @@ class CutPlot(ImagePlot):
         self._points.data = {"x": x[1:], "y": y[1:], "number": numbers}
 
     def _tell(self, on_tap: Callable[[FloatArray], None], event: Tap) -> None:
-        if self.plane is not None and event.x is not None and event.y is not None:
+        if self._world_from_picture is not None and event.x is not None and event.y is not None:
             on_tap(self._world_from_picture.apply([event.x, event.y, 0.0]))

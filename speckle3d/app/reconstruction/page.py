@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import shlex
+from collections.abc import Iterable
 from dataclasses import replace
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -16,17 +18,15 @@ from plotly import graph_objects as go
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.app.look import batch_changes
-from speckle3d.app.reconstruction.commands import command
 from speckle3d.app.reconstruction.cut_plot import CutPlot
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import Speckle3DError
 from speckle3d.core.reconstruction import Reconstruction
 from speckle3d.core.sweep import Sweep
-from speckle3d.imaging.images import PosedImages
 from speckle3d.report.figures import plot_curves, plot_outlines
 from speckle3d.scoring.references import find_reference, sweep_curves
 from speckle3d.study.figures import RANGE_DB, label_of
-from speckle3d.study.pose_errors import PICKING, caution, measure
+from speckle3d.study.pose_errors import PICKING, caution, how_measured, measure
 from speckle3d.study.posed import PosedSweep, SweepModes, at_modes
 from speckle3d.study.reslices.cuts import cut_at_modes
 from speckle3d.study.reslices.places import along_sweep, in_frame
@@ -46,6 +46,10 @@ _CUTS = {
 """Along the sweep, in a frame's plane, parallel to the skin: the slider that moves the cut, and those that
 move the upright and the level line in it."""
 _HELP = "Click in a cut: the cross hair, and with it the other cuts, go there."
+_CODE = (
+    "font-family:ui-monospace,'DejaVu Sans Mono',monospace;font-size:11px;white-space:pre-wrap;"
+    "overflow-wrap:anywhere;user-select:all;background:#f3f5f7;padding:6px;border:1px solid #d5dae0"
+)
 
 
 class ReconstructionPage:
@@ -85,7 +89,9 @@ class ReconstructionPage:
         self.reference = find_reference(sweep)
         whole = self.reference is not None and self.reference.covered.all()
         self.modes = (*reconstruction.poses, *([self.reference.name] if self.reference and whole else []))
-        self.calibrations = [source.path for source in reconstruction.provenance.calibrations]
+        source, _ = self._sweep.source(None, RANGE_DB)
+        images = max(KEPT_BYTES // (4 * source.grid.vectors * source.grid.samples), 1)
+        self.images = replace(source, images=lru_cache(images)(source.read))
         self.posed = lru_cache(self._at_modes)
 
     def view(self) -> Viewable:
@@ -94,13 +100,6 @@ class ReconstructionPage:
 
     def _at_modes(self, mode: str, overlay: str | None) -> SweepModes:
         return at_modes(self._sweep, [mode, *([overlay] if overlay else [])], mode)
-
-    @cached_property
-    def images(self) -> PosedImages:
-        """Images to cut."""
-        source, _ = self._sweep.source(None, RANGE_DB)
-        size = 4 * source.grid.vectors * source.grid.samples
-        return replace(source, images=lru_cache(max(KEPT_BYTES // size, 1))(source.read))
 
 
 class _Viewer(param.Parameterized):  # type: ignore[misc]
@@ -141,7 +140,6 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
         self.param.watch(self._draw_points, [*_COLOURS, "mode", "overlay", "points_mm"], precedence=1)
         self.param.watch(lambda _: setattr(self, "points_mm", []), "mode")
         self.param.watch(self._measure, "points_mm")
-        self._space = pn.pane.Plotly(self._outlines(), sizing_mode="stretch_both")
         self._draw_points()
 
     def layout(self) -> Viewable:
@@ -154,13 +152,12 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
         remove = pn.widgets.Button(name="Remove the last", **half)
         add.on_click(self._add)
         remove.on_click(lambda _: setattr(self, "points_mm", self.points_mm[:-1]))
+        calibrations = self._page.reconstruction.provenance.calibrations
         commands = pn.Card(self._commands, title="The commands", collapsed=True, width=_SIDE_PX)
         side = pn.Column(
             controls,
             self._lengths,
-            pn.pane.HTML(
-                "<br>".join(f"calibration used: {escape(path)}" for path in self._page.calibrations)
-            ),
+            pn.pane.HTML("<br>".join(f"calibration used: {escape(file.path)}" for file in calibrations)),
             pn.Row(add, remove, margin=0),
             self._words,
             commands,
@@ -175,7 +172,7 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
         return pn.Row(side, along, frame, third, sizing_mode="stretch_both")
 
     def _outlines(self) -> go.Figure:
-        """Outlines of the frames of all modes in space, with room for those of the cuts."""
+        """Outlines of the frames of all modes in space."""
         page = self._page
         poses = {mode: page.posed(mode, None).poses[mode] for mode in page.modes}
         outlines = plot_outlines(poses, self._grid)
@@ -183,13 +180,12 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
             height=None,
             margin={"l": 0, "r": 0, "t": 0, "b": 0},
             font_size=10,
-            uirevision="kept",
             legend={"y": 1},
             scene_camera={"eye": {"x": 2.4, "y": -3.3, "z": 1.4}, "center": {"z": -0.05}},
             scene_xaxis_nticks=3,
             scene_yaxis_nticks=3,
         )
-        return outlines.add_scatter3d(mode="lines", line={"color": "#ff4fc3", "width": 6}, name="cuts")
+        return outlines
 
     def _trajectories(self) -> Viewable:
         """Outlines of frames in space, and length and angles over the frames, of all modes."""
@@ -204,22 +200,10 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
         )
         over_frames = pn.pane.Plotly(drift, sizing_mode="stretch_both")
         return pn.Tabs(
-            ("in space", self._space),
+            ("in space", pn.pane.Plotly(self._outlines(), sizing_mode="stretch_both")),
             ("over the frames", over_frames),
             sizing_mode="stretch_both",
         )
-
-    def _draw_planes(self) -> None:
-        """Draw where the cuts are in space."""
-        hulls = [plot.plane.hull_mm for plot in self._plots.values() if plot.plane is not None]
-        # Of the first pixels of all columns and the last ones, the first and the last column's.
-        corners = [
-            np.vstack([hull[[0, len(hull) // 2 - 1, -1, len(hull) // 2, 0]], np.full(3, np.nan)])
-            for hull in hulls
-        ]
-        y, z, x = self._poses[0].inv().apply(np.concatenate(corners)).T
-        self._space.object.data[-1].update(x=x, y=y, z=z)
-        self._space.param.trigger("object")
 
     @property
     def _cross_mm(self) -> FloatArray:
@@ -280,12 +264,11 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
         options += [("difference_to", self.mode)] if self._pair[1] else []
         options += [("sweep", page.sweep_file)] if page.sweep_file else []
         self._commands.object = "".join(
-            command(
+            _command(
                 "reslice", page.source, [("output", f"{name}.png"), *self._slider(name).items(), *options]
             )
             for name in _CUTS
         )
-        self._draw_planes()
 
     def _add(self, *_: Any) -> None:
         """Measure from and to where the cross hair is."""
@@ -301,15 +284,30 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
         if len(points) > 1:
             try:
                 lines += [row.line for row in measure(page.reconstruction, points, self.mode)]
-                half_mm = 1.96 * PICKING * self._grid.vector_pitch_mm
-                lines.append(
-                    f"mode {self.mode}; points are picked to +- {half_mm:.2g} mm per axis; every +- is 95 %"
-                )
+                lines.append(how_measured(self.mode, PICKING * self._grid.vector_pitch_mm))
                 lines += filter(None, [caution(page.reconstruction, self.mode)])
                 places = [("point", ",".join(map(repr, point))) for point in points.tolist()]
-                again = command("measure", page.source, [("mode", self.mode), *places])
+                again = _command("measure", page.source, [("mode", self.mode), *places])
             except Speckle3DError as error:
                 lines.append(str(error))
         self._words.object = (
             "".join(f"<p style='margin:3px 0'>{escape(line)}</p>" for line in lines) + again or _HELP
         )
+
+
+def _command(name: str, source: Path, options: Iterable[tuple[str, object]]) -> str:
+    """HTML of a command line about a reconstruction, which one click selects.
+
+    Parameters
+    ----------
+    name : str
+        Of the command.
+    source : path
+        The reconstruction.
+    options : iterable of (str, object)
+        Names of options, as ``depth_mm``, and their values.
+    """
+    words = ["speckle3d", name, str(source)]
+    for option, value in options:
+        words += [f"--{option.replace('_', '-')}", f"{value:g}" if isinstance(value, float) else str(value)]
+    return f'<div style="{_CODE}">{escape(shlex.join(words))}</div>'

@@ -7,12 +7,31 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from speckle3d.app.sensor.source import COLUMNS, NORMAL_95, Columns, angles, heading_rad
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from xsens.fusion.field import Trust, dip_rad, field_of
 from xsens.fusion.orient import Orientation, orient
 from xsens.logs.samples import ImuLog
+
+COLUMNS = ("t", "x", "y", "z", "field", "dip", "heading", "half", "doubt")
+NORMAL_95 = 1.96
+
+Columns = dict[str, FloatArray]
+"""By the names of `COLUMNS`: time, s; gyroscope, degrees per second; norm of the field; its dip and the
+heading, degrees; half the heading's 95 % interval; norm again where the field is not believed; or NaN."""
+
+
+def heading_rad(rotation: Rotation) -> FloatArray:
+    """Heading about up, from north to west, without jumps."""
+    matrices = rotation.as_matrix().reshape(-1, 3, 3)
+    return np.asarray(np.unwrap(np.arctan2(matrices[:, 1, 0], matrices[:, 0, 0])))
+
+
+def angles(rotation: Rotation) -> tuple[str, str]:
+    """Name and value of roll, pitch and yaw."""
+    return "roll, pitch, yaw", ", ".join(
+        f"{angle:+.1f}°" for angle in rotation.as_euler("ZYX", degrees=True)[::-1]
+    )
 
 
 class LogReadings:
@@ -61,14 +80,12 @@ class LogReadings:
             columns["field"] = np.linalg.norm(field, axis=1)
         if stream is None:
             return columns
-        heading = np.degrees(heading_rad(stream[1]))
-        columns |= {"heading": heading, "low": heading, "high": heading}
+        columns["heading"] = np.degrees(heading_rad(stream[1]))
         if field is not None:
             rows = np.flatnonzero(np.isfinite(field).all(axis=1))
             columns["dip"][rows] = np.degrees(dip_rad(stream[1][rows].apply(field[rows])))
         if isinstance(orientation, Orientation):
-            half = NORMAL_95 * np.degrees(orientation.standard_deviation_rad[:, 2])
-            columns |= {"low": heading - half, "high": heading + half}
+            columns["half"] = NORMAL_95 * np.degrees(orientation.standard_deviation_rad[:, 2])
             doubtful = orientation.disturbed & orientation.magnetic
             columns["doubt"] = np.where(doubtful, columns["field"], np.nan)
         return columns

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from speckle3d.app.look import batch_changes
 from speckle3d.app.plots import time_plot
-from speckle3d.app.sensor.log import LogReadings
+from speckle3d.app.sensor.log import Columns, LogReadings
 from speckle3d.app.sensor.watch import SHOWN_S, SensorWatch
 from speckle3d.core.arrays import FloatArray
 from xsens.fusion.field import Trust
@@ -89,7 +89,7 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
     def __init__(self, source: Source, mounting: Rotation | None) -> None:
         super().__init__()
         self._source, self._mounting = source, mounting
-        self._data = ColumnDataSource(source.columns())
+        self._data = ColumnDataSource(self._columns())
         end_s = 0.0 if source.is_live else max(float(self._data.data["t"][-1]), 1e-3)
         self.param.step.bounds = (0, max(int(end_s / _STEP_S), 1))
         self._range = Range1d(-SHOWN_S if source.is_live else 0.0, end_s)
@@ -131,6 +131,11 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
         )
         return pn.Column(self._banner, row, sizing_mode="stretch_both")
 
+    def _columns(self) -> Columns:
+        columns = self._source.columns()
+        heading, half = columns["heading"], columns["half"]
+        return columns | {"low": heading - half, "high": heading + half}
+
     def _plot(self, label: str, names: tuple[str, ...]) -> figure:
         plot = time_plot(label, self._range, self._cursor, self._go, min_border_left=64)
         for name in names:
@@ -152,7 +157,7 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
 
     @batch_changes
     def _refresh(self) -> None:
-        self._data.data = self._source.columns()
+        self._data.data = self._columns()
         self._show()
 
     @batch_changes

@@ -13,7 +13,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from speckle3d.app.sensor.source import COLUMNS, NORMAL_95, Columns, angles, heading_rad
+from speckle3d.app.sensor.log import COLUMNS, NORMAL_95, Columns, angles, heading_rad
 from speckle3d.core.errors import Speckle3DError
 from xsens.fusion.field import Trust, field_now
 from xsens.live.monitor import LiveState
@@ -81,10 +81,7 @@ class SensorWatch:
         columns = dict(zip(COLUMNS, table.T, strict=True))
         columns["t"] = columns["t"] - columns["t"][-1:]
         rows = np.isfinite(columns["heading"])
-        heading = columns["heading"][rows]
-        columns["heading"][rows] = np.degrees(np.unwrap(np.radians(heading)))
-        for end in ("low", "high"):
-            columns[end][rows] += columns["heading"][rows] - heading
+        columns["heading"][rows] = np.unwrap(columns["heading"][rows], period=360.0)
         return columns
 
     def gaps_s(self) -> list[float]:
@@ -143,4 +140,4 @@ def _row(state: LiveState) -> tuple[float, ...]:
         half = NORMAL_95 * float(np.degrees(state.fused.standard_deviation_rad[2]))
     doubt = state.field if state.disturbed else nan
     dip = float(np.degrees(state.dip_rad))
-    return (state.elapsed_s, *rate, state.field, dip, heading, heading - half, heading + half, doubt)
+    return (state.elapsed_s, *rate, state.field, dip, heading, half, doubt)

@@ -13,8 +13,15 @@ from panel.viewable import Viewable
 
 from speckle3d.app.look import batch_changes
 from speckle3d.app.plots import greys
-from speckle3d.app.sweep.pairs import NEIGHBOURS, PatchValues, patch_values
-from speckle3d.app.sweep.plots import FLAG_COLOUR, REASONS, PatchPlot, TimePlots
+from speckle3d.app.sweep.plots import (
+    FLAG_COLOUR,
+    NEIGHBOURS,
+    REASONS,
+    PatchPlot,
+    PatchValues,
+    TimePlots,
+    patch_values,
+)
 from speckle3d.config import Config, stored_config
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.doubts import Doubt
@@ -22,7 +29,7 @@ from speckle3d.core.reconstruction import Reconstruction
 from speckle3d.core.sweep import OrientationSensor, Sweep, Tracker
 from speckle3d.examine.sensors import repair_readings
 from speckle3d.matching.quality import FrameFlag
-from speckle3d.study.images import GreyImages
+from speckle3d.study.images import grey_images
 
 MOST_ROWS = 640
 """Rows that are sent to the browser: more than a screen shows, and a third of what echoes are sampled at."""
@@ -56,7 +63,7 @@ class SweepPage:
         self.sweep = sweep
         toml = "" if reconstruction is None else reconstruction.config_toml
         config = stored_config(toml) if toml else Config()
-        self._images = GreyImages(sweep, _MOST_DB, settings=config.intensity)
+        self._images = grey_images(sweep, _MOST_DB, reconstruction)
         grid = self._images.grid
         # Rows that are shown are means of so many samples.
         self._pooled = -(-grid.samples // MOST_ROWS)
@@ -158,13 +165,13 @@ class _Player(param.Parameterized):  # type: ignore[misc]
             for flag in FrameFlag(int(flags[frame])):
                 yield f'<span style="color:{FLAG_COLOUR}">&#9873; {escape(REASONS[flag])}</span>'
         if values is not None:
-            elevation, sigma = values.elevation_mm
+            elevation, sigma = values["elevation"]
             yield (
                 f"<b>With frame {partner}</b>: the image's centre is {elevation:.3f} mm away, elevational "
                 f"(standard deviation {sigma:.3f})"
             )
-            left_out = np.isfinite(values.distance_mm) & ~values.inliers
-            yield f"{values.inliers.sum()} patches used, {left_out.sum()} left out (red crosses)"
+            left_out = np.isfinite(values["distance"]) & ~values["inliers"]
+            yield f"{values['inliers'].sum()} patches used, {left_out.sum()} left out (red crosses)"
         elif self.colour != "none":
             yield f"The reconstruction did not use the pair with frame {partner}."
 

@@ -6,17 +6,25 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from bokeh.models import ColumnDataSource, FactorRange, HoverTool, LinearColorMapper, Range1d
 from bokeh.models.annotations import ColorBar, Span
 from bokeh.palettes import Viridis256
 from bokeh.plotting import figure
+from scipy.spatial.transform import RigidTransform
 
 from speckle3d.app.plots import ImagePlot, time_plot
-from speckle3d.app.sweep.pairs import PatchValues
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.doubts import Doubt
+from speckle3d.core.grid import ImageGrid
+from speckle3d.core.reconstruction import FramePairs
 from speckle3d.core.sweep import Sweep
 from speckle3d.matching.quality import FrameFlag
+
+PatchValues = dict[str, npt.NDArray[Any]]
+
+NEIGHBOURS = 8
+"""Frames before and after with which a frame can be compared."""
 
 REASONS = {
     FrameFlag.FROZEN: "frozen: bit for bit the frame before, which the recorder repeated",
@@ -28,7 +36,8 @@ REASONS = {
 FLAG_COLOUR, _DOUBT_COLOUR, _OUTLIER_COLOUR = "#d55e00", "#7b3fa0", "#ff4d4d"
 _LINES = ("#0072b2", "#d55e00", "#009e73")
 """Of three quantities, told apart by the colour-blind (Okabe and Ito)."""
-_PATCHES = "x", "y", "angle", "value", "line", "cross", "state", "distance", "sigma"
+_COLUMNS = "x", "y", "angle", "distance", "sigma"
+_PATCHES = *_COLUMNS, "value", "line", "cross", "state"
 _ROW_PX, _LEFT_PX = 16, 108
 
 
@@ -75,15 +84,11 @@ class PatchPlot(ImagePlot):
         if patches is None:
             self._patches.data = {name: [] for name in _PATCHES}
             return
-        has_distance = np.isfinite(patches.distance_mm)
-        outlier = has_distance & ~patches.inliers
-        columns = {"distance": patches.distance_mm, "sigma": patches.sigma_mm}
+        has_distance = np.isfinite(patches["distance"])
+        outlier = has_distance & ~patches["inliers"]
         self._colours.high = most
-        self._patches.data = columns | {
-            "x": patches.centre_mm[:, 0],
-            "y": patches.centre_mm[:, 1],
-            "angle": patches.turn_rad,
-            "value": columns[by],
+        self._patches.data = {name: patches[name] for name in _COLUMNS} | {
+            "value": patches[by],
             "line": np.where(outlier, _OUTLIER_COLOUR, "#ffffff"),
             "cross": np.where(outlier, 16, 0),
             "state": np.where(outlier, "left out", np.where(has_distance, "used", "without a distance")),
@@ -159,3 +164,39 @@ class TimePlots:
 
     def _go(self, time_s: float) -> None:
         self._jump(int(np.argmin(np.abs(self._time_s - time_s))))
+
+
+def patch_values(pairs: FramePairs, grid: ImageGrid, frame: int, partner: int) -> PatchValues | None:
+    """Patches of a frame by its pair with another, by name; None for a pair that was not reconstructed.
+
+    Returns
+    -------
+    dict of str to ndarray, or None
+        Where the patches lie in this frame (``x``, ``y``, mm) and by which ``angle``, rad, they are turned
+        there, a fan's vectors included; their ``distance`` and its ``sigma``, mm, NaN where there is none;
+        ``inliers``, those that the plane of the pair rests on; ``elevation``, how far the image's centre is
+        from the other frame along its elevational axis, mm, and standard deviation.
+    """
+    first, second = sorted((frame, partner))
+    rows = np.flatnonzero((pairs.first == first) & (pairs.second == second))
+    if not rows.size:
+        return None
+    row = int(rows[0])
+    first_from_second = RigidTransform.from_matrix(pairs.first_from_second[row])
+    # Patches tile the earlier frame.
+    centre_mm = np.column_stack([pairs.patch_centre_mm, np.zeros(len(pairs.patch_centre_mm))])
+    angle = -grid.angle_rad(grid.sample_at(pairs.patch_centre_mm)[:, 0])
+    if frame == second:
+        second_from_first = first_from_second.inv()
+        centre_mm = second_from_first.apply(centre_mm)
+        angle = angle + second_from_first.rotation.as_euler("zyx")[0]
+    elevation = abs(first_from_second.apply(grid.centre_mm)[2]), pairs.covariance[row, 2, 2] ** 0.5
+    return {
+        "x": centre_mm[:, 0],
+        "y": centre_mm[:, 1],
+        "angle": angle,
+        "distance": pairs.distance_mm[row].astype(float),
+        "sigma": pairs.sigma_mm[row].astype(float),
+        "inliers": pairs.used[row],
+        "elevation": np.array(elevation),
+    }

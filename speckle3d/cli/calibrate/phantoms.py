@@ -5,9 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from speckle3d.cli.calibrations import report_of
 from speckle3d.cli.commands import Fields
-from speckle3d.cli.common import Out, Result, note
+from speckle3d.cli.common import Out, Result, note, report_of
 from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.progress import progress_bar
 

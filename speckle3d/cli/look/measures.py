@@ -56,10 +56,10 @@ def measure(
     from speckle3d.io.reconstructions import read_reconstruction
     from speckle3d.scoring.modes import default_mode
     from speckle3d.scoring.trajectories import poses_of
-    from speckle3d.study.pose_errors import PICKING, caution
+    from speckle3d.study.pose_errors import PICKING, caution, how_measured
     from speckle3d.study.pose_errors import measure as measure_points
     from speckle3d.study.posed import pose_mark, require_made_at
-    from speckle3d.study.reslices.cut_geometry import read_plane
+    from speckle3d.study.reslices.cuts import read_plane
 
     columns = WORLD if on is None else PICTURE
     places = read_places(points, columns) if points is not None else parse_places(point or [], columns)
@@ -73,9 +73,9 @@ def measure(
     pick_mm = PICKING * reconstruction.grid.vector_pitch_mm if pick_mm is None else pick_mm
     measurements = measure_points(reconstruction, places, mode, pick_mm)
     notes([why, caution(reconstruction, mode)])
-    how = f"mode {mode}; points are picked to +- {1.96 * pick_mm:.2g} mm per axis; every +- is 95 %"
     numbers = {"mode": mode, "pick_mm": pick_mm, "measurements": [_record(m) for m in measurements]}
-    return numbers, "\n".join([*(measurement.line for measurement in measurements), how])
+    lines = [*(measurement.line for measurement in measurements), how_measured(mode, pick_mm)]
+    return numbers, "\n".join(lines)
 
 
 def _record(measurement: Measurement) -> dict[str, Any]:

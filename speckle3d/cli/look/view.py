@@ -8,11 +8,12 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from speckle3d.cli.commands import Fields
-from speckle3d.cli.common import MaybeNumber, MaybePath, Port, WritablePath, note
+from speckle3d.cli.common import MaybePath, Port, WritablePath, note
 from speckle3d.core.extras import require_extra
 
 _SETTINGS = "speckle3d.calibrating.settings"
 _SCAN = ("phantom", "points", "poses", "transform", "pixel_mm")
+_IMPORTED = ("column_pitch_mm", "row_spacing_mm", "frame_rate_hz", "dynamic_range_db", "plus_config")
 
 
 def view(
@@ -24,7 +25,7 @@ def view(
     calibrate: Literal["plane", "orientation", "wires"] | None = None,
     scan: Annotated[Any, Fields(f"{_SETTINGS}:WireSettings", _SCAN)],
     plane: Annotated[Any, Fields(f"{_SETTINGS}:OrientationSettings", ("sensor", "level"))],
-    dynamic_range_db: MaybeNumber = None,
+    recording: Annotated[Any, Fields("speckle3d.io.import_settings:ImportSettings", _IMPORTED)],
     port: Port = 0,
     browser: bool = True,
 ) -> None:
@@ -63,8 +64,9 @@ def view(
     transform
         With --calibrate: poses to use, by their name in an image sequence, as ToolToTracker (ProbeToTracker).
     pixel_mm
-    dynamic_range_db
-        Of a recording's grey levels, if it does not say. Not with --calibrate.
+        With --calibrate: distance between columns and rows, mm, if FILE does not say.
+    column_pitch_mm, row_spacing_mm, frame_rate_hz, dynamic_range_db, plus_config
+        Of a recording that does not say it, as in `speckle3d convert`. Not with --calibrate.
 
     Examples
     --------
@@ -76,20 +78,12 @@ def view(
     from speckle3d.app.phantom.pages import phantom_page
     from speckle3d.app.server import AppServer
     from speckle3d.calibrating.settings import model_of
-    from speckle3d.io.import_settings import ImportSettings
     from speckle3d.io.toml import validated
 
     with ExitStack() as running:
         if calibrate is None:
-            column_mm, row_mm = scan.pixel_mm or (None, None)
-            values = {
-                "column_pitch_mm": column_mm,
-                "row_spacing_mm": row_mm,
-                "dynamic_range_db": dynamic_range_db,
-            }
-            settings = validated(values, "--pixel-mm, --dynamic-range-db", ImportSettings)
             pages = running.enter_context(
-                open_pages(file, record, reconstruction=reconstruction, sweep=sweep_file, settings=settings)
+                open_pages(file, record, reconstruction=reconstruction, sweep=sweep_file, settings=recording)
             )
         else:
             values = scan.model_dump(exclude_unset=True) | plane.model_dump(exclude_unset=True)

@@ -1,25 +1,32 @@
-"""A sweep at poses: its voxels, and scenes for 3D Slicer."""
+"""A sweep at poses: its voxels, scenes for 3D Slicer, and cuts."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
-from speckle3d.cli.calibrations import clip_of
+from speckle3d.cli.common import MaybeNumber, MaybePath, MaybeText, Out
+from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.progress import progress_bar
+
+if TYPE_CHECKING:
+    from speckle3d.core.arrays import FloatArray
+    from speckle3d.study.posed import SweepModes
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+from pydantic import BaseModel
+
 from speckle3d.cli.commands import Fields
 from speckle3d.cli.common import (
-    MaybePath,
-    MaybeText,
-    Out,
     Result,
     WritablePath,
+    clip_of,
     load_settings,
     note,
     notes,
 )
-from speckle3d.core.progress import progress_bar
 
 if TYPE_CHECKING:
     from speckle3d.core.grid import Region
@@ -36,13 +43,12 @@ _IMPORTED = (
     "frame_rate_hz",
 )
 ImportOptions = Annotated[Any, Fields("speckle3d.io.import_settings:ImportSettings", _IMPORTED)]
-"""Options of what a recording does not say; the range of its grey levels is that of the levels made."""
+"""Options of what a recording does not say."""
 _SETTINGS = "speckle3d.imaging.voxels.settings:CompoundingSettings"
 _SCENE = ("voxel_mm", "splat", "rule", "fill_radius", "dynamic_range_db")
 
 
-@dataclass(frozen=True)
-class SweepChoice:
+class SweepChoice(BaseModel):
     """Options of a sweep at poses: which file, with which calibrations, and what part of its images."""
 
     region: str | None = None
@@ -66,7 +72,6 @@ def open_sweep_at(
     source: Path,
     settings: ImportSettings,
     choice: SweepChoice,
-    range_db: float | None = None,
 ) -> tuple[list[PosedSweep], Region | None]:
     """Open a sweep at the poses of each mode (None: the best), and note on stderr what it says of itself.
 
@@ -79,7 +84,7 @@ def open_sweep_at(
     from speckle3d.study.posed import open_posed
 
     require_unsaid(source, settings)
-    options = choice.sweep_file, settings, choice.calibration or (), range_db
+    options = choice.sweep_file, settings, choice.calibration or ()
     sweeps = [open_posed(source, mode, *options) for mode in modes]
     first = sweeps[0]
     notes(first.notes())
@@ -149,14 +154,12 @@ def volume(
     $ speckle3d volume out/reconstruction.h5 -o volume.nrrd
     """
     from speckle3d.study.pose_errors import caution
-    from speckle3d.study.scenes.voxels import VolumeRequest, write_voxels
+    from speckle3d.study.scenes.voxels import write_voxels
 
     compounding = compounding_settings(config_file, settings)
-    range_db = settings.model_dump(exclude_unset=True).get("dynamic_range_db")
-    (posed,), part = open_sweep_at([mode], input_file, recording, choice, range_db)
-    request = VolumeRequest(compounding, grid, part)
+    (posed,), part = open_sweep_at([mode], input_file, recording, choice)
     with progress_bar(f"compounding {out.name}"):
-        report = write_voxels(posed, request, out, state, deviation)
+        report = write_voxels(posed, compounding, out, grid, part, state, deviation)
     if deviation is not None and posed.reconstruction is not None:
         notes([caution(posed.reconstruction, posed.mode)])
     note(report.line)
@@ -181,7 +184,7 @@ def scene(
     ----------
     input_file
     out
-        Folder to write; open its scene.mrml.
+        Folder to write into; open its scene.mrml.
     mode
         As for `volume`; may be repeated.
     images
@@ -198,16 +201,119 @@ def scene(
     --------
     $ speckle3d scene out/reconstruction.h5 -o scene --images
     """
-    from speckle3d.study.scenes.scene import require_scene_place, write_scene
-    from speckle3d.study.scenes.voxels import VolumeRequest
+    from speckle3d.study.results import require_own
+    from speckle3d.study.scenes.scene import FILES, write_scene
 
-    require_scene_place(out, input_file, choice.sweep_file, *(choice.calibration or ()))
+    require_own(out, FILES)
     compounding = compounding_settings(config_file, settings)
-    range_db = settings.model_dump(exclude_unset=True).get("dynamic_range_db")
     modes = list(dict.fromkeys(mode)) if mode else [None]
-    sweeps, part = open_sweep_at(modes, input_file, recording, choice, range_db)
-    request = VolumeRequest(compounding, region=part)
+    sweeps, part = open_sweep_at(modes, input_file, recording, choice)
     with progress_bar(f"writing {out.name}") as progress:
-        reports = write_scene(out, sweeps, request, images, deviation, progress)
+        reports = write_scene(out, sweeps, compounding, part, images, deviation, progress)
     for report in reports:
         note(report.line)
+
+
+def reslice(
+    input_file: Path,
+    out: Annotated[Out, "picture volume"],
+    *,
+    mode: list[str] | None = None,
+    difference_to: MaybeText = None,
+    lateral_mm: MaybeNumber = None,
+    depth_mm: MaybeNumber = None,
+    frame: int | None = None,
+    angle_deg: float = 0.0,
+    points: MaybeText = None,
+    curve: MaybePath = None,
+    on: MaybePath = None,
+    pixel_mm: float = 0.2,
+    choice: SweepOptions,
+    dynamic_range_db: float = 50.0,
+    recording: ImportOptions,
+) -> None:
+    """Cut a plane or along a curve, straight from the frames at the poses of one or more modes.
+
+    Parameters
+    ----------
+    input_file
+    out
+        PNG to write; or .nrrd, .mha, .nii.gz: the cut at its place.
+    mode
+        Which poses to use, as in `volume`; repeated, modes stand side by side.
+    lateral_mm
+        Cut along the sweep at this lateral position (middle). Not with --depth-mm or --points or --curve.
+    depth_mm
+        Cut parallel to the skin at this depth. Not with --frame or --points or --curve.
+    frame
+        Cut in the plane of this frame, from 0. Not with --points or --curve.
+    points
+        Cut through three points of the world, 'X,Y,Z X,Y,Z X,Y,Z' in mm: of the first row and, in it, the
+        first column, farther along it, and on the side of the columns. Not with --curve.
+    curve
+        CSV of a curve's points x_mm,y_mm,z_mm in the world: cut along it and into the depth.
+    on
+        With --curve: picture of `speckle3d reslice` with the curve's points: x_mm,y_mm then, by its axes.
+
+    Other Parameters
+    ----------------
+    difference_to
+        What modes are compared with (truth or tracker if known, else the first).
+    angle_deg
+        With --frame: turn out of it about its depth line; 90 is along the sweep.
+    pixel_mm
+        Side of a pixel.
+    dynamic_range_db
+        Range of the grey levels of RF and I/Q.
+    region, sweep_file, calibration, tracker_transform
+
+    Examples
+    --------
+    $ speckle3d reslice out/reconstruction.h5 -o cut.png --mode image --mode pose
+    """
+    from speckle3d.imaging.cuts.oblique import spanned_plane
+    from speckle3d.io.points import parse_places
+    from speckle3d.io.voxels.volume_writer import write_volume
+    from speckle3d.study.posed import at_modes
+    from speckle3d.study.reslices.cuts import cut_as_volume, cut_at_modes
+    from speckle3d.study.reslices.places import along_curve, along_sweep, in_frame, in_world
+    from speckle3d.study.reslices.reslice_figures import save_reslices
+
+    plane = None
+    if points is not None:
+        corners = parse_places(points.split(), option="--points")
+        if len(corners) != 3:
+            raise InvalidInputError(f"--points: expected three, got {len(corners)}")
+        plane = spanned_plane(corners[0], *(corners[1:] - corners[0]))
+    first_mode = mode[:1] if mode else [None]
+    (first,), part = open_sweep_at(first_mode, input_file, recording, choice)
+    modes = at_modes(first, mode or (), difference_to)
+    source, _ = modes.posed.source(None, dynamic_range_db)
+    grid = source.grid
+    if curve is not None:
+        place = along_curve(modes, grid, _curve(curve, on, modes), pixel_mm)
+    elif plane is not None:
+        place = in_world(modes, grid, plane, pixel_mm)
+    elif frame is not None:
+        place = in_frame(modes, grid, frame, angle_deg, lateral_mm, pixel_mm)
+    else:
+        place = along_sweep(modes, grid, lateral_mm, depth_mm, pixel_mm)
+    with progress_bar(f"reslicing {out.name}"):
+        picture = cut_at_modes(modes, place, source, dynamic_range_db, part)
+    if out.suffix.lower() == ".png":
+        save_reslices(picture, out)
+    else:
+        write_volume(out, cut_as_volume(picture))
+
+
+def _curve(path: Path, picture: Path | None, modes: SweepModes) -> FloatArray:
+    """Points of a curve in the world, read as such or as points of a picture of the mode that is cut."""
+    from speckle3d.io.points import PICTURE, WORLD, read_places
+    from speckle3d.study.posed import require_made_at
+    from speckle3d.study.reslices.cuts import read_plane
+
+    if picture is None:
+        return read_places(path, WORLD)
+    plane = read_plane(picture, modes.reference)
+    require_made_at(plane.mark, modes.marks[modes.reference], str(picture))
+    return plane.world_mm(read_places(path, PICTURE))

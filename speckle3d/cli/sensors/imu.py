@@ -14,14 +14,19 @@ from speckle3d.cli.common import (
     MaybePath,
     OptionalOut,
     OutArgument,
+    Paths,
     Result,
+    WritablePath,
     note,
     notes,
     rows_of,
+    status_line,
 )
 from speckle3d.core.errors import InvalidInputError, naming
 
 if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
+
     from speckle3d.core.streams import TimedRotations
     from xsens.fusion.orient import Orientation
     from xsens.logs.samples import ImuLog
@@ -199,13 +204,11 @@ def orient(
         rotations, orientation = orientation_of(log, method, magnetometer)
     if into is not None:
         # As options say, else the calibration, else the sweep that the log is from.
-        offset_s, mounting = 0.0, None
-        if sensor is not None:
-            offset_s, mounting = sensor.time_offset_s, sensor.sensor_from_image
+        offset_s, mounting = (sensor.time_offset_s, sensor.sensor_from_image) if sensor else (0.0, None)
         if calibration is not None:
             solution = read_calibration(calibration)
-            offset_s = offset_s if solution.time_offset_s is None else solution.time_offset_s
             mounting = solution.rotation
+            offset_s = offset_s if solution.time_offset_s is None else solution.time_offset_s
         offset_s = offset_s if time_offset_s is None else time_offset_s
         coverage = attach_log(into, log, rotations, mounting, offset_s, replace_stream)
         note(f"orientation of {len(rotations)} samples in {into}{coverage}")
@@ -225,6 +228,104 @@ def orient(
     name = "sensor" if orientation is None else method
     lines = [("method", name, ""), *((key, f"{value:.5g}", unit) for key, value, unit in rows)]
     return {"method": name} | {key: value for key, value, _ in rows}, rows_of(lines)[1]
+
+
+def accuracy(
+    log_file: Path,
+    reference: MaybePath = None,
+    optical: MaybePath = None,
+    calibration: Paths = None,
+    turns: str = "roll, yaw, tilt",
+    fit_mounting: Annotated[bool, typer.Option("--fit-mounting/--aligned")] = True,
+    time_offset_s: float = 0.0,
+    method: Method = "smoother",
+    magnetometer: bool = True,
+    figure: Annotated[WritablePath, "picture"] = None,
+    rate_hz: MaybeNumber = None,
+    world: World = None,
+) -> Result:
+    """Compare the angles between all pairs of orientations with a reference's (Housden 2008, Table 2).
+
+    One of --reference or --optical.
+
+    Parameters
+    ----------
+    log_file
+    reference
+        Settings of a mechanism: CSV with tilt, yaw, roll in degrees, perhaps time_s and until_s.
+    optical
+        Orientation by a tracker: TUM text, or a log that carries its own orientation.
+    calibration
+        Calibration files; may be repeated.
+    method
+    figure
+        PNG of single turns, as Figure 5 of the paper.
+    as_json
+
+    Other Parameters
+    ----------------
+    turns
+        With --reference: the mechanism's axes from its base to the probe.
+    fit_mounting
+        With --optical: the target's axes on the probe: found from the motion, or those of the image.
+    time_offset_s
+        With --optical: a reading of the sensor at t belongs to the tracker's time t + this.
+    magnetometer, rate_hz, world
+
+    Examples
+    --------
+    $ speckle3d imu accuracy log.mtb --optical tracker.tum --calibration imu.h5
+    """
+    from scipy.spatial.transform import Rotation
+
+    from speckle3d.io.calibrations import read_calibration
+    from speckle3d.study.figures import save_figure
+    from xsens.accuracy.angles import AccuracyTable, pair_errors
+    from xsens.accuracy.figures import figure_turns
+    from xsens.accuracy.mechanism import read_mechanism_csv, readings_at
+
+    log = read(log_file, rate_hz, world)
+    note_gaps(log)
+    mountings = Rotation.identity(1)
+    if calibration:
+        mountings = Rotation.concatenate([read_calibration(path).rotation for path in calibration])
+    else:
+        note("no --calibration: the sensor's axes are taken for the image's")
+    mechanism = None if reference is None else read_mechanism_csv(reference, turns)
+    with naming(str(log_file)):
+        rotations, _ = orientation_of(log, method, magnetometer)
+        if mechanism is not None:
+            readings, truth = readings_at(rotations, mechanism), mechanism.base_from_image
+        elif optical is not None:
+            readings, truth = _beside_tracker(rotations, optical, time_offset_s, fit_mounting, mountings)
+        errors = pair_errors(readings, truth, mountings)
+    table = AccuracyTable.of({log_file.stem: errors})
+    if figure is not None:
+        save_figure(figure_turns({log_file.stem: errors}, log_file.name), figure)
+    how = f"{len(errors)} errors: pairs of {errors.frames} orientations, {len(mountings)} calibrations"
+    return rows_of(table.values())[0], f"{table.text()}\n{how}"
+
+
+def _beside_tracker(
+    rotations: TimedRotations, optical: Path, time_offset_s: float, fit_mounting: bool, mountings: Rotation
+) -> tuple[Rotation, Rotation]:
+    """Readings of the sensor, and the image's orientation by the tracker at the same moments."""
+    from speckle3d.core.streams import TimedRotations
+    from speckle3d.io.tum import is_tum, read_tum
+    from xsens.accuracy.angles import common_readings, mounting_from_motion
+
+    if is_tum(optical):
+        poses = read_tum(optical)
+        target_stream = TimedRotations(poses.time_s, poses.world_from_sensor.rotation)
+    else:
+        log = read(optical)
+        note_gaps(log)
+        target_stream = log.rotations()
+    readings, target = common_readings(rotations, target_stream, time_offset_s)
+    if not fit_mounting:
+        return readings, target
+    note("the target's mounting is found from the motion: constant errors of calibration do not show")
+    return readings, target * mounting_from_motion(readings * mountings.mean(), target)
 
 
 def record(
@@ -260,17 +361,14 @@ def record(
     --------
     $ speckle3d imu record /dev/ttyUSB0 log.mtb
     """
-    from rich.console import Console
-    from rich.live import Live
-    from rich.text import Text
-
     from xsens.live.recording import record as record_port
 
-    console, state = Console(stderr=True), None
+    state = None
     try:
-        with Live(Text("connecting"), console=console, refresh_per_second=8, transient=True) as live:
+        with status_line() as show:
+            show("connecting")
             for state in record_port(port, out, settings, append, duration_s=duration_s):
-                live.update(Text(state.line()))
+                show(state.line())
     except KeyboardInterrupt:
         note("stopped")
     if state is not None:

@@ -1,22 +1,30 @@
-"""Cuts through a sweep at the poses of one or several modes."""
+"""Cuts through a sweep at the poses of several modes; where they lie stands in a PNG's text.
+
+Whoever picks points in the picture, by its axes, gets points of the world.
+"""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import Float32Array, FloatArray
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.core.grid import ImageGrid, Region
+from speckle3d.core.files import PathLike, open_regular
+from speckle3d.core.geometry import transforms_from_matrices
+from speckle3d.core.grid import Region
 from speckle3d.core.sweep import BModeSettings
 from speckle3d.core.volume import Volume
 from speckle3d.imaging.cuts.outlines import crossings, frame_outlines
 from speckle3d.imaging.cuts.planes import Cut
 from speckle3d.imaging.cuts.reslice import reslice_at
 from speckle3d.imaging.images import PosedImages
+from speckle3d.io.hdf5 import reading
 from speckle3d.scoring.lengths import ModeError
 from speckle3d.scoring.references import Reference, error_rows
 from speckle3d.study.figures import RANGE_DB
@@ -115,21 +123,16 @@ def cut_at_modes(
         levels = [((image - 255) * (dynamic_range_db / 255)).astype(np.float32) for image in levels]
     if not any(np.isfinite(image).any() for image in levels):
         raise InvalidInputError("cut: expected one that meets the sweep, got one that shows nothing")
-    cuts = {
-        mode: DrawnCut(image, cut, frame_lines(cut, grid, poses[mode]))
-        for (mode, cut), image in zip(place.cuts.items(), levels, strict=True)
-    }
+    cuts = {}
+    for (mode, cut), image in zip(place.cuts.items(), levels, strict=True):
+        cuts[mode] = DrawnCut(image, cut)
+        if cut.world_from_picture is not None:
+            lines = crossings(frame_outlines(grid, poses[mode]), cut.world_from_picture)
+            cuts[mode] = DrawnCut(image, cut, lines)
     reference = Reference.over_all(modes.reference, poses[modes.reference])
     lengths = length_words(error_rows(poses, reference, grid.centre_mm), modes.reference)
     name = modes.posed.sweep.name
     return CutPicture(cuts, place.axes, place.words, unit, limits, name, modes.marks, lengths)
-
-
-def frame_lines(cut: Cut, grid: ImageGrid, world_from_image: RigidTransform) -> FloatArray:
-    """Lines in which frames cross a plane, by its axes, (n, 2, 2), mm; NaN for none; none on a sheet."""
-    if cut.world_from_picture is None:
-        return np.empty((0, 2, 2))
-    return crossings(frame_outlines(grid, world_from_image), cut.world_from_picture)
 
 
 def length_words(rows: Sequence[ModeError], reference: str) -> dict[str, str]:
@@ -165,3 +168,78 @@ def cut_as_volume(picture: CutPicture) -> Volume:
     voxels = np.nan_to_num(level, nan=0.0).astype(np.uint8)
     place = RigidTransform.from_components(panel.cut.base_mm[0], panel.cut.world_from_picture.rotation)
     return Volume(voxels[None].T, (panel.cut.pixel_mm,) * 3, place, fields)
+
+
+KEYWORD = "speckle3d.reslice"
+
+
+@dataclass(frozen=True)
+class PicturedPlane:
+    """A plane in a picture.
+
+    Attributes
+    ----------
+    mode : str
+        Whose poses place it in the world.
+    mark : str
+        Of these poses, by `pose_mark`; empty where no frames were cut, and in older pictures.
+    world_from_picture : RigidTransform
+        From what the picture's axes say, x, y and 0, mm.
+    """
+
+    mode: str
+    mark: str
+    world_from_picture: RigidTransform
+
+    def world_mm(self, picked_mm: FloatArray) -> FloatArray:
+        """Points of the world, shape (n, 3), by the picture's axes, shape (n, 2)."""
+        return self.world_from_picture.apply(np.column_stack([picked_mm, np.zeros(len(picked_mm))]))
+
+
+def picture_text(cuts: Mapping[str, Cut], marks: Mapping[str, str]) -> str:
+    """Where the planes of a picture lie, by mode; `read_plane` reads it back. Of curved sheets nothing."""
+    planes = [
+        {"mode": mode, "kind": "plane", "mark": marks.get(mode, ""), "first_mm": (0.0, 0.0)}
+        | {"world_from_plane": cut.world_from_picture.as_matrix().tolist()}
+        for mode, cut in cuts.items()
+        if cut.world_from_picture is not None
+    ]
+    return json.dumps({"version": 1, "cuts": planes})
+
+
+def read_plane(path: PathLike, mode: str | None = None) -> PicturedPlane:
+    """Read where the plane of one mode in a picture lies; of the first, unless one is named.
+
+    Raises
+    ------
+    FileError
+        If the file cannot be read.
+    InvalidInputError
+        If it is no PNG of `speckle3d reslice`, or does not show a plane of that mode.
+    """
+    from PIL import Image, UnidentifiedImageError
+
+    try:
+        with reading(path), open_regular(path) as stream:
+            try:
+                text = dict(getattr(Image.open(stream, formats=["PNG"]), "text", {}))
+            except UnidentifiedImageError:  # an OSError, but not of the disk
+                text = {}
+        cuts = json.loads(text[KEYWORD])["cuts"]
+        planes = [_plane(cut) for cut in cuts if cut["kind"] == "plane"]
+    except (SyntaxError, KeyError, TypeError, ValueError, RecursionError) as error:
+        raise InvalidInputError(
+            f"{path}: expected a PNG that `speckle3d reslice` wrote, got another or a damaged one"
+        ) from error
+    for plane in planes:
+        if mode in (None, plane.mode):
+            return plane
+    modes = ", ".join(plane.mode for plane in planes) or "none"
+    raise InvalidInputError(f"{path}: expected a plane of mode {mode!r}, got {modes}")
+
+
+def _plane(record: Any) -> PicturedPlane:
+    (world_from_plane,) = transforms_from_matrices([record["world_from_plane"]], KEYWORD)
+    plane_from_picture = RigidTransform.from_translation([*np.negative(record["first_mm"]), 0.0])
+    mark = str(record.get("mark", ""))
+    return PicturedPlane(str(record["mode"]), mark, world_from_plane * plane_from_picture)

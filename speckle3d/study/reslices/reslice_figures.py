@@ -27,8 +27,7 @@ from speckle3d.study.figures import (
     save_figure,
 )
 from speckle3d.study.posed import SweepModes
-from speckle3d.study.reslices.cut_geometry import KEYWORD, picture_text
-from speckle3d.study.reslices.cuts import CutPicture, cut_at_modes
+from speckle3d.study.reslices.cuts import KEYWORD, CutPicture, cut_at_modes, picture_text
 from speckle3d.study.reslices.places import along_sweep
 
 _PIXEL_MM = 0.1

@@ -1,31 +1,35 @@
-"""A folder that opens in 3D Slicer as one scene: volumes, states of voxels, frames' outlines and poses."""
+"""A sweep for 3D Slicer: a scene of volumes, states of voxels, outlines and poses; a sequence that plays."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import jinja2
 import numpy as np
+import numpy.typing as npt
 from matplotlib.colors import to_rgb
 
-from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.arrays import ByteArray, FloatArray
 from speckle3d.core.files import PathLike
+from speckle3d.core.grid import Region
 from speckle3d.core.labels import STATE_SEGMENTS
 from speckle3d.core.printable import printable
 from speckle3d.core.progress import Progress
 from speckle3d.core.reconstruction import MODES
+from speckle3d.core.sweep import BModeSettings, Sweep
 from speckle3d.imaging.cuts.outlines import frame_outlines
+from speckle3d.imaging.images import PosedImages
+from speckle3d.imaging.voxels.settings import CompoundingSettings
 from speckle3d.io.fileset import FileSet
 from speckle3d.io.plus.write import write_sequence, write_transforms
 from speckle3d.io.shapes import write_polylines, write_transform
 from speckle3d.scoring.references import REFERENCES
 from speckle3d.study.figures import colour_of
-from speckle3d.study.posed import PosedSweep
-from speckle3d.study.scenes.sequences import slicer_sequence
-from speckle3d.study.scenes.voxels import VolumeReport, VolumeRequest, write_voxels
+from speckle3d.study.posed import USUAL_RANGE_DB, PosedSweep
+from speckle3d.study.scenes.voxels import VolumeReport, write_voxels
 
 SCENE = "scene.mrml"
 
@@ -40,12 +44,16 @@ _NAMES = {
     "poses": "poses-{}.seq.mha",
 }
 """Files of a mode, by what they hold."""
+_MODES = (*MODES, *REFERENCES)
+FILES = FileSet(SCENE, tuple(name.format(mode) for mode in _MODES for name in _NAMES.values()))
+"""What a scene may hold."""
 
 
 def write_scene(
     folder: PathLike,
     posed: Sequence[PosedSweep],
-    request: VolumeRequest | None = None,
+    settings: CompoundingSettings,
+    region: Region | None = None,
     with_images: bool = False,
     with_deviation: bool = False,
     progress: Progress | None = None,
@@ -55,10 +63,12 @@ def write_scene(
     Parameters
     ----------
     folder : path
-        New, or one that holds a scene, which is replaced.
+        Made if need be; a scene in it is replaced, other files stay.
     posed : sequence of PosedSweep
         One sweep with the poses of one mode or more.
-    request : VolumeRequest, optional
+    settings : CompoundingSettings
+    region : Region, optional
+        Of the images; samples outside it do not count.
     with_images : bool
         Whether the images are there, too, and move through the volume when they are played.
     with_deviation : bool
@@ -76,24 +86,25 @@ def write_scene(
     FileError
         If the folder cannot be written.
     """
-    request, target = request or VolumeRequest(), Path(folder)
+    target = Path(folder)
     choices = {"deviation": with_deviation, "images": with_images, "poses": with_images}
     kinds = [kind for kind in _NAMES if choices.get(kind, True)]
     names = dict.fromkeys(_NAMES[kind].format(posed_sweep.mode) for posed_sweep in posed for kind in kinds)
-    old_names = {name.format(mode) for mode in (*MODES, *REFERENCES) for name in _NAMES.values()} - {*names}
+    old_names = {*FILES.others} - {*names}
     scene: list[dict[str, Any]] = []
     reports = []
     with FileSet(SCENE, tuple(names), tuple(old_names)).replaced(target) as part:
         for posed_sweep in posed:
             files = {kind: _NAMES[kind].format(posed_sweep.mode) for kind in kinds}
-            report = _write_mode({kind: part / name for kind, name in files.items()}, posed_sweep, request)
+            paths = {kind: part / name for kind, name in files.items()}
+            report = _write_mode(paths, posed_sweep, settings, region)
             reports.append(replace(report, path=target / report.path.name))
             seconds = max(float(np.ptp(posed_sweep.sweep.frame_time_s[posed_sweep.frames])), 1e-3)
             scene.append(
                 {
                     "name": printable(f"{posed_sweep.sweep.name}, {posed_sweep.mode}"),
                     "files": files,
-                    "is_bytes": request.settings.voxel_type == "uint8",
+                    "is_bytes": settings.voxel_type == "uint8",
                     "colour": " ".join(f"{share:.3g}" for share in to_rgb(colour_of(posed_sweep.mode))),
                     "frames_per_s": f"{len(posed_sweep.frames) / seconds:g}",
                 }
@@ -108,25 +119,12 @@ def write_scene(
     return reports
 
 
-def require_scene_place(folder: Path, *inputs: Path | None) -> None:
-    """Refuse to write a scene into a folder that holds an input, or other things than a scene.
-
-    Raises
-    ------
-    InvalidInputError
-        Naming the folder.
-    """
-    if not folder.is_dir():
-        return
-    if any(path is not None and path.resolve().parent == folder.resolve() for path in inputs):
-        raise InvalidInputError(f"{folder}: holds an input: give another name")
-    if any(folder.iterdir()) and not (folder / SCENE).is_file():
-        raise InvalidInputError(f"{folder}: expected a new name or a scene to replace, got another folder")
-
-
-def _write_mode(files: Mapping[str, Path], posed: PosedSweep, request: VolumeRequest) -> VolumeReport:
-    report = write_voxels(posed, request, files["volume"], files["state"], files.get("deviation"))
-    sweep, poses = slicer_sequence(posed, request.settings.dynamic_range_db)
+def _write_mode(
+    files: Mapping[str, Path], posed: PosedSweep, settings: CompoundingSettings, region: Region | None
+) -> VolumeReport:
+    volume, state, deviation = files["volume"], files["state"], files.get("deviation")
+    report = write_voxels(posed, settings, volume, None, region, state, deviation)
+    sweep, poses = slicer_sequence(posed, settings.dynamic_range_db)
     outlines = frame_outlines(sweep.grid, posed.world_from_image)
     write_polylines(files["outlines"], outlines, posed.frames)
     write_transform(files["first"], posed.world_from_image[0])
@@ -134,3 +132,54 @@ def _write_mode(files: Mapping[str, Path], posed: PosedSweep, request: VolumeReq
         write_sequence(files["images"], sweep, None, True, poses)
         write_transforms(files["poses"], sweep.frame_time_s, poses)
     return report
+
+
+_RAS_FROM_LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
+
+
+@dataclass(frozen=True)
+class _Bytes:
+    """Grey images, 0 to 255, rounded as they are asked for."""
+
+    source: PosedImages
+    dtype = np.dtype(np.uint8)
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        return len(self.source), self.source.grid.vectors, self.source.grid.samples
+
+    def __getitem__(self, index: int) -> ByteArray:
+        image: npt.NDArray[Any] = self.source.read(index)
+        # Outside a fan there is nothing.
+        return np.asarray(np.clip(np.rint(np.nan_to_num(image)), 0, 255), dtype=np.uint8)
+
+
+def slicer_sequence(
+    posed: PosedSweep, dynamic_range_db: float = USUAL_RANGE_DB
+) -> tuple[Sweep, dict[str, FloatArray]]:
+    """Take a posed sweep's images, B-mode as stored and echoes log-compressed, and where their pixels are.
+
+    Parameters
+    ----------
+    posed : PosedSweep
+    dynamic_range_db : float
+        Range of the log-compressed grey levels.
+
+    Returns
+    -------
+    sweep : Sweep
+        Of B-mode, read one at a time.
+    poses : dict of str to ndarray, shape (n, 4, 4)
+        ``ImageToWorld``, for `write_sequence`: from pixels (column, row, 0, 1) to mm. Unlike in other files
+        of this package, axes lead right, anterior and superior, as Slicer takes them: a sequence cannot say
+        where its axes lead.
+    """
+    source, _ = posed.source(None, dynamic_range_db)
+    grid, signal = source.grid, posed.sweep.signal
+    signal = signal if isinstance(signal, BModeSettings) else BModeSettings(dynamic_range_db)
+    times, name = posed.sweep.frame_time_s[posed.frames], posed.sweep.name
+    sweep = Sweep(_Bytes(source), grid, signal, times, name=name, probe=posed.sweep.probe)
+    thick_mm = (grid.vector_pitch_mm + grid.sample_spacing_mm) / 2
+    image_from_pixels = np.insert(grid.image_from_sample, 2, [0.0, 0.0, thick_mm, 0.0], axis=1)
+    lps_from_pixels = posed.world_from_image.as_matrix() @ image_from_pixels
+    return sweep, {"ImageToWorld": np.asarray(_RAS_FROM_LPS @ lps_from_pixels)}

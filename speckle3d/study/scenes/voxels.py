@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from pydantic import BaseModel, ConfigDict
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import FloatArray, IntArray
@@ -32,8 +33,7 @@ _DEVIATION = "standard deviation of position along the sweep, mm"
 Axes = Literal["sweep", "world", "principal"]
 
 
-@dataclass(frozen=True)
-class GridRequest:
+class GridRequest(BaseModel):
     """Requested grid of voxels, whole or in part.
 
     Attributes
@@ -54,6 +54,8 @@ class GridRequest:
     like : path, optional
         A volume whose grid to take instead of all this.
     """
+
+    model_config = ConfigDict(frozen=True)
 
     axes: Axes = "sweep"
     spacing_mm: tuple[float, float, float] | None = None
@@ -84,32 +86,8 @@ class GridRequest:
         if self.within_gb is not None:
             bound = self.within_gb, axes, settings.voxel_type, self.origin_mm, self.size_mm
             spacing = spacing_within(images, world_from_image, *bound)
-        return grid_around(
-            images,
-            world_from_image,
-            spacing,
-            world_from_axes=axes,
-            origin_mm=self.origin_mm,
-            shape=self.shape,
-            size_mm=self.size_mm,
-        )
-
-
-@dataclass(frozen=True)
-class VolumeRequest:
-    """Settings of the compounding, grid and region of a volume.
-
-    Attributes
-    ----------
-    settings : CompoundingSettings
-    grid : GridRequest
-    region : Region, optional
-        Of the images; samples outside it do not count.
-    """
-
-    settings: CompoundingSettings = field(default_factory=CompoundingSettings)
-    grid: GridRequest = GridRequest()
-    region: Region | None = None
+        place = self.model_dump(include={"origin_mm", "shape", "size_mm"})
+        return grid_around(images, world_from_image, spacing, axes, **place)
 
 
 @dataclass(frozen=True)
@@ -159,8 +137,10 @@ class VolumeReport:
 
 def write_voxels(
     posed: PosedSweep,
-    request: VolumeRequest,
+    settings: CompoundingSettings,
     out: Path,
+    grid_request: GridRequest | None = None,
+    region: Region | None = None,
     state_path: Path | None = None,
     deviation_path: Path | None = None,
 ) -> VolumeReport:
@@ -169,9 +149,13 @@ def write_voxels(
     Parameters
     ----------
     posed : PosedSweep
-    request : VolumeRequest
+    settings : CompoundingSettings
     out : path
         With a suffix of `speckle3d.io.voxels.volume_writer.SUFFIXES`.
+    grid_request : GridRequest, optional
+        By default cubic voxels along the sweep that hold it.
+    region : Region, optional
+        Of the images; samples outside it do not count.
     state_path : path, optional
         Where to write which voxels are measured and filled, as labels.
     deviation_path : path, optional
@@ -180,18 +164,18 @@ def write_voxels(
     Raises
     ------
     InvalidInputError
-        If a part of the request is not what it must be.
+        If a part of what is asked for is not what it must be.
     InsufficientDataError
         If no sample of the images lies in the grid, or the rule "weighted" finds no claimed errors.
     FileError
         If a file cannot be written.
     """
-    began, settings = time.perf_counter(), request.settings
+    began = time.perf_counter()
     levels = None if settings.levels == "auto" else settings.levels
     source, meaning = posed.source(levels, settings.dynamic_range_db)
-    part = request.region.part(source.grid) if request.region else source.grid
-    grid = request.grid.grid(part, source.world_from_image, settings)
-    mask = None if request.region is None else request.region.mask(source.grid)
+    part = region.part(source.grid) if region else source.grid
+    grid = (grid_request or GridRequest()).grid(part, source.world_from_image, settings)
+    mask = region.mask(source.grid) if region else None
     weights = confidence(posed, grid) if settings.rule == "weighted" and settings.backward_mm == 0 else None
     fields = fields_of(posed, settings, meaning)
     volume = compound_onto(grid, source, settings, weights, mask)

@@ -13,8 +13,8 @@ from speckle3d.core.sweep import BModeSettings, Sweep
 from speckle3d.io.load import load_sweep
 from speckle3d.io.reconstructions import read_reconstruction
 from speckle3d.io.sweep_writer import write_sweep
-from speckle3d.study.details import recorded_doubts
 from speckle3d.study.job import run_job
+from speckle3d.study.results import recorded_doubts
 
 NO_CONTACT = slice(30, 35)
 

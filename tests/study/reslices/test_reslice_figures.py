@@ -10,8 +10,7 @@ from speckle3d.core.errors import InvalidInputError
 from speckle3d.imaging.cuts.curved import curved_sheet
 from speckle3d.imaging.cuts.planes import plane_cut
 from speckle3d.scoring.lengths import ModeError
-from speckle3d.study.reslices.cut_geometry import read_plane
-from speckle3d.study.reslices.cuts import CutPicture, DrawnCut, length_words
+from speckle3d.study.reslices.cuts import CutPicture, DrawnCut, length_words, read_plane
 from speckle3d.study.reslices.reslice_figures import draw_cuts, save_reslices
 
 WORLD_FROM_PLANE = RigidTransform.from_components(

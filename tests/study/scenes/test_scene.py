@@ -13,7 +13,6 @@ from speckle3d.core.sweep import BModeSettings, Sweep
 from speckle3d.imaging.voxels.settings import CompoundingSettings
 from speckle3d.study.posed import PosedSweep
 from speckle3d.study.scenes.scene import write_scene
-from speckle3d.study.scenes.voxels import VolumeRequest
 
 NAME = 'Größe <&> "1"; a:b\n'
 """Of a sweep: what XML, attributes of a scene and file systems would stumble over."""
@@ -31,14 +30,14 @@ def posed_sweep(mode="image", frames=8):
     return PosedSweep(sweep, np.arange(frames), poses, mode)
 
 
-REQUEST = VolumeRequest(CompoundingSettings(voxel_mm=0.25, splat="nearest"))
+SETTINGS = CompoundingSettings(voxel_mm=0.25, splat="nearest")
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     target = tmp_path_factory.mktemp("scene") / "a scene"
     pose = replace(posed_sweep("pose"), world_from_image=posed_sweep().world_from_image.inv())
-    write_scene(target, [posed_sweep(), pose], REQUEST, with_images=True)
+    write_scene(target, [posed_sweep(), pose], SETTINGS, with_images=True)
     return target
 
 

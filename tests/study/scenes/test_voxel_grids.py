@@ -5,7 +5,7 @@ import pytest
 from speckle3d.core.grid import Region
 from speckle3d.imaging.voxels.settings import CompoundingSettings
 from speckle3d.study.posed import open_posed
-from speckle3d.study.scenes.voxels import GridRequest, VolumeRequest, write_voxels
+from speckle3d.study.scenes.voxels import GridRequest, write_voxels
 
 SPACING, ORIGIN, SHAPE = (0.7, 0.9, 1.1), (1.0 / 3.0, 2.0 / 7.0, -0.1), (19, 41, 7)
 COARSE = CompoundingSettings(voxel_mm=1.0)
@@ -17,17 +17,17 @@ def sweep(data_folder):
 
 
 def write_image(sweep, path, **request):
-    write_voxels(sweep, VolumeRequest(COARSE, **request), path)
+    write_voxels(sweep, COARSE, path, **request)
     return pytest.importorskip("SimpleITK").ReadImage(path)
 
 
 def test_spacing_origin_and_shape_are_in_the_file_to_the_last_bit(sweep, tmp_path):
     name = "v.mha"
-    request = GridRequest("world", SPACING, ORIGIN, SHAPE)
-    image = write_image(sweep, tmp_path / name, grid=request)
+    request = GridRequest(axes="world", spacing_mm=SPACING, origin_mm=ORIGIN, shape=SHAPE)
+    image = write_image(sweep, tmp_path / name, grid_request=request)
     assert (image.GetSpacing(), image.GetOrigin(), image.GetSize()) == (SPACING, ORIGIN, SHAPE)
     assert image.GetDirection() == (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
-    again = write_image(sweep, tmp_path / "like.nrrd", grid=GridRequest(like=tmp_path / name))
+    again = write_image(sweep, tmp_path / "like.nrrd", grid_request=GridRequest(like=tmp_path / name))
     assert (again.GetSpacing(), again.GetOrigin(), again.GetSize()) == (SPACING, ORIGIN, SHAPE)
 
 

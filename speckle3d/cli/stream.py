@@ -1,17 +1,29 @@
-"""Reconstructing a sweep while it is made."""
+"""Sweeps over OpenIGTLink: reconstructing one while it is made, and serving one as a scanner would."""
 
 from __future__ import annotations
+
+import time
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from speckle3d.cli.common import Port, note
+from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.extras import require_extra
+from speckle3d.core.progress import progress_bar
+
+if TYPE_CHECKING:
+    from speckle3d.core.grid import ImageGrid
+    from speckle3d.core.sweep import Frames, Sweep
 
 import re
 import signal
 import sys
-import time
 import webbrowser
 from contextlib import ExitStack
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
-
-import typer
+from typing import TYPE_CHECKING, Any
 
 from speckle3d.cli.commands import Fields
 from speckle3d.cli.common import (
@@ -22,14 +34,10 @@ from speckle3d.cli.common import (
     Out,
     Paths,
     load_settings,
-    note,
+    status_line,
 )
 from speckle3d.cli.reconstruction import reconstruct
 from speckle3d.cli.signals import ENDS, handle_signals
-from speckle3d.core.errors import InvalidInputError
-from speckle3d.core.extras import require_extra
-from speckle3d.core.printable import printable
-from speckle3d.core.progress import progress_bar
 
 if TYPE_CHECKING:
     from types import FrameType
@@ -214,20 +222,15 @@ def _run(session: Session, duration_s: float | None, connection: Connection, nam
     Other signals that ask for the end are heard once all is recorded. How it goes is a line in place on a
     terminal; a log has it when there is something else to say.
     """
-    from rich.console import Console
-    from rich.live import Live
-    from rich.text import Text
-
-    signals, console, last_note = list[int](), Console(stderr=True), ""
+    signals, last_note = list[int](), ""
 
     def show(progress: Progress) -> None:
         nonlocal last_note
         state = connection.state
         trouble = _trouble(state, name)
         text = " | ".join(filter(None, (progress.line, trouble)))
-        # A status of rich's would wrap where the terminal is narrow.
-        line.update(Text(printable(text), no_wrap=True, overflow="ellipsis"))
-        if not console.is_terminal and (words := f"{progress.words}{trouble}") != last_note:
+        show_line(text)
+        if not sys.stderr.isatty() and (words := f"{progress.words}{trouble}") != last_note:
             note(text)
             last_note = words
         if progress.frames and not state.peers and state.silent_s > _LEFT_S:
@@ -238,13 +241,94 @@ def _run(session: Session, duration_s: float | None, connection: Connection, nam
         signals.append(number)
         session.end()
 
-    interval_s = sys.getswitchinterval()
     sys.setswitchinterval(_SWITCH_S)
-    with handle_signals(end, *ENDS), Live(console=console, transient=True) as line:
-        try:
-            session.run(duration_s, show)
-        finally:
-            sys.setswitchinterval(interval_s)
+    with handle_signals(end, *ENDS), status_line() as show_line:
+        session.run(duration_s, show)
     for number in signals:
         if number != signal.SIGINT:
             signal.raise_signal(number)
+
+
+Kind = Literal["rf", "bmode"]
+
+_DEVICES = "Image_Reference", "ProbeToReference", "ProbeToWorld"
+_LAST_S = 5.0
+"""Longest wait for a client to take what is left at the end."""
+
+
+def play(
+    images: Path,
+    port: Port = 18944,
+    address: str = "127.0.0.1",
+    rate: Annotated[float, typer.Option(min=1e-3, max=1e3)] = 1.0,
+    kind: Annotated[Kind | None, typer.Option("--as")] = None,
+) -> None:
+    """Serve a recorded sweep over OpenIGTLink at its own rate, as PLUS serves a scanner.
+
+    It begins when the first client connects. Messages carry the sweep's own times, shifted if some are below
+    zero. RF is sent with the samples of a vector along the columns, as PLUS sends it. Devices are
+    Image_Reference, and ProbeToReference and ProbeToWorld of a tracker's and an orientation sensor's poses.
+
+    Parameters
+    ----------
+    images
+    port
+        0: any free one.
+    kind
+        Echoes (default, of RF or I/Q) or B-mode made of them.
+    rate
+        Speed, times the sweep's own.
+
+    Other Parameters
+    ----------------
+    address
+        0.0.0.0: also for other machines.
+
+    Examples
+    --------
+    $ speckle3d play sweep.h5
+    """
+    require_extra("live", "play", "pyigtl", "fastcrc")
+    from speckle3d.io.igtl.link import Server
+    from speckle3d.io.igtl.played import clock_shift_s, played
+    from speckle3d.io.load import load_sweep
+
+    read = load_sweep(images)
+    frames, grid, upright = _frames(read, kind)
+    send = partial(played, read, frames, grid, upright, _DEVICES)
+    shift_s = clock_shift_s(read)
+    next(send(shift_s))  # refused at once if messages cannot hold it
+    if shift_s:
+        note(f"times in the messages are the sweep's and {shift_s:g} s")
+    with Server(port, address) as server, progress_bar(f"playing {read.name}") as progress:
+        note(f"{address}:{server.port}: {len(read)} frames of {read.name}; waiting for a client")
+        while not server.wait_connected(1.0):
+            server.receive(0.0)
+        count, start_s = 0, time.monotonic()
+        for at_s, message, is_frame in send(shift_s):
+            time.sleep(max(0.0, start_s + at_s / rate - time.monotonic()))
+            server.send(message)
+            server.receive(0.0)
+            count += is_frame
+            progress(count, len(read))
+        server.drain(_LAST_S)
+        losses = server.state.dropped
+        slow = f", {losses} messages dropped: a client is too slow" if losses else ""
+        note(f"{count} frames sent{slow}")
+
+
+def _frames(sweep: Sweep, kind: Kind | None) -> tuple[Frames, ImageGrid, bool]:
+    """What is sent, where it lies, and whether its vectors are columns."""
+    from speckle3d.core.sweep import BModeSettings
+    from speckle3d.study.images import grey_images
+
+    is_grey = isinstance(sweep.signal, BModeSettings)
+    if kind == "rf" and is_grey:
+        raise InvalidInputError(f"--as rf: expected echoes, got {sweep.name}, which holds B-mode")
+    if is_grey or kind == "bmode":
+        keep_levels = is_grey and sweep.frames.dtype == "uint8"
+        images = grey_images(sweep, levels="stored" if keep_levels else "log")
+        return images, images.grid, True
+    if sweep.grid.fan is not None:
+        raise InvalidInputError(f"{sweep.name}: expected parallel vectors to send, got a fan's: --as bmode")
+    return sweep.frames, sweep.grid, False

@@ -1,1 +1,0 @@
-"""Commands of sweeps that are being made, over OpenIGTLink."""
