@@ -318,7 +318,7 @@ def play(
 
 
 def _frames(sweep: Sweep, kind: Kind | None) -> tuple[Frames, ImageGrid, bool]:
-    """What is sent, where it lies, and whether its vectors are columns."""
+    """Frames to send, their grid, and whether their vectors are columns."""
     from speckle3d.core.sweep import BModeSettings
     from speckle3d.study.images import grey_images
 

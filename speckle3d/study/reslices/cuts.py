@@ -197,7 +197,7 @@ class PicturedPlane:
 
 
 def picture_text(cuts: Mapping[str, Cut], marks: Mapping[str, str]) -> str:
-    """Where the planes of a picture lie, by mode; `read_plane` reads it back. Of curved sheets nothing."""
+    """Text of the planes of a picture by mode, read back by `read_plane`; none of curved sheets."""
     planes = [
         {"mode": mode, "kind": "plane", "mark": marks.get(mode, ""), "first_mm": (0.0, 0.0)}
         | {"world_from_plane": cut.world_from_picture.as_matrix().tolist()}
