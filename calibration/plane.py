@@ -25,11 +25,12 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from calibration.motion import OBLONG, require_adequate
 from calibration.points import ANGLES, CHAIN, SOME_FRAMES, ImagePoints, SeenAs, as_directions, columns_of
+from calibration.robust import absolute_weights, robust_linear
 from calibration.settings import PlaneFit
 from calibration.solution import UNKNOWN, Prior, Problem, Solution, are_distinct
 from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
-from speckle3d.core.geometry import nearest_rotation, roll_yaw_tilt
+from speckle3d.core.geometry import nearest_rotation
 
 _NORMALS = 30
 """About 26 degrees apart: refinement converges from further away."""
@@ -43,8 +44,6 @@ _HOPELESS = 3.0
 """Ends whose mean absolute residual is as many times the least are not looked at again."""
 _TINY = 1e-12
 """Of a normal matrix's diagonal, where residuals do not depend on a parameter at all."""
-_SOLUTIONS, _NEARLY = 4, 0.1
-"""Rounds of weighting; share of the median above which residuals count by their absolute value."""
 _HALF_TURN_Z, _HALF_TURN_X = np.diag([-1.0, -1.0, 1.0, 1.0]), np.diag([1.0, -1.0, -1.0, 1.0])
 """Half a turn about the z axis, and about the x axis."""
 
@@ -68,13 +67,6 @@ class Chain:
     probe: FloatArray
     target: FloatArray
 
-    @classmethod
-    def of(
-        cls, pixel_mm: FloatArray, sensor_from_image: RigidTransform, target_from_world: RigidTransform
-    ) -> Chain:
-        """The chain of two transforms."""
-        return cls(pixel_mm, sensor_from_image.as_matrix(), target_from_world.as_matrix())
-
     @cached_property
     def sensor_from_image(self) -> RigidTransform:
         """Sensor from image: R_T_P of TR 303."""
@@ -88,12 +80,6 @@ class Chain:
     def target_from_image(self, points: ImagePoints) -> RigidTransform:
         """Pose of the image of each point in the phantom's frame."""
         return self.target_from_world * points.world_from_sensor * self.sensor_from_image
-
-    def parameters(self) -> FloatArray:
-        """The parameters as published, in the order of `CHAIN`: x-y-z fixed angles, abs(beta) <= pi / 2."""
-        poses = self.sensor_from_image, self.target_from_world
-        parts = [part for pose in poses for part in (pose.translation, roll_yaw_tilt(pose.rotation))]
-        return np.concatenate([self.pixel_mm, *parts])
 
     def displace(self, step: FloatArray) -> Chain:
         """Displace the image in its frame and the world in the phantom's, `step` in the order of `CHAIN`.
@@ -170,14 +156,11 @@ class Equations:
     ----------
     rows, offsets : ndarray, shapes (n, r, 3) and (n, r)
         See `Phantom.vanishing`.
-    weights : ndarray, shape (n, r), optional
-        Factor on each equation.
     """
 
     points: ImagePoints
     rows: FloatArray
     offsets: FloatArray
-    weights: FloatArray | None = None
 
     def __getitem__(self, index: BoolArray) -> Equations:
         return Equations(self.points[index], self.rows[index], self.offsets[index])
@@ -201,10 +184,7 @@ class Equations:
             ],
             axis=2,
         )
-        values = np.einsum("nri,ni->nr", rows, place) - self.offsets
-        if self.weights is None:
-            return values, slopes
-        return values * self.weights, slopes * self.weights[..., None]
+        return np.einsum("nri,ni->nr", rows, place) - self.offsets, slopes
 
     def _places(self, chain: Chain) -> tuple[FloatArray, FloatArray]:
         """Where the points are in the image's frame and in the phantom's, mm, shape (n, 3) each."""
@@ -274,8 +254,9 @@ class Equations:
             size = np.abs(self.residuals(chain))
             if size.mean() > 0.99 * before:
                 break
-            before, weights = size.mean(), np.sqrt(absolute_weights(size))
-            chain = replace(self, weights=weights).least_squares(chain, free, tolerance=_ROUGHLY)
+            before, factor = size.mean(), np.sqrt(absolute_weights(size))
+            weighted = Equations(self.points, factor[..., None] * self.rows, factor * self.offsets)
+            chain = weighted.least_squares(chain, free, tolerance=_ROUGHLY)
         return chain
 
 
@@ -283,42 +264,6 @@ def _cross_zyx(a: FloatArray, b: FloatArray) -> FloatArray:
     """Cross product, its z component first; NumPy's own takes five times as long."""
     first, second = [0, 2, 1], [1, 0, 2]
     return np.asarray(a[..., first] * b[..., second] - a[..., second] * b[..., first])
-
-
-def robust_linear(matrix: FloatArray, target: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Solve linear equations, some of which may be wrong, by iteratively reweighted least squares.
-
-    Parameters
-    ----------
-    matrix : ndarray, shape (n, p) or (n, r, p)
-        A group of r rows gets one weight, from the norm of its residuals.
-    target : ndarray, shape (n,) or (n, r)
-
-    Returns
-    -------
-    parameters : ndarray, shape (p,)
-        The smallest, where the equations leave some open.
-    residuals : ndarray, as `target`
-
-    References
-    ----------
-    .. [1] P. W. Holland and R. E. Welsch, "Robust regression using iteratively reweighted least-squares",
-       Commun. Stat. Theory Methods, 1977.
-    """
-    rows, values = matrix.reshape(-1, matrix.shape[-1]), target.ravel()
-    group = values.size // len(target)
-    root = np.ones(values.size)
-    for _ in range(_SOLUTIONS):
-        parameters = np.linalg.lstsq(rows * root[:, None], values * root)[0]
-        residuals = rows @ parameters - values
-        size = np.linalg.norm(residuals.reshape(-1, group), axis=1)
-        root = np.repeat(np.sqrt(absolute_weights(size)), group)
-    return np.asarray(parameters), np.asarray(residuals).reshape(target.shape)
-
-
-def absolute_weights(sizes: FloatArray, axis: int | None = None) -> FloatArray:
-    """Weights by which most residuals count by their absolute value: Huber's, with a tenth of the median."""
-    return np.asarray(1.0 / np.maximum(sizes, _NEARLY * np.median(sizes, axis, keepdims=True) + _TINY))
 
 
 # 3. The plane in three stages (TR 303, appendix A)
@@ -415,12 +360,10 @@ def angle_starts(
     equations = phantom.equations(directions.of_some_frames(_ANGLE_FRAMES))
     ends = list[tuple[float, Chain]]()
     for number in np.argsort(costs)[:_REFINEMENTS]:
-        pose = Rotation.from_matrix(turns[number]), rotation_to_z(normals[number])
-        start = Chain.of(sizes[number], *map(RigidTransform.from_rotation, pose))
+        start = Chain(sizes[number], np.eye(4), turn_upright(normals[number]))
+        start.probe[:3, :3] = turns[number]
         end = equations.least_absolute(start, (*ANGLES, *phantom.unknowns), _ROUNDS)
-        # The world is turned as little as puts the plane's normal upright.
-        upright = RigidTransform.from_rotation(rotation_to_z(end.target[2, :3]))
-        end = replace(end, target=upright.as_matrix())
+        end = replace(end, target=turn_upright(end.target[2, :3]))
         ends.append((float(np.abs(equations.residuals(end)).mean()), end))
     ends.sort(key=lambda end: end[0])
     starts = list[Chain]()
@@ -431,9 +374,11 @@ def angle_starts(
     return starts[:_MOST_STARTS]
 
 
-def rotation_to_z(normal: FloatArray) -> Rotation:
-    """A rotation that turns a plane's normal into the z axis."""
-    return Rotation.align_vectors([[0.0, 0.0, 1.0]], [normal])[0]
+def turn_upright(normal: FloatArray) -> FloatArray:
+    """Turn the world as little as makes a plane's normal the z axis, shape (4, 4)."""
+    target = np.eye(4)
+    target[:3, :3] = Rotation.align_vectors([[0.0, 0.0, 1.0]], [normal])[0].as_matrix()
+    return target
 
 
 def _with_distances(lines: ImagePoints, angles: Chain, pixel_mm: FloatArray | None) -> Chain:

@@ -145,10 +145,10 @@ def choose_crossings(recording: Recording, detections: Detections, offsets_s: Se
     consensus, candidates = min(trials, key=lambda trial: trial[0].false_alarms)
     near = consensus.require().away_mm <= GATES_MM[-1]
     elsewhere = f"nothing within {GATES_MM[-1]:g} mm of the other frames' crossing"
-    reasons = dict.fromkeys((int(n) for n in candidates.frame[consensus.nearest[~near]]), elsewhere)
+    reasons = dict.fromkeys((int(n) for n in candidates.frame[consensus.choice[~near]]), elsewhere)
     unread = np.setdiff1d(detections.frame, candidates.frame)
     reasons |= dict.fromkeys((int(n) for n in unread), _UNREAD)
-    return replace(candidates[consensus.nearest[near]], dropped={**detections.dropped, **reasons})
+    return replace(candidates[consensus.choice[near]], dropped={**detections.dropped, **reasons})
 
 
 def _snapshots(

@@ -17,7 +17,7 @@ from calibration.points import CHAIN, SCALES
 from calibration.solution import Solution
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.calibration import Calibration, FramesUsed, Parameter
-from speckle3d.core.geometry import skew
+from speckle3d.core.geometry import roll_yaw_tilt, skew
 from speckle3d.core.tables import text_rows
 
 USED_COLOUR, DROPPED_COLOUR = "#0072B2", "#D55E00"
@@ -89,7 +89,9 @@ def _parameters(solution: Solution) -> tuple[Parameter, ...]:
     An angle's error is that about the image's z, y and x axes (roll, yaw, tilt), or about the phantom's:
     near a singularity of fixed angles it is as large as ever.
     """
-    values = dict(zip(CHAIN, solution.chain.parameters(), strict=True))
+    poses = solution.chain.sensor_from_image, solution.chain.target_from_world
+    parts = [part for pose in poses for part in (pose.translation, roll_yaw_tilt(pose.rotation))]
+    values = dict(zip(CHAIN, np.concatenate([solution.chain.pixel_mm, *parts]), strict=True))
     turn = np.eye(len(CHAIN))
     turn[2:5, 2:5] = solution.chain.sensor_from_image.rotation.as_matrix()
     # Angles are in the order z, y, x; the world's origin moves as the phantom turns.

@@ -18,10 +18,11 @@ import numpy as np
 from scipy.linalg import toeplitz
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from calibration.consensus import GATES_MM, find_consensus, nearest_of_frames
+from calibration.consensus import GATES_MM, choose_by_frame, find_consensus
 from calibration.motion import require_adequate
-from calibration.plane import Chain, Phantom, robust_linear
+from calibration.plane import Chain, Phantom
 from calibration.points import POSE, SOME_FRAMES, TARGET, ImagePoints, SeenAs, affine_equations
+from calibration.robust import robust_linear
 from calibration.settings import WireFit
 from calibration.solution import Problem, Solution
 from speckle3d.core.arrays import FloatArray
@@ -98,12 +99,12 @@ def calibrate_cross_wire(
         # Poor motion, too, can leave no consensus; then that is said.
         require_adequate(problem.best(points, [wire_start(points, problem, _AS_IT_IS)[0]]), pixel_mm)
     consensus.require()
-    agreeing = points[consensus.nearest[consensus.inliers]]
+    agreeing = points[consensus.choice[consensus.inliers]]
     first = problem.solve(agreeing, wire_start(agreeing, problem, _AS_IT_IS)[0])
     # The rigid chain, from all that agree, tells candidates better than the sample did.
     away_mm = np.linalg.norm(phantom.equations(points).residuals(first.chain), axis=1)
-    nearest = nearest_of_frames(points.frame, away_mm)
-    inliers, crossings = away_mm[nearest] <= GATES_MM[-1], points[nearest]
+    choice = choose_by_frame(points.frame, away_mm)
+    inliers, crossings = away_mm[choice] <= GATES_MM[-1], points[choice]
     solution = _beside(problem.best(crossings[inliers], [first.chain]), s.beside_mm)
     inliers[inliers] = solution.used
     residuals = phantom.equations(crossings).residuals(solution.chain)

@@ -31,9 +31,6 @@ sweeps that cross by 9."""
 WEAK = 0.2
 """As `LEAST`: below, the verdict says "weak"; along the beam, fans of 28 degrees; across, 11 degrees."""
 
-_AMPLE = 0.3
-"""As `LEAST`: above, advice does not ask for more."""
-
 _FRAMES = 12
 """Images whose beams are compared."""
 
@@ -68,16 +65,15 @@ class Angulation:
             "x": "cross the sweeps: turn the probe by about 90 degrees between them",
             "y": "fan in each: tilt the probe to and fro by 40 degrees within each sweep",
         }
-        return "; ".join(motions[name] for name, share in self.sensitivity.items() if share < _AMPLE)
+        return "; ".join(motions[name] for name, share in self.sensitivity.items() if share < WEAK)
 
     @property
     def verdict(self) -> str:
-        """One line: sufficient, weak or insufficient, with the weakest parameter and what to do."""
+        """One line: sufficient, or weak with the weakest parameter and what to do."""
         name, share = min(self.sensitivity.items(), key=lambda item: item[1])
         if share >= WEAK:
             return "sufficient"
-        kind = "insufficient" if share < LEAST else "weak"
-        return f"{kind}: 1 mm of error in {name} shows by {share:.2f} mm; {self.advice}"
+        return f"weak: 1 mm of error in {name} shows by {share:.2f} mm; {self.advice}"
 
     def require(self, part: float = 1.0) -> None:
         """Refuse sweeps that cannot determine every parameter.
@@ -94,8 +90,8 @@ class Angulation:
         """
         if min(self.sensitivity.values()) < part * LEAST:
             raise InsufficientDataError(
-                f"expected two angulated sweeps that cross, got {self.crossing_deg:.0f} degrees between them "
-                f"and fans of {self.fan_deg[0]:.0f} and {self.fan_deg[1]:.0f} degrees: {self.verdict}"
+                f"expected two sweeps that cross and fan, got {self.crossing_deg:.0f} degrees between them "
+                f"and fans of {self.fan_deg[0]:.0f} and {self.fan_deg[1]:.0f} degrees; {self.advice}"
             )
 
 

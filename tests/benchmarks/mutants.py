@@ -157,7 +157,7 @@ MUTANTS = {
         "io/test_calibrations.py",
     ),
     "wrong lines weigh as much": Mutant(
-        "calibration.plane:absolute_weights", on_return(np.ones_like), "calibration/test_plane.py"
+        "calibration.robust:absolute_weights", on_return(np.ones_like), "calibration/test_plane.py"
     ),
     "worlds taken the other way": Mutant(
         "xsens.logs.worlds:nwu_from", on_return(lambda turn: turn.inv()), "xsens/logs/test_worlds.py"

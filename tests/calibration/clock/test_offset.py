@@ -20,7 +20,7 @@ def estimate(seed, search_s):
     frame_s, sensor_s = floor.time_s, np.arange(-1.0, floor.time_s[-1] + 1.0, 1 / 50.0)
     readings = TimedPoses(sensor_s - OFFSET_S, floor.readings(sensor_s, drifts=False))
     pixels, inside = floor.lines(frame_s, 0.2), frame_s < frame_s[-1] - 2 * search_s
-    truth = Chain.of(floor.pixel_mm, floor.mounting, floor.world_from_floor.inv())
+    truth = Chain(floor.pixel_mm, floor.mounting.as_matrix(), floor.world_from_floor.inv().as_matrix())
     frame_s, pixels = frame_s[inside], pixels[inside]
     points = ImagePoints.of_lines(np.arange(len(frame_s)), pixels, readings.at(frame_s), frame_s)
     return estimate_offset(

@@ -31,7 +31,9 @@ def test_wires_are_told_apart_among_wrong_dots_however_the_image_lies(seed, degr
 
 
 def truth(wires):
-    return Chain.of(PIXEL_MM, wires.sensor_from_image, wires.phantom.world_from_phantom.inv())
+    return Chain(
+        PIXEL_MM, wires.sensor_from_image.as_matrix(), wires.phantom.world_from_phantom.inv().as_matrix()
+    )
 
 
 def test_a_calibration_finds_the_wires_that_show_and_no_others():
