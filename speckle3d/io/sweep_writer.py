@@ -17,7 +17,6 @@ from typing import Any, Literal, Self
 import h5py
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import AnyArray, FloatArray
 from speckle3d.core.errors import FileError, InvalidInputError, Speckle3DError, naming
@@ -203,20 +202,20 @@ def attach_orientation(path: PathLike, sensor: OrientationSensor) -> None:
 
 
 def _write_sensor(file: h5py.File, sensor: OrientationSensor | Tracker) -> None:
-    readings, mounting = sensor.readings, sensor.sensor_from_image
+    readings = sensor.readings
     values: dict[str, Any] = {"time_s": readings.time_s, "time_offset_s": sensor.time_offset_s}
     if isinstance(sensor, Tracker):
         name, values["world_from_sensor"] = "tracker", readings.world_from_sensor
         values["valid"] = np.ones(len(readings), dtype=bool)
         values["image_skew_rad"] = sensor.image_skew_rad or None
+        if (pose := sensor.sensor_from_image) is not None:
+            values["sensor_from_image"] = tuple(pose.as_matrix())
     else:
         name, values["quaternion"] = "orientation", readings.world_from_sensor
         values |= {vector: getattr(sensor, vector) for vector in INERTIAL}
+        if (turn := sensor.sensor_from_image) is not None:
+            values["sensor_from_image_wxyz"] = tuple(turn.as_quat(scalar_first=True))
     put(file, name, values)
-    if isinstance(mounting, RigidTransform):
-        file[name].attrs["sensor_from_image"] = mounting.as_matrix()
-    elif mounting is not None:
-        file[name].attrs["sensor_from_image_wxyz"] = mounting.as_quat(scalar_first=True)
 
 
 _STREAMS: dict[str, dict[str, tuple[int, ...]]] = {

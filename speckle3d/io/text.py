@@ -20,17 +20,13 @@ def text_lines(path: PathLike) -> Iterator[tuple[int, str]]:
     Raises
     ------
     FileError
-        If the file cannot be read.
-    InvalidInputError
-        If its bytes are not UTF-8; a byte order mark, with which editors on Windows begin, is left out.
+        If the file cannot be read, or its bytes are not UTF-8; a byte order mark, with which editors on
+        Windows begin, is left out.
     """
     with reading(path), io.TextIOWrapper(open_regular(path), encoding="utf-8-sig") as stream:
-        try:
-            for number, line in enumerate(stream, start=1):
-                if text := line.strip():
-                    yield number, text
-        except UnicodeDecodeError as error:
-            raise InvalidInputError(f"{path}: expected text in UTF-8, got other bytes") from error
+        for number, line in enumerate(stream, start=1):
+            if text := line.strip():
+                yield number, text
 
 
 def numbers(text: str, count: int | None, where: str) -> tuple[float, ...]:

@@ -10,6 +10,7 @@ from pydantic import BaseModel, ValidationError
 
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.files import open_regular
+from speckle3d.io.hdf5 import reading
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -33,16 +34,10 @@ def read_toml(path: Path) -> str:
     Raises
     ------
     FileError
-        If the file cannot be read.
-    InvalidInputError
-        If it is no UTF-8.
+        If the file cannot be read, or is no UTF-8.
     """
-    with open_regular(path) as stream:
-        content = stream.read()
-    try:
-        return content.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise InvalidInputError(f"{path}: expected UTF-8 text, got other bytes") from error
+    with reading(path), open_regular(path) as stream:
+        return stream.read().decode("utf-8-sig")
 
 
 def parsed(text: str, where: str) -> dict[str, Any]:

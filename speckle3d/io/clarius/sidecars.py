@@ -44,8 +44,7 @@ def yml_fields(text: str, where: str) -> dict[str, Any]:
     try:
         document = yaml.load(_GAIN_LINE.sub("", text), Loader=getattr(yaml, "CBaseLoader", yaml.BaseLoader))
     except (yaml.YAMLError, ValueError, RecursionError) as error:
-        words = " ".join(str(error).split())[:200]
-        raise InvalidInputError(f"{where}: expected YAML, got an error: {words}") from error
+        raise InvalidInputError(f"{where}: expected YAML, got an error: {error!s:.200}") from error
     if not isinstance(document, dict):
         raise InvalidInputError(f"{where}: expected fields, got a {type(document).__name__}")
     return document

@@ -31,6 +31,8 @@ from speckle3d.io.recordings import Facts, Recording, Row, Value, differs
 FORMAT = "DICOM"
 
 _MARK, _MARK_BYTE = b"DICM", 128
+_FIRST_ELEMENT = b"\2\0\0\0UL"
+"""Of files without the preamble that ends in the mark."""
 _TISSUE, _CM, _POLAR = [1.0, 1.0], [3.0, 3.0], [12.0, 3.0]
 """Region Spatial Format and Data Type of 2-D tissue; Physical Units of X and Y, cm, or degrees and cm."""
 _KIND = ("RegionSpatialFormat", "RegionDataType")
@@ -89,7 +91,7 @@ def open_dicom(path: Path, settings: ImportSettings) -> Facts:
     """Read grey images of eight bits; they stay in the file until they are asked for."""
     pydicom = extra_module("pydicom", "dicom", f"{path}: DICOM")
     with _reading(str(path)), open_regular(path) as stream:
-        header = pydicom.dcmread(stream, stop_before_pixels=True, specific_tags=list(_TAGS))
+        header = pydicom.dcmread(stream, stop_before_pixels=True, force=True, specific_tags=list(_TAGS))
         syntax = header.file_meta.TransferSyntaxUID.name
         for _ in header.iterall():  # elements are read from their bytes when first asked for
             pass
@@ -229,4 +231,8 @@ def _numbers(item: Any, *names: str) -> list[float]:
     return numbers
 
 
-READER = Reader(FORMAT, lambda _, start: start[_MARK_BYTE:].startswith(_MARK), open_dicom)
+READER = Reader(
+    FORMAT,
+    lambda _, start: start[_MARK_BYTE:].startswith(_MARK) or start.startswith(_FIRST_ELEMENT),
+    open_dicom,
+)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
@@ -13,9 +14,11 @@ import numpy as np
 from speckle3d.core.arrays import AnyArray, FloatArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.printable import printable
+from speckle3d.io.carrier import demodulation_of
 from speckle3d.io.frames import FileFrames, HDF5Slices
 from speckle3d.io.hdf5 import has_member, locate, read_array
-from speckle3d.io.recordings import Value, step_of
+from speckle3d.io.import_settings import ImportSettings
+from speckle3d.io.recordings import Value, rate_by_spacing, step_of
 
 Turn: TypeAlias = Callable[..., AnyArray]
 """Makes a frame (vector, sample) of slices of data sets."""
@@ -67,6 +70,26 @@ def band_about(values: Mapping[str, Value], share: float | None, place: str) -> 
     if not share or centre is None:
         return {}
     return {"bandwidth_hz": Value((centre.value * (1 - share / 2), centre.value * (1 + share / 2)), place)}
+
+
+def by_phase(
+    frames: FileFrames,
+    carrier_hz: float,
+    stated: Value,
+    values: Mapping[str, Value],
+    settings: ImportSettings,
+) -> Value:
+    """Frequency that I/Q were shifted down by: `carrier_hz` or 0 as their phase tells, else as stated."""
+    if settings.demodulation_frequency_hz is not None:
+        return stated
+    rate_hz = rate_by_spacing(values["row_spacing_mm"], settings, values).value
+    shift_hz = demodulation_of(frames, carrier_hz, rate_hz)
+    if shift_hz in (None, stated.value):
+        return stated
+    if stated.value is not None:
+        words = f"I/Q are shifted by {shift_hz:g} Hz as their phase tells, the file says {stated.value:g}"
+        warnings.warn(f"{frames.path}: {words}: --demodulation-frequency-hz decides", stacklevel=2)
+    return Value(shift_hz, f"{stated.source} and the phase of the data")
 
 
 def fan_values(

@@ -66,8 +66,6 @@ def open_matlab(path: Path, settings: ImportSettings) -> Facts:
     rows = [(name, _size(node), _kind(node)) for name, node in largest]
     yield from ((f"array {name}", size, kind) for name, size, kind in rows)
     arrays, where = settings.arrays, f"{path}: arrays"
-    if unknown := sorted({*arrays} - {*_ROLES, *_POSITIONS, *ImportSettings.model_fields, "axes"}):
-        raise InvalidInputError(f"{where}: expected {', '.join(sorted(_ROLES))}, axes, got {unknown[0]}")
     data = next((data for data in _DATA if {*data} == _ROLES & {*arrays}), None)
     if data is None:
         listing = ", ".join(map(" ".join, rows))
@@ -78,20 +76,12 @@ def open_matlab(path: Path, settings: ImportSettings) -> Facts:
         )
     with naming(where):
         nodes = [_array(variables, arrays[role]) for role in data]
-        if len({node.shape for node in nodes}) > 1:
-            raise InvalidInputError(f"expected arrays of one size, got {' and '.join(map(_size, nodes))}")
         if _kind(nodes[0]).startswith("complex") != (data == ("iq",)):
             raise InvalidInputError(f"{data[0]}: expected complex numbers as iq alone, got {_kind(nodes[0])}")
         lengths, names = _axes(arrays.get("axes", ""), nodes[0])
         shape = lengths["frame"], lengths["vector"], lengths["sample"]
         values, times = _numbers(variables, arrays, shape)
-    frames = _frames(path, nodes, names, shape, data)
-    for role in data:
-        yield "read", f"{role}: {arrays[role]} {_size(nodes[0])}", _kind(nodes[0])
-    yield "axes", arrays["axes"], ""
-    if isinstance(frames, np.ndarray):
-        yield "frames", "held in memory: MATLAB 7.3 files are read one by one", ""
-    return Recording(path, settings, frames, values, time_s=times)
+    return Recording(path, settings, _frames(path, nodes, names, shape, data), values, time_s=times)
 
 
 def _variables(path: Path) -> dict[str, Any]:

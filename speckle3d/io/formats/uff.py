@@ -24,9 +24,9 @@ import h5py
 import numpy as np
 
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.io.carrier import demodulation_of
 from speckle3d.io.formats.hdf5_values import (
     band_about,
+    by_phase,
     fan_values,
     flat,
     frame_of,
@@ -45,7 +45,7 @@ from speckle3d.io.hdf5 import (
 )
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.readers import Reader
-from speckle3d.io.recordings import Facts, Recording, Value, grid_values, rate_by_spacing
+from speckle3d.io.recordings import Facts, Recording, Value, grid_values
 
 FORMAT = "USTB .uff"
 
@@ -97,8 +97,9 @@ def open_uff(file: h5py.File, settings: ImportSettings) -> Facts:
     shape = count, lines, samples
     source = HDF5Slices(path, parts, partial(frame_of, shape=shape[1:]), axis)
     frames = source.frames(shape, np.complex64 if is_complex else np.float32)
-    if is_complex and count and settings.demodulation_frequency_hz is None:
-        _require_phase(frames, values, settings, modulation_hz)
+    if is_complex and count and "centre_frequency_hz" in values:
+        carrier_hz = modulation_hz or values["centre_frequency_hz"].value
+        values["demodulation_frequency_hz"] = by_phase(frames, carrier_hz, modulation, values, settings)
     elif count and not is_complex and (kind := _kind_of(frames)) != "RF":
         is_db = kind == "decibels"
         frames, values["dynamic_range_db"] = grey_frames(source, shape, is_db, settings.dynamic_range_db)
@@ -112,21 +113,6 @@ def _kind_of(frames: FileFrames) -> str:
     if frame.min() < 0 < frame.max():
         return "RF"
     return "decibels" if frame.min() < 0 else "an envelope"
-
-
-def _require_phase(
-    frames: FileFrames, values: dict[str, Value], settings: ImportSettings, modulation_hz: float
-) -> None:
-    """Refuse a modulation frequency that contradicts how the phase of the data turns."""
-    carrier_hz = modulation_hz or values.get("centre_frequency_hz", Value()).value or 0.0
-    rate_hz = rate_by_spacing(values["row_spacing_mm"], settings, values).value
-    shift_hz = demodulation_of(frames, carrier_hz, rate_hz) if carrier_hz else None
-    if shift_hz is not None and shift_hz != modulation_hz:
-        raise InvalidInputError(
-            f"modulation_frequency: expected {shift_hz:g} Hz, as the phase of the data tells (they "
-            f"{'are shifted down by' if shift_hz else 'still carry'} {carrier_hz:g}), got {modulation_hz:g}: "
-            "give --demodulation-frequency-hz, 0 where it is still carried"
-        )
 
 
 def _scan(group: h5py.Group, source: str) -> tuple[int, int, dict[str, Value]]:

@@ -29,9 +29,9 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.sweep import Tracker
-from speckle3d.io.carrier import demodulation_of
 from speckle3d.io.formats.hdf5_values import (
     band_about,
+    by_phase,
     fan_values,
     frame_of,
     grey_frames,
@@ -51,7 +51,7 @@ from speckle3d.io.hdf5 import (
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.pose_paths import timed_poses
 from speckle3d.io.readers import Reader
-from speckle3d.io.recordings import Facts, Recording, Value, grid_values, rate_by_spacing
+from speckle3d.io.recordings import Facts, Recording, Value, grid_values
 
 FORMAT = "zea"
 
@@ -132,10 +132,9 @@ def open_zea(file: h5py.File, settings: ImportSettings) -> Facts:
         is_db, given_db = kind != "envelope_data", settings.dynamic_range_db
         frames, values["dynamic_range_db"] = grey_frames(source, shape, is_db, given_db)
     shift_hz = single(file, f"{scan}/demodulation_frequency")
-    if is_complex and shift_hz and has_places and settings.demodulation_frequency_hz is None:
-        rate_hz = rate_by_spacing(values["row_spacing_mm"], settings, values).value
-        words = "of scan/demodulation_frequency and the phase of the data"
-        values["demodulation_frequency_hz"] = Value(demodulation_of(frames, shift_hz, rate_hz), words)
+    if is_complex and shift_hz and has_places:
+        stated = Value(source="of scan/demodulation_frequency")
+        values["demodulation_frequency_hz"] = by_phase(frames, shift_hz, stated, values, settings)
     try:
         tracker, remarks = _tracker(file, left_mm)
     except (InvalidInputError, FileError) as error:
