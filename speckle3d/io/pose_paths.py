@@ -201,15 +201,14 @@ def _repeats(readings: TimedPoses, sweep: Sweep, frame_time_s: FloatArray) -> li
     matrices = readings.world_from_sensor.as_matrix()
     changes = np.flatnonzero((matrices[1:] != matrices[:-1]).any(axis=(1, 2))) + 1
     runs = np.split(readings.time_s, changes)
-    lengths, longest = [run.size for run in runs], max(runs, key=len)
-    odd = np.count_nonzero(np.array(lengths) > max(_MOST_ALIKE, _MOST_TIMES * float(np.median(lengths))))
+    longest, usual = max(runs, key=len), float(np.median([run.size for run in runs]))
     inside = np.flatnonzero((frame_time_s >= longest[0]) & (frame_time_s <= longest[-1]))
-    if not changes.size or not odd or inside.size < 2:
+    if not changes.size or longest.size <= max(_MOST_ALIKE, _MOST_TIMES * usual) or inside.size < 2:
         return []
     first, last = (sweep.frames[int(i)] for i in inside[[0, -1]])
     if np.array_equal(first, last):
         return []
     return [
-        f"poses: {odd} run(s) of one pose while images change, the longest of {longest.size} poses, "
+        f"poses: one and the same while images change, at most {longest.size} times, "
         f"{np.ptp(longest):.3g} s from {longest[0]:.3f} s: the tracker's output stood still"
     ]
