@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import re
+from codecs import BOM_UTF16_BE, BOM_UTF16_LE
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -20,13 +21,15 @@ def text_lines(path: PathLike) -> Iterator[tuple[int, str]]:
     Raises
     ------
     FileError
-        If the file cannot be read, or its bytes are not UTF-8; a byte order mark, with which editors on
-        Windows begin, is left out.
+        If the file cannot be read, or its bytes are not UTF-8, or UTF-16 behind a byte order mark, as of
+        Windows' PowerShell.
     """
-    with reading(path), io.TextIOWrapper(open_regular(path), encoding="utf-8-sig") as stream:
-        for number, line in enumerate(stream, start=1):
-            if text := line.strip():
-                yield number, text
+    with reading(path), open_regular(path) as stream:
+        encoding = "utf-16" if stream.peek()[:2] in (BOM_UTF16_LE, BOM_UTF16_BE) else "utf-8-sig"
+        with io.TextIOWrapper(stream, encoding) as lines:
+            for number, line in enumerate(lines, start=1):
+                if text := line.strip():
+                    yield number, text
 
 
 def numbers(text: str, count: int | None, where: str) -> tuple[float, ...]:

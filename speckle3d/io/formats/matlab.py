@@ -118,10 +118,8 @@ def _arrays(node: Any, target: str = "", name: str = "") -> Iterator[tuple[str, 
         if 0 not in node.shape:
             yield name, node.T if isinstance(node, np.ndarray) else node
         return
-    elements = 0
-    for label, child in _children(node):
-        elements += label[:1] in ("(", "{")
-        if target.startswith(name + label) if target else elements <= _MOST_ELEMENTS:
+    for k, (label, child) in enumerate(_children(node)):
+        if target.startswith(name + label) if target else k < _MOST_ELEMENTS or label[:1] not in ("(", "{"):
             yield from _arrays(child, target, name + label)
 
 
@@ -129,8 +127,6 @@ def _children(node: Any) -> Iterator[tuple[str, Any]]:
     """Yield the children of a node with what MATLAB adds to its name, nothing for a single struct."""
     if isinstance(node, dict):
         yield from node.items()
-    elif isinstance(node, Iterator):
-        yield from node
     elif isinstance(node, np.void):
         yield from ((f".{name}", node[name]) for name in node.dtype.names or ())
     elif isinstance(node, np.ndarray) and (node.dtype.names or node.dtype == object):
@@ -146,7 +142,7 @@ def _children(node: Any) -> Iterator[tuple[str, Any]]:
         if not lists:
             yield from fields.items()
         for k in range(lists[0].size if lists else 0):
-            yield f"({k + 1})", iter([(name, _element(field, k)) for name, field in fields.items()])
+            yield f"({k + 1})", {name: _element(field, k) for name, field in fields.items()}
 
 
 def _element(node: h5py.Dataset, k: int) -> Any:
