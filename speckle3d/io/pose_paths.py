@@ -209,6 +209,6 @@ def _repeats(readings: TimedPoses, sweep: Sweep, frame_time_s: FloatArray) -> li
     if np.array_equal(first, last):
         return []
     return [
-        f"poses: one and the same while images change, at most {longest.size} times, "
+        f"poses: runs of one pose while images change, the longest of {longest.size} poses, "
         f"{np.ptp(longest):.3g} s from {longest[0]:.3f} s: the tracker's output stood still"
     ]
