@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
+from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.errors import InvalidInputError
 from xsens.logs.clocks import usual_step
 from xsens.logs.samples import VECTORS, ImuLog, finite_rows, median_norm, row_norms, selection
@@ -69,7 +69,7 @@ _SCATTERED = 0.5
 _ENOUGH = 50
 _MOST_SENSORS = 8
 _LOOKED_AT = 1000
-"""Rows on either side of the log's middle that tell whether sensors take turns."""
+"""Rows on either side of the log's middle that tell whether sensors take turns, or readings are noise."""
 
 
 def without_faults(log: ImuLog) -> ImuLog:
@@ -136,19 +136,19 @@ def _bad(name: str, rows: FloatArray, force: FloatArray, rate: FloatArray) -> di
     }
 
 
+def _middle(rows: FloatArray) -> FloatArray:
+    middle = len(rows) // 2
+    return rows[max(middle - _LOOKED_AT, 0) : middle + _LOOKED_AT]
+
+
 def _is_noise(rows: FloatArray) -> bool:
     """Whether readings of a vector of constant length are scattered about zero, each on its own."""
+    rows = _middle(rows)
     if len(rows) < _ENOUGH:
         return False
     step, spread = row_norms(np.diff(rows, axis=0)) ** 2, np.mean(row_norms(rows - rows.mean(axis=0)) ** 2)
     scattered = spread > _SCATTERED * np.mean(row_norms(rows) ** 2)
     return bool(scattered and usual_step(step, 0.0) > 2.0 * _SCATTERED * spread)
-
-
-def _runs(rows: FloatArray) -> tuple[IntArray, IntArray]:
-    """First row and length of each run of equal rows."""
-    start = np.flatnonzero(np.append(True, np.logical_or.reduce([axis[1:] != axis[:-1] for axis in rows.T])))
-    return start, np.diff(np.append(start, len(rows)))
 
 
 def _repeats(name: str, change: float, rows: FloatArray, force: FloatArray, rate: FloatArray) -> BoolArray:
@@ -157,7 +157,8 @@ def _repeats(name: str, change: float, rows: FloatArray, force: FloatArray, rate
     One in ten of a sensor's samples may last longer: its rate is another than that of the log.
     Where readings before and after change by many of their last digits, none is repeated by chance.
     """
-    start, length = _runs(rows)
+    start = np.flatnonzero(np.append(True, np.logical_or.reduce([axis[1:] != axis[:-1] for axis in rows.T])))
+    length = np.diff(np.append(start, len(rows)))
     middle, high = np.percentile(length, [50, 90]) if len(length) > 1 else (1, 1)
     usual = int(min(3.0 * middle, high))
     long, repeats = length > max(2, 2 * usual), np.zeros(len(rows), dtype=bool)
@@ -194,28 +195,28 @@ def stuck_axes(rows: FloatArray, least: float = 0.0) -> BoolArray:
     At the end of its range slopes before and after are steep; a dead axis jumps, or never changes again.
     """
     bad = np.zeros(len(rows), dtype=bool)
-    longest = _STUCK * float(np.median(_runs(rows)[1]))
-    for column in rows.T:
-        axis = column.astype(float)
-        start, length = _runs(axis[:, None])
-        long = (length > 2) & (np.abs(axis[start]) >= least)
-        if not long.any():
-            continue
-        start, length = start[long], length[long]
-        steps, value, end = (
-            np.abs(np.pad(np.diff(axis), 2, constant_values=np.nan)),
-            axis[start],
-            start + length,
-        )
-        steep = np.fmin(steps[start], steps[end + 2]) > 3.0 * _digit(steps)
+    same = rows[1:] == rows[:-1]
+    repeats = same.all(axis=1)
+    alone = same & ~repeats[:, None]
+    longest = _STUCK * len(rows) / (len(rows) - repeats.sum())
+    for k in np.flatnonzero(alone.any(axis=0)).tolist():
+        axis, others = rows[:, k].astype(float), np.append(0, np.cumsum(alone[:, k]))
+        first = np.flatnonzero(np.append(True, ~same[:, k]))
+        value, end = axis[first], np.append(first[1:], len(rows))
+        length = end - first
         at_end = (value == np.fmax.reduce(axis)) | (value == np.fmin.reduce(axis))
+        run = (others[end - 1] - others[first] > 1) & (np.abs(value) >= least) & (at_end | (length > longest))
+        if not run.any():
+            continue
+        first, end, zero = first[run], end[run], value[run] == 0.0
+        steps = np.abs(np.pad(np.diff(axis), 2, constant_values=np.nan))
         usual = usual_step(steps, np.inf)
-        jumps = np.fmax(steps[start + 1], steps[end + 1]) > _NOISY * usual
-        dead = (length > longest) & (jumps | ((end == len(rows)) & (value != 0.0) & (usual < np.inf)))
-        stuck = dead | (at_end & steep & (value != 0.0))
-        for i, k in zip(start[stuck], end[stuck], strict=True):
-            others_go_on = (rows[i + 1 : k] != rows[i : k - 1]).any(axis=1).sum() > 1
-            bad[i:k] |= others_go_on
+        steep = np.fmin(steps[first], steps[end + 2]) > 3.0 * _digit(steps)
+        dead = np.fmax(steps[first + 1], steps[end + 1]) > _NOISY * usual
+        dead |= (end == len(rows)) & ~zero & (usual < np.inf)
+        stuck = (at_end[run] & steep & ~zero) | (dead & (end - first > longest))
+        for i, j in zip(first[stuck], end[stuck], strict=True):
+            bad[i:j] = True
     return bad
 
 
@@ -236,8 +237,7 @@ def _require_one_sensor(readings: dict[str, FloatArray]) -> None:
     for name, rows in readings.items():
         if name == VECTORS[1] or len(rows) < _ENOUGH:  # a gyroscope's noise is as large as its rate
             continue
-        middle = len(rows) // 2
-        rows = rows[max(middle - _LOOKED_AT, 0) : middle + _LOOKED_AT]
+        rows = _middle(rows)
         rows = np.where(row_norms(rows)[:, None] > 0.0, rows, np.nan)
         difference = [median_norm(rows[lag:] - rows[:-lag]) for lag in range(1, _MOST_SENSORS + 1)]
         least = 0.02 * median_norm(rows)
