@@ -199,8 +199,8 @@ def common_readings(
     if common.size < 2:
         raise InsufficientDataError(
             f"expected at least 2 samples of the reference covered by the sensor's, got {common.size}: the "
-            f"reference spans {_span(reference.time_s)}, the sensor with an offset of {sensor_offset_s:g} s "
-            f"{_span(sensor.time_s + sensor_offset_s)}"
+            f"reference spans {span(reference.time_s)}, the sensor with an offset of {sensor_offset_s:g} s "
+            f"{span(sensor.time_s + sensor_offset_s)}"
         )
     sample = common[np.unique(np.linspace(0, common.size - 1, frames).round().astype(int))]
     return sensor.at(times_s[sample]), reference.world_from_sensor[sample]
@@ -265,5 +265,6 @@ def _nearest_turn(turns: FloatArray, reference: FloatArray) -> FloatArray:
     return np.where(nearer[..., None], opposite, turns)
 
 
-def _span(time_s: FloatArray) -> str:
+def span(time_s: FloatArray) -> str:
+    """First and last of some times, in words."""
     return f"{time_s[0]:.3f} to {time_s[-1]:.3f} s"

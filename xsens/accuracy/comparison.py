@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.streams import TimedRotations
+from xsens.accuracy.angles import span
 
 if TYPE_CHECKING:
     from xsens.fusion.orient import Orientation
@@ -77,8 +78,7 @@ def compare_orientations(
     common = second.covers(first.time_s)
     if not common.any():
         raise InsufficientDataError(
-            f"expected streams that overlap, got {first.time_s[0]:.3f} to {first.time_s[-1]:.3f} s "
-            f"and {second.time_s[0]:.3f} to {second.time_s[-1]:.3f} s"
+            f"expected streams that overlap, got {span(first.time_s)} and {span(second.time_s)}"
         )
     apart = first.world_from_sensor[common] * second.at(first.time_s[common]).inv()
     w, x, y, z = apart.as_quat(scalar_first=True).T

@@ -129,14 +129,11 @@ def averaged_bins(
     return bins
 
 
-NORTH = ("turn_rad", "sd_rad", "disturbed", "stray", "iron")
-"""What is told at the end of a bin: the angle about up from level axes to north; its deviation; whether the
-reading was hardly believed; how much the field changes from place to place, a fraction of its norm, per
-component; the weight of the filter that takes iron to be on the sensor, 0 to 1."""
-
-
 UNKNOWN = (0.0, np.pi, False, np.nan, np.nan)
-"""Where no field has told the heading."""
+"""What is told at the end of a bin, here where no field has told the heading: the angle about up from level
+axes to north; its deviation; whether the reading was hardly believed; how much the field changes from place
+to place, a fraction of its norm, per component; the weight of the filter that takes iron to be on the sensor,
+0 to 1."""
 
 
 class HeadingFilter:
@@ -169,7 +166,7 @@ class HeadingFilter:
         self._lately = np.zeros((0, _FILTERS + 1))  # angles of the filters, and slip
 
     def follow(self, rows: Any, to_end: bool = False) -> FloatArray:
-        """`NORTH` after each step by the last whole bin, or else the first; what is left is one `to_end`."""
+        """Values as in `UNKNOWN` after each step by the last whole bin; `to_end` what is left is one."""
         per_bin, before = steps_per_bin(self._settings), len(self._rows)
         rows, north = np.concatenate([self._rows, rows]), self._north
         bin_of_row = (np.arange(before, len(rows)) + 1) // per_bin + len(north) - 1
@@ -258,7 +255,7 @@ def _empty_arrays(*shape: int) -> list[FloatArray]:
 
 
 def _combine(rows: Any, weights: FloatArray, best: IntArray, bins: Any, more_rad2: Any) -> FloatArray:
-    """`NORTH` of each bin: the best filter's angle, and deviation of all from it by their weights."""
+    """Values as in `UNKNOWN` of each bin: the best filter's angle, and deviation of all from it."""
     turn = np.take_along_axis(rows["turn_rad"], best[:, None], axis=1)
     off = _angle(rows["turn_rad"] - turn)
     variance = np.minimum((weights * (rows["variance"] + off**2)).sum(axis=1) + more_rad2, np.pi**2)

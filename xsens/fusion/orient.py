@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -59,10 +59,10 @@ class Orientation:
     disturbed: BoolArray
     resting: BoolArray
     method: Method
-    notes: tuple[str, ...] = ()
-    magnetic: bool = True
-    field_stray: FloatArray = field(default_factory=lambda: np.zeros(0))
-    field_iron: FloatArray = field(default_factory=lambda: np.zeros(0))
+    notes: tuple[str, ...]
+    magnetic: bool
+    field_stray: FloatArray
+    field_iron: FloatArray
 
     def __len__(self) -> int:
         return len(self.rotations)

@@ -66,14 +66,13 @@ def by_vqf(stretch: Samples, claims: Estimate, offline: bool, magnetic: bool) ->
         first = Rotation.from_quat(claims.xyzw[0]) * Rotation.from_quat(xyzw[0]).inv()
         north_rad = 2.0 * float(np.arctan2(*first.as_quat()[2:]))
     xyzw = turn_about_up(north_rad, xyzw)
+    apart = Rotation.from_quat(xyzw) * Rotation.from_quat(claims.xyzw).inv()
     at = np.minimum(np.rint(place).astype(np.int64), len(grid) - 1)
     disturbance = estimate["magDistDetected"][at] if magnetic else np.zeros(len(stretch), dtype=bool)
     return replace(
         claims,
         xyzw=xyzw,
-        standard_deviation_rad=np.minimum(
-            np.hypot(claims.standard_deviation_rad, _apart(xyzw, claims.xyzw)), np.pi
-        ),
+        standard_deviation_rad=np.minimum(np.hypot(claims.standard_deviation_rad, apart.as_rotvec()), np.pi),
         gyro_bias_rad_s=estimate["bias"][at],
         disturbed=disturbance,
         resting=estimate["restDetected"][at],
@@ -84,9 +83,3 @@ def _at(places: FloatArray, grid: FloatArray, values: FloatArray) -> FloatArray:
     """Finite rows interpolated at places, from those at known ones."""
     rows = np.isfinite(values[:, 0])
     return np.column_stack([np.interp(places, grid[rows], column[rows]) for column in values.T])
-
-
-def _apart(first: FloatArray, second: FloatArray) -> FloatArray:
-    """Turn between quaternions, scalar last, about each of the world's axes, rad."""
-    turns = Rotation.from_quat(first) * Rotation.from_quat(second).inv()
-    return np.asarray(2.0 * np.arcsin(turns.as_quat(canonical=True)[:, :3]))

@@ -121,7 +121,7 @@ class Device:
         except DeviceError:
             raise
         except OSError as error:  # pyserial's own errors are OSErrors
-            raise DeviceError(f"{self._port.name}: the port is gone: {_first_line(error)}") from error
+            raise DeviceError(f"{self._port.name}: the port is gone: {error}") from error
 
     def request(self, mid: int, payload: bytes = b"", tries: int = _TRIES) -> Message:
         """Answer to a request; `DeviceError` if there is none after `tries`, or it is an error."""
@@ -186,12 +186,7 @@ def _open_port(port_name: str, baud: int) -> Serial:
         )
         return port
     except (OSError, ValueError) as error:
-        reason = _first_line(error)
-        raise DeviceError(f"{port_name}: cannot be opened as a serial port: {reason}") from error
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0]
+        raise DeviceError(f"{port_name}: cannot be opened as a serial port: {error}") from error
 
 
 def prepare(device: Device, settings: DeviceSettings) -> DeviceInfo:

@@ -19,7 +19,7 @@ import numpy as np
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.parts import whole_file
-from xsens.logs.clocks import SHORTEST_S, TICK_S, Stamps, unwrap, usual_step
+from xsens.logs.clocks import SHORTEST_S, TICK_S, Stamps, usual_step
 from xsens.logs.parts import Hints, Parts, assemble_log
 from xsens.logs.samples import VECTORS, ImuLog, median_norm
 from xsens.logs.texttables import (
@@ -31,6 +31,7 @@ from xsens.logs.texttables import (
     describe_unknown,
     number,
     read_table,
+    unwrap_column,
 )
 from xsens.logs.worlds import Claim, are_rotations, quaternions_of, rotation_vectors
 
@@ -179,7 +180,9 @@ def _stamps(
             notes.append("taken for a DOT's export by its clock: ticks of 1 us, gyroscope in deg/s")
         columns["time"] = columns["ticks"] * _TICKS["DOT" if dot else "MT Manager"]
     if "time" not in columns and "utc_s" in columns:
-        columns["time"] = _utc_s(columns)
+        hour, minute, nano = (columns.get(f"utc_{part}", 0.0) for part in ("hour", "minute", "nano"))
+        seconds = 3600.0 * hour + 60.0 * minute + columns["utc_s"] + 1e-9 * nano
+        columns["time"] = unwrap_column(np.asarray(seconds))
     if np.isnan(period_s) and not columns.keys() & {"time", "counter"}:
         unknown = [name[:40] for name in table.names if column_of(name) is None]
         raise InvalidInputError(
@@ -218,16 +221,6 @@ def _unit_of(times: FloatArray, units: dict[str, float]) -> str | None:
     usual = usual_step(np.diff(times), 0.01)  # of a single time a sensor's
     value, low, high = (times[0], *_EPOCH_S) if usual == 1.0 else (usual, SHORTEST_S, 1.0 / _SLOWEST_HZ)
     return next((unit for unit, scale in units.items() if low <= value * scale <= high), None)
-
-
-def _utc_s(columns: dict[str, FloatArray]) -> FloatArray:
-    """Seconds of columns of UTC, since the first minute, hour or day began."""
-    hour, minute, nano = (columns.get(f"utc_{part}", 0.0) for part in ("hour", "minute", "nano"))
-    times = np.asarray(3600.0 * hour + 60.0 * minute + columns["utc_s"] + 1e-9 * nano)
-    span = 60 if "utc_minute" not in columns else 3600 if "utc_hour" not in columns else 86400
-    finite = np.isfinite(times)
-    times[finite] = unwrap(times[finite], span)
-    return times
 
 
 def _claim(table: TextTable, dot: bool) -> Claim:

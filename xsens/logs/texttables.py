@@ -21,7 +21,7 @@ from scipy.constants import g
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
-from xsens.logs.clocks import COUNTS, LATE, TICKS, unwrap
+from xsens.logs.clocks import COUNTS, LATE, TICKS, unwrap, usual_step
 
 Names = tuple[str, ...]
 Header = list[str]
@@ -102,8 +102,8 @@ _SPELLINGS = (
 
 STAMPS = ("time", "counter", "ticks")
 
-_SPANS = (1 << 8, 1 << 10, 1 << 12, COUNTS, 86400, TICKS)
-"""At which counters and clocks wrap round: words of so many bits, and midnight."""
+_SPANS = (60, 1 << 8, 1 << 10, 3600, 1 << 12, COUNTS, 86400, TICKS)
+"""At which counters and clocks wrap round: words of so many bits, minutes, hours and days."""
 
 _WHOSE = re.compile(
     r"(?:sensor|device|imu|node|unit|segment|body|placement)[ _]?(?:id|name|no|nr|number|tag|serial)?$"
@@ -274,12 +274,12 @@ def _read_rows(lines: Iterable[str], header: Header, names: list[str], separator
     for (key, (_, scale)), column in zip(columns.items(), rows.T, strict=True):
         if not any(names) or np.isfinite(column).any():
             with np.errstate(over="ignore"):  # damage, which is left out as no measurement
-                quantities[key] = (_unwrap_column(column) if key in STAMPS else column) * (scale or 1.0)
+                quantities[key] = (unwrap_column(column) if key in STAMPS else column) * (scale or 1.0)
     with_unit = frozenset(key for key, (_, scale) in columns.items() if scale is not None)
     return TextTable(header, tuple(filter(None, names)), quantities, with_unit, tuple(notes))
 
 
-def _unwrap_column(column: FloatArray) -> FloatArray:
+def unwrap_column(column: FloatArray) -> FloatArray:
     """A counter or clock unwrapped where it wraps round as `_SPANS` have it; any other as it is."""
     finite = np.isfinite(column)
     steps = np.diff(column[finite])
@@ -288,6 +288,6 @@ def _unwrap_column(column: FloatArray) -> FloatArray:
         if falls.any() and column[finite].max() < span:
             rising = column.copy()
             rising[finite] = unwrap(column[finite], span)
-            if np.diff(rising[finite])[falls].max() <= LATE * np.median(steps[steps > 0.0]):
+            if np.diff(rising[finite])[falls].max() <= LATE * usual_step(steps):
                 return rising
     return column
