@@ -117,8 +117,9 @@ def with_every(step, rows, value):
         (VECTORS[1], lambda rows: np.clip(rows, -1.2, 1.2)),
         (VECTORS[1], lambda rows: with_every(97, rows, [25.0, -25.0, 25.0])),
         (VECTORS[2], lambda rows: with_every(97, rows, [9.0, 0.0, 0.0])),
+        (VECTORS[0], lambda rows: rows * np.where(np.arange(len(rows))[:, None] < 600, 1.0, [1.0, 1.0, 0.0])),
     ],
-    ids=["saturated", "spikes", "a field's spikes"],
+    ids=["saturated", "spikes", "a field's spikes", "half dead"],
 )
 @pytest.mark.parametrize("method", ["smoother", "filter"])
 def test_saturation_and_values_no_hand_makes_are_missing(name, spoil, method):
@@ -180,6 +181,8 @@ def test_a_magnetometer_on_other_axes_is_left_out():
     assert not orientation.magnetic
     assert "magnetometer" in orientation.notes[0]
     assert orient(with_rows(log, [VECTORS[2]], lambda rows: rows + 0.6)).magnetic  # iron on the sensor
+    noise = np.random.default_rng(1).standard_normal((2000, 3))
+    assert not orient(replace(log, magnetometer_au=noise)).magnetic
 
 
 NAMES = "time_s," + ",".join(f"{kind}_{axis}" for kind in ("acc", "gyr", "mag") for axis in "xyz")
