@@ -24,10 +24,6 @@ MOST_BYTES = 1 << 27
 of messages, whose numbers are shorter than a double."""
 
 _HEAD_BYTES = 1 << 16
-_DAMAGE_SHARE = 0.01
-_TEXT_CONTROLS = np.array([code < 32 and chr(code) not in "\t\n\r\f" for code in range(256)])
-"""Bytes that text does not hold unless it is damaged."""
-
 _WIDE = (b"\xff\xfe", b"\xfe\xff")
 """First bytes of text whose characters take two bytes."""
 
@@ -82,10 +78,9 @@ def read_log(path: PathLike, hints: Hints | None = None) -> ImuLog:
 
 
 def _is_text(first: bytes) -> bool:
-    """Whether hardly any byte is a control character and the bytes hold no message of the sensor."""
-    head = np.frombuffer(first, dtype=np.uint8)
-    readable = first.startswith(_WIDE) or _TEXT_CONTROLS[head].mean() <= _DAMAGE_SHARE
-    return bool(readable) and not len(find_frames(head))
+    """Whether the bytes hold no message of the sensor and hardly any zero."""
+    readable = first.startswith(_WIDE) or 100 * first.count(0) <= len(first)
+    return readable and not len(find_frames(first))
 
 
 # -- the sensor's own bytes
