@@ -140,7 +140,7 @@ def pair_errors(
     MismatchError
         If there is not one reading per reference.
     InsufficientDataError
-        If there are fewer than two frames or no calibration.
+        If there are fewer than two frames.
 
     Examples
     --------
@@ -155,8 +155,6 @@ def pair_errors(
     0.5
     """
     matrices = sensor_from_image.as_matrix().reshape(-1, 3, 3)
-    if not len(matrices):
-        raise InsufficientDataError("sensor_from_image: expected at least one calibration, got none")
     turns, reference = _turns(world_from_sensor, reference_from_image)
     # (S C)^-1 (T C) = C^-1 (S^-1 T) C turns by the rotation vector of S^-1 T in the image's axes, so that
     # each pair's rotation vector is computed once for all calibrations.

@@ -21,14 +21,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from speckle3d.core.arrays import FloatArray
-from speckle3d.core.errors import FileError, InsufficientDataError, InvalidInputError
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.files import PathLike, open_regular
 from speckle3d.core.streams import TimedRotations
 
 _COLUMNS = ("tilt", "yaw", "roll", "time", "until")
-
-_LARGEST_BYTES = 16 * 2**20
-"""Enough for a quarter of a million orientations, more than a mechanism is set to by hand or motor."""
 
 _AXIS = {"roll": "Z", "yaw": "Y", "tilt": "X"}
 
@@ -69,7 +66,7 @@ def read_mechanism_csv(path: PathLike, turns: str = "roll, yaw, tilt") -> Mechan
     Raises
     ------
     FileError
-        If the file cannot be read, is no file, or is larger than 16 MB.
+        If the file cannot be read, or is no file.
     InvalidInputError
         With file and line, if the text is not as described.
     """
@@ -77,9 +74,7 @@ def read_mechanism_csv(path: PathLike, turns: str = "roll, yaw, tilt") -> Mechan
     if sorted(sequence) != sorted(_AXIS):
         raise InvalidInputError(f"turns: expected roll, yaw and tilt in some order, got {turns!r}")
     with open_regular(path) as file:
-        text = file.read(_LARGEST_BYTES + 1)
-    if len(text) > _LARGEST_BYTES:
-        raise FileError(f"{path}: expected at most {_LARGEST_BYTES} bytes, got more")
+        text = file.read()
     table = _table(text.decode("utf-8-sig", errors="replace"), str(path))
     angles = [table.get(name, np.zeros(len(table["tilt"]))) for name in sequence]
     order = "".join(_AXIS[name] for name in sequence)

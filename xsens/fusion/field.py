@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import StrEnum
 from typing import TYPE_CHECKING
 
@@ -144,8 +144,8 @@ def field_of(log: ImuLog, orientation: Orientation) -> FieldFound:
 def field_now(state: OnlineState, disbelieved: float) -> FieldFound:
     """What a filter finds of the field while samples arrive, with the share it disbelieved lately."""
     sd_rad = float(state.standard_deviation_rad[2])
-    field = FieldFound(sd_rad, disbelieved, state.field_stray, state.field_iron)
-    return field if state.started else replace(field, stray=math.nan)
+    stray = state.field_stray if state.started else math.nan
+    return FieldFound(sd_rad, disbelieved, stray, state.field_iron)
 
 
 def dip_rad(field_in_world: FloatArray) -> FloatArray:

@@ -127,15 +127,11 @@ class ImuLog:
             raise InvalidInputError(f"{self.source or 'log'}: expected at least one sample, got none")
         if self.oriented.size == 0:
             object.__setattr__(self, "oriented", np.full(len(self), self.world_from_sensor is not None))
-        shapes = dict.fromkeys(VECTORS, (len(self), 3)) | dict.fromkeys(("oriented", "counter"), (len(self),))
-        for name, shape in shapes.items():
-            values = getattr(self, name)
-            if values is not None and np.shape(values) != shape:
-                raise MismatchError(f"{name}: expected shape {shape}, got {np.shape(values)}")
-        if self.world_from_sensor is not None and len(self.world_from_sensor) != len(self):
-            raise MismatchError(
-                f"world_from_sensor: expected {len(self)} samples, got {len(self.world_from_sensor)}"
-            )
+        tails = dict.fromkeys(VECTORS, (3,)) | dict.fromkeys(("oriented", "counter", "world_from_sensor"), ())
+        for name, tail in tails.items():
+            values, expected = getattr(self, name), (len(self), *tail)
+            if values is not None and (shape := (len(values), *np.shape(values)[1:])) != expected:
+                raise MismatchError(f"{name}: expected shape {expected}, got {shape}")
 
     def __len__(self) -> int:
         return int(self.time_s.size)

@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 
 from speckle3d.core.arrays import ByteArray, IntArray
-from speckle3d.core.errors import InvalidInputError
 
 PREAMBLE = 0xFA
 
@@ -44,13 +43,6 @@ class Message:
     mid: int
     payload: bytes = b""
     bid: int = 0xFF
-
-    def __post_init__(self) -> None:
-        if not (0 <= self.mid <= 255 and 0 <= self.bid <= 255 and len(self.payload) <= MOST_PAYLOAD):
-            raise InvalidInputError(
-                f"message: expected ids of one byte and at most {MOST_PAYLOAD} bytes of payload, got ids "
-                f"{self.mid} and {self.bid} and {len(self.payload)} bytes"
-            )
 
 
 def encode(message: Message) -> bytes:
