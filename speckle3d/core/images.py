@@ -46,7 +46,9 @@ class ImageFrames:
     def __len__(self) -> int:
         return self.shape[0]
 
-    def __getitem__(self, index: int) -> npt.NDArray[Any]:
+    def __getitem__(self, index: int | slice) -> npt.NDArray[Any]:
+        if isinstance(index, slice):
+            return np.stack([self[i] for i in range(*index.indices(len(self)))])
         image = np.asarray(self._images[range(len(self))[index]])
         if image.shape[:2] != self.shape[:0:-1]:
             raise InvalidInputError(

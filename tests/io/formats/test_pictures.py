@@ -58,6 +58,7 @@ def test_a_folder_of_pictures_is_read_in_the_order_of_its_numbers(tmp_path, suff
     np.testing.assert_allclose(
         frames_of(load_sweep(tmp_path, settings)).astype(int), flat.transpose(0, 2, 1), atol=2
     )
+    assert load_sweep(tmp_path, settings).frames[2:4].shape == (2, 7, 9)
     Image.fromarray(flat[0, :, :4]).save(tmp_path / f"frame12{suffix}")
     with pytest.raises(InvalidInputError, match="frame 12: expected shape"):
         frames_of(load_sweep(tmp_path, settings))
