@@ -88,16 +88,15 @@ def _tabs(pages: Sequence[Page]) -> Viewable:
     parts = [_view(pages[0]), *(_message(opening) for _ in pages[1:])]
     views = [pn.Column(part, sizing_mode="stretch_both", margin=0) for part in parts]
     tabs = pn.Tabs(*zip((page.title for page in pages), views, strict=True), sizing_mode="stretch_both")
-    closed = {*range(1, len(pages))}
+    closed = dict(enumerate(pages[1:], 1))
 
-    def make(number: int) -> None:
-        views[number].objects = [_view(pages[number])]
+    def make(number: int, page: Page) -> None:
+        views[number].objects = [_view(page)]
 
     def fill(event: Any) -> None:
-        if event.new in closed:
-            closed.remove(event.new)
+        if (page := closed.pop(event.new, None)) is not None:
             # When what is there instead has been shown.
-            pn.state.execute(partial(make, event.new), schedule=True)
+            pn.state.execute(partial(make, event.new, page), schedule=True)
 
     tabs.param.watch(fill, "active")
     return tabs

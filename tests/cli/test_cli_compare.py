@@ -22,3 +22,5 @@ def test_compare_writes_a_study_and_skips_it_the_second_time(run, bench, broken_
     _, out, err = run(*compare, "--json")
     assert json.loads(out)["modes"] == ["image", "pose", "tracker"]
     assert "1 of 2 sweeps" in err
+    code, out, _ = run("compare", broken_file, "-o", tmp_path / "none", "--json")
+    assert (code, json.loads(out)["sweeps"][0]["status"]) == (2, "failed")

@@ -13,7 +13,7 @@ from speckle3d.io.calibrations import write_calibration
 from speckle3d.io.load import recording_sha256
 from speckle3d.io.sweep_writer import write_sweep
 from speckle3d.study.images import sweep_of
-from speckle3d.study.posed import open_posed
+from speckle3d.study.posed import at_modes, open_posed
 
 PIXELS = np.diag([0.1, 0.2, 0.15, 1.0])
 LEANING = PIXELS.copy()
@@ -49,7 +49,12 @@ def test_notes_count_the_frames_without_a_valid_pose(tmp_path):
     assert len(source) == 2
     np.testing.assert_array_equal(source.images[0], grey(4)[1].T)
     assert sweep.notes()[-1] == "a: 2 of 4 frames have no valid pose and are left out"
-    assert "no valid pose" not in "".join(open_posed(sequence(tmp_path)).notes())
+    whole = open_posed(sequence(tmp_path))
+    assert "no valid pose" not in "".join(whole.notes())
+    assert "dynamic range" not in "".join(whole.notes())
+    # Cuts show no gaps between frames.
+    away_mm = np.linalg.norm(np.diff(whole.world_from_image.translation, axis=0), axis=1)
+    assert at_modes(whole).reach_mm > 1.9 * away_mm.max()
 
 
 def test_a_reconstruction_is_opened_with_the_calibrations_it_was_made_with(tmp_path):

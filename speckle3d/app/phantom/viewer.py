@@ -104,7 +104,7 @@ class PhantomViewer:
         right = pn.Column(
             *parts,
             pn.Row(self.widgets["region"], self.widgets["leave_out"]),
-            *([self.widgets["reflector"]] if "reflector" in self.widgets else []),
+            *filter(None, [self.widgets.get("reflector")]),
             self._button,
             self._stale,
             self._verdict,

@@ -123,7 +123,6 @@ class LogReadings:
             at = min(int(np.searchsorted(times_s, time_s + self._start_s)), last)
             *inclination, heading = NORMAL_95 * np.degrees(orientation.standard_deviation_rad[at])
             rows.append(("known to (95 %)", f"inclination {max(inclination):.1f}°, heading {heading:.1f}°"))
-            rows.append(("state", "at rest" if orientation.resting[at] else "moving"))
             north = north if orientation.magnetic else "where it was at the start, y to its left"
             notes = (*notes, *orientation.notes)
         if log.gaps:
