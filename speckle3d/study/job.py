@@ -210,6 +210,7 @@ def run_job(
             details,
             doubts,
             left_out,
+            claims,
             _drift_rows(estimates, reference_poses, sweep, source),
         )
         motion = sweep_curves(estimates, centre, reference_poses, tracked.covariance)

@@ -70,6 +70,8 @@ class Summary:
         About the recording.
     left_out : mapping of str to str
         Modes that were asked for and refused, and why.
+    claims : mapping of str to float
+        Relative standard deviation of the length that a mode claims, where it claims one.
     details : dict
         Anything else worth keeping, by name: dataclasses, numbers, strings, arrays.
     """
@@ -82,6 +84,7 @@ class Summary:
     details: dict[str, Any] = field(default_factory=dict)
     doubts: Sequence[Doubt] = ()
     left_out: Mapping[str, str] = field(default_factory=dict)
+    claims: Mapping[str, float] = field(default_factory=dict)
     drift: Sequence[Mapping[str, Any]] = ()
 
     @property
@@ -294,8 +297,7 @@ def read_summary(folder: Path, name: str) -> Summary:
     ]
     rows = [ModeError(**row) for row in values]
     doubts = [Doubt(**doubt) for doubt in record["doubts"]]
-    for key in ("doubted", "claims"):  # of older versions
-        record.pop(key, None)
+    record.pop("doubted", None)  # of older versions
     return Summary(**record | {"sweep": name, "rows": rows, "doubts": doubts})
 
 

@@ -37,7 +37,7 @@ def test_what_is_in_doubt_and_left_out_stands_below_the_table_and_is_read_back(t
     left_out = {"pose": "s: drift mode pose: tracker: ..."}
     doubts, details = [METRES, SPIKES], {"provenance": Provenance("s.h5", "ab12", "1.0"), "seconds": 2.0}
     rows = [row(sigma_mm=1.0)]
-    of = Summary("s", "truth", 9, 1.0, rows, details, doubts, left_out)
+    of = Summary("s", "truth", 9, 1.0, rows, details, doubts, left_out, {"image": 0.1})
     write_summary(tmp_path, of)
     provenance = Provenance("s.h5", "ab12", "1.0")
     assert recorded_doubts(tmp_path / "reconstruction.h5", provenance) == (METRES, SPIKES)
