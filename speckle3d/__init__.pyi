@@ -5,10 +5,10 @@ from .core.calibration import Calibration as Calibration
 from .core.calibration import calibrated as calibrated
 from .core.curves import DecorrelationCurves as DecorrelationCurves
 from .core.errors import Speckle3DError as Speckle3DError
-from .core.labels import LabelMap as LabelMap
 from .core.progress import progress_bar as progress_bar
 from .core.reconstruction import Reconstruction as Reconstruction
 from .core.sweep import Sweep as Sweep
+from .core.volume import LabelMap as LabelMap
 from .corrections import correct as correct
 from .crossing_sweeps import cross_sweeps as cross_sweeps
 from .imaging.measures.surface import surface_of as surface_of

@@ -10,12 +10,12 @@ from speckle3d.core.sweep import Sweep
 from speckle3d.correction.crossing.pair import CrossedPair
 from speckle3d.correction.drift import DriftCorrection
 from speckle3d.correction.modes import CUBIC_MODES, correct_mode, require_modes, sensor_of
-from speckle3d.correction.scale import FusedPoses, ScaledPoses
+from speckle3d.correction.scale import ScaledPoses
 from speckle3d.examine.sensors import credible_sensors, repair_readings, require_credible
 from speckle3d.tracked import Tracked
 from speckle3d.tracking import require_kind
 
-Correction = DriftCorrection | ScaledPoses | FusedPoses
+Correction = DriftCorrection | ScaledPoses
 
 
 def correct(
@@ -41,7 +41,7 @@ def correct(
 
     Returns
     -------
-    dict of str to DriftCorrection, ScaledPoses or FusedPoses
+    dict of str to DriftCorrection or ScaledPoses
         By mode; ``poses`` are ``world_from_image``, in the sensor's world if there is one.
 
     Raises
@@ -92,20 +92,18 @@ def correct(
     return corrections
 
 
-def _fuse(tracked: Tracked, sweep: Sweep, config: Config, pair: CrossedPair | None) -> FusedPoses:
+def _fuse(tracked: Tracked, sweep: Sweep, config: Config, pair: CrossedPair | None) -> ScaledPoses:
     """Fuse with the sensors that do not contradict themselves."""
     from speckle3d.correction.fused import fuse
 
     sweep = credible_sensors(sweep, tracked.doubts)
-    evidence = () if pair is None else pair.of(sweep.frame_time_s, sweep.name).evidence
+    evidence = None if pair is None else pair.of(sweep.frame_time_s, sweep.name).evidence
     with naming(f"{sweep.name}: drift mode fused"):
         return fuse(
             tracked.edges,
             tracked.image,
             float(tracked.coherence.share.mean()),
-            tracked.scale_sigma,
-            tracked.shared.curves_sigma,
-            tracked.shared.turn_sigma_per_mm,
+            tracked.shared,
             sweep.grid.centre_mm,
             sweep.frame_time_s,
             sweep.orientation,

@@ -95,7 +95,7 @@ def cross_with(
         crossing_side(second, second_tracking, second_stack, config),
         config.crossing,
     )
-    lengths = [Length(side.log_scale, side.log_scale_sigma) for side in (pair.first, pair.second)]
+    lengths = [Length(side.log_scale, side.length_sigma) for side in (pair.first, pair.second)]
     return pair, corrected_curves(curves, [tracking.curves, second_tracking.curves], lengths)
 
 

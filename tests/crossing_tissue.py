@@ -17,7 +17,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from speckle3d.core.grid import ImageGrid
 from speckle3d.correction.crossing.stack import ImageStack
 from speckle3d.correction.crossing.sweep import CrossingSweep
-from speckle3d.simulation.movement import HandMotion, hand_sweep, turned_about
+from speckle3d.simulation.movement import hand_sweep
+from speckle3d.simulation.settings import SimulationSettings
 
 CELL_MM = 0.25
 """Side of a cell with one scatterer."""
@@ -153,14 +154,13 @@ def _hand(case, rng, number, angle_deg):
     """True poses of the frames: the second sweep starts turned about the middle, off it by a few mm."""
     duration = case.frames / FRAME_RATE_HZ
     middle = np.array([GRID.width_mm / 2, 0.0, case.length_mm / 2])
-    start = turned_about(np.array([0.0, 0.0, 0.0]), np.deg2rad(angle_deg * number + rng.normal(0, 3.0)))
+    turn = Rotation.from_euler("y", angle_deg * number + rng.normal(0, 3.0), degrees=True)
     off = rng.normal(0.0, [1.5, 0.3, 1.5]) * number
     lean = Rotation.from_rotvec(np.deg2rad(rng.normal(0.0, [3.0, 0.0, 3.0])) * number)
-    start = RigidTransform.from_components(off, lean) * start * RigidTransform.from_translation(-middle)
-    path = hand_sweep(
-        case.length_mm, duration, GRID.width_mm, HandMotion(), start, RigidTransform.identity(), rng
-    )
-    return path.medium_from_image(np.arange(case.frames) / FRAME_RATE_HZ)
+    start = RigidTransform.from_components(off, lean * turn) * RigidTransform.from_translation(-middle)
+    settings = SimulationSettings(length_mm=case.length_mm)
+    path = hand_sweep(settings, duration, GRID.width_mm, RigidTransform.identity(), rng)
+    return start * path.medium_from_image(np.arange(case.frames) / FRAME_RATE_HZ)
 
 
 def _drifting_poses(truth, stretch, rng):

@@ -1,15 +1,28 @@
-"""Files given by name: opened only if they are files, so that nothing waits for a pipe or reads a device."""
+"""Files given by name: opened only if they are files, so that nothing waits for a pipe, and written whole.
+
+Those that killed processes leave half written have names of their own, and are removed.
+"""
 
 from __future__ import annotations
 
+import errno
+import glob
+import importlib
 import os
+import secrets
 import stat
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from io import BufferedReader
-from typing import TypeAlias
+from pathlib import Path
+from typing import Any, TypeAlias
 
-from speckle3d.core.errors import FileError
+from speckle3d.core.errors import FileError, NoSpaceError
 
 PathLike: TypeAlias = str | os.PathLike[str]
+
+_NO_SPACE = {errno.ENOSPC, errno.EFBIG, getattr(errno, "EDQUOT", errno.ENOSPC)}
+"""A full disk, a limit on the size of a file, and one on what a user may store."""
 
 
 def open_regular(path: PathLike) -> BufferedReader:
@@ -29,3 +42,53 @@ def open_regular(path: PathLike) -> BufferedReader:
         raise
     except (OSError, ValueError) as error:
         raise FileError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
+
+
+def cannot_write(path: PathLike, error: OSError, words: str = "cannot be written") -> FileError:
+    """Error of one line for a file that the system refuses to write."""
+    kind = NoSpaceError if error.errno in _NO_SPACE else FileError
+    reason = (error.strerror or str(error).strip() or type(error).__name__).splitlines()[0]
+    return kind(f"{path}: {words}: {reason}")
+
+
+@contextmanager
+def whole_file(target: Path) -> Iterator[Path]:
+    """Yield a temporary sibling, with the target's suffix, that takes its place if the block succeeds.
+
+    A lock of the operating system marks it, which ends with the process, however it ends; siblings without,
+    which killed processes left, are removed.
+
+    Raises
+    ------
+    FileError
+        If the system refuses to write.
+    """
+    fcntl = locks()
+    left = target.parent.glob(f".part-{'[0-9a-f]' * 8}-{glob.escape(target.name)}")
+    for path in left if fcntl is not None else ():
+        with suppress(OSError), path.open("rb") as file:  # gone by now, of another user, or at work
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            path.unlink()
+    part = target.with_name(f".part-{secrets.token_hex(4)}-{target.name}")
+    try:
+        with part.open("xb") as file:
+            if fcntl is not None:
+                with suppress(OSError):  # a file system without locks
+                    fcntl.flock(file, fcntl.LOCK_EX)
+            yield part
+            os.replace(part, target)
+    except FileError:
+        raise
+    except OSError as error:
+        raise cannot_write(target, error) from error
+    finally:
+        with suppress(OSError):  # none was made, or the folder has gone
+            part.unlink()
+
+
+def locks() -> Any:
+    """Module of POSIX locks; None on Windows, which has none."""
+    try:
+        return importlib.import_module("fcntl")
+    except ImportError:
+        return None

@@ -9,7 +9,6 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import FloatArray, IntArray
-from speckle3d.core.errors import MismatchError
 from speckle3d.core.shown import shown
 
 
@@ -63,12 +62,6 @@ class PoseErrors:
     factors: FloatArray
     world_from_image: RigidTransform
     centre_mm: FloatArray
-
-    def __post_init__(self) -> None:
-        if self.factors.shape[1:] != (len(self.world_from_image), 6):
-            raise MismatchError(
-                f"expected six errors of {len(self.world_from_image)} poses, got shape {self.factors.shape}"
-            )
 
     def covariance(self) -> FloatArray:
         """Covariance of each frame's pose, shape (n, 6, 6)."""

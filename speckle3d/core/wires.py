@@ -78,12 +78,12 @@ class WirePhantom:
     def crossings_mm(self) -> FloatArray:
         """Where the middle wire of each N meets the first and the last wire, shape (n_shapes, 2, 3)."""
         n = np.array(self.n_shapes, dtype=int).reshape(-1, 3)
-        point, along = self.points_mm[n[:, 1], None], self.directions[n[:, 1], None]
-        rows, offsets = self.equations(n[:, ::2])
-        # Nearest to the outer wire: its distance is linear along the middle one.
-        distance, slope = ((rows @ axis[..., None])[..., 0] for axis in (point, along))
-        step = ((offsets - distance) * slope).sum(axis=-1) / (slope**2).sum(axis=-1)
-        return np.asarray(point + step[..., None] * along)
+        point, along = self.points_mm[n], self.directions[n]
+        across = np.cross(along[:, 1:2], along[:, ::2])
+        # The place of the middle wire that is nearest to the outer one.
+        aside = np.cross(point[:, ::2] - point[:, 1:2], along[:, ::2])
+        step = (aside * across).sum(axis=-1, keepdims=True) / (across**2).sum(axis=-1, keepdims=True)
+        return np.asarray(point[:, 1:2] + step * along[:, 1:2])
 
     @cached_property
     def _normals(self) -> FloatArray:

@@ -32,18 +32,13 @@ def length_sigma(poses: RigidTransform, covariance: FloatArray, centre_mm: Float
     return float(np.sqrt(covariance[farthest, 2, 2]) / max(abs(float(z_mm[farthest])), LEAST_LENGTH_MM))
 
 
-def correlated_readings(error: FloatArray, shapes: int = 0) -> float:
-    """Autocorrelation time of residuals, in readings.
+def correlated_readings(error: FloatArray) -> float:
+    """Autocorrelation time of the residuals of a cubic, shape (m,), in readings.
 
-    Parameters
-    ----------
-    error : ndarray, shape (m, k)
-        Residuals of a fit.
-    shapes : int
-        Slow shapes that the fit has taken out of each column. They make every autocovariance smaller by
-        `shapes` / m of the sum of all, which is put back.
+    The cubic's coefficients make every autocovariance smaller by their number / m of the sum of all, which is
+    put back.
     """
-    error = error - error.mean(axis=0)
+    error = error - error.mean()
     energy = total = float((error**2).sum())
     lags = 1
     while lags < len(error) // 4:
@@ -51,7 +46,7 @@ def correlated_readings(error: FloatArray, shapes: int = 0) -> float:
         if product <= 0.0:
             break
         total, lags = total + 2.0 * product, lags + 1
-    bias = min((2 * lags - 1) * shapes / len(error), 0.75) if lags > 1 else 0.0
+    bias = min((2 * lags - 1) * (CUBIC + 1) / len(error), 0.75) if lags > 1 else 0.0
     return max(total / max(energy, np.finfo(float).tiny) / (1.0 - bias), 1.0)
 
 
@@ -72,7 +67,7 @@ def curve_errors(error: FloatArray, frames: int) -> FloatArray:
     order = np.arange(CUBIC + 1)
     basis = legendre.legvander(np.linspace(-1.0, 1.0, frames), CUBIC) * np.sqrt(2.0 * order + 1.0)
     against_first = ((basis - basis[0]) ** 2).sum(axis=1) / len(error)
-    runs = [correlated_readings(column[:, None], CUBIC + 1) for column in error.T]
+    runs = [correlated_readings(column) for column in error.T]
     white = np.mean((error[2:] - 2.0 * error[1:-1] + error[:-2]) ** 2, axis=0) / 6.0
     excess = 2.0 * np.maximum(error.var(axis=0) - white, 0.0)
     variance = against_first[:, None] * error.var(axis=0) * runs

@@ -107,12 +107,16 @@ class CorrectedChain:
         parts = ("offset", *(f"legendre{k}" for k in range(COEFFICIENTS - 1)))
         return tuple(f"{axis}_{part}" for axis in self.axes for part in parts)
 
+    @property
+    def _columns(self) -> list[int]:
+        """Which of `AXES` are corrected, by number."""
+        return [AXES.index(axis) for axis in self.axes]
+
     def values(self, coefficients: FloatArray) -> FloatArray:
         """Every frame's correction in the order of `AXES`, shape (n, 6), mm and rad."""
         values = np.zeros((len(self.steps), len(AXES)))
-        columns = [AXES.index(axis) for axis in self.axes]
         per_axis = coefficients.reshape(len(self.axes), -1)
-        values[:, columns] = np.einsum("faj,aj->fa", self.basis, per_axis)
+        values[:, self._columns] = np.einsum("faj,aj->fa", self.basis, per_axis)
         return values
 
     def poses(self, coefficients: FloatArray) -> FloatArray:
@@ -132,9 +136,8 @@ class CorrectedChain:
         turn, shift : ndarray, shape (n, 3, n_coefficients)
             A point at world position X of frame f moves by ``turn x X + shift`` per unit coefficient.
         """
-        columns = [AXES.index(axis) for axis in self.axes]
-        turning, moving = _world_axes(poses, self.values(coefficients))
-        return self._accumulate(turning[:, :, columns]), self._accumulate(moving[:, :, columns])
+        turn, shift = _world_axes(poses, self.values(coefficients))
+        return self._accumulate(turn), self._accumulate(shift)
 
     def frame_errors(self, coefficients: FloatArray, poses: FloatArray) -> FloatArray:
         """Motion of every frame's origin against the first by every coefficient.
@@ -150,7 +153,7 @@ class CorrectedChain:
         return np.concatenate([to_first @ shift, to_first @ turn], axis=1)
 
     def _accumulate(self, per_frame: FloatArray) -> FloatArray:
-        per_coefficient = per_frame[:, :, :, None] * self.basis[:, None, :, :]
+        per_coefficient = per_frame[:, :, self._columns, None] * self.basis[:, None, :, :]
         return np.asarray(np.cumsum(per_coefficient, axis=0).reshape(len(per_frame), 3, -1))
 
 
@@ -167,15 +170,11 @@ def _world_axes(poses: FloatArray, values: FloatArray) -> tuple[FloatArray, Floa
     """Twist in the world of each of a frame's six corrections, as columns: turn and shift, (n, 3, 6)."""
     rotation = correction_matrices(values)[:, :3, :3]
     before = poses[:, :3, :3] @ rotation.transpose(0, 2, 1)
-    turn, shift = np.zeros((len(poses), 3, 6)), np.zeros((len(poses), 3, 6))
-    shift[:, :, :3] = before
     # Tilt, yaw and roll turn Rz(roll) Ry(yaw) Rx(tilt) about its own x, the y before it, and z.
-    axes = np.stack(
-        [rotation[:, :, 0], np.cross([0.0, 0.0, 1.0], rotation[:, :, 0]), 0 * rotation[:, :, 0]], axis=-1
-    )
-    axes[:, :, 1] /= np.linalg.norm(axes[:, :, 1], axis=1, keepdims=True)
+    axes, roll = np.zeros((len(poses), 3, 3)), values[:, 5]
+    axes[:, :, 0], axes[:, 0, 1], axes[:, 1, 1] = rotation[:, :, 0], -np.sin(roll), np.cos(roll)
     axes[:, 2, 2] = 1.0
-    turn[:, :, 3:] = before @ axes
+    turn = before @ axes
     # The turn is about the frame's own origin p: w x (X - p) = w x X + p x w.
-    shift[:, :, 3:] = skew(poses[:, :3, 3]) @ turn[:, :, 3:]
-    return turn, shift
+    about_origin = skew(poses[:, :3, 3]) @ turn
+    return np.dstack([np.zeros_like(turn), turn]), np.dstack([before, about_origin])

@@ -13,7 +13,7 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import product
 
@@ -24,11 +24,12 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import MismatchError
 from speckle3d.core.leastsquares import huber_weights
+from speckle3d.core.reconstruction import SharedErrors
 from speckle3d.core.relative import RelativePoses
 from speckle3d.core.sweep import OrientationSensor, Tracker
 from speckle3d.correction.claims import length_sigma
 from speckle3d.correction.image_path import ImagePath
-from speckle3d.correction.scale import FusedPoses, ScaleEvidence
+from speckle3d.correction.scale import ScaledPoses, ScaleEvidence
 from speckle3d.correction.sensor_readings import SensorReadings
 from speckle3d.correction.settings import FusedSettings
 
@@ -49,7 +50,7 @@ class FusionProblem:
 
     path: ImagePath
     sensors: tuple[SensorReadings, ...]
-    evidence: tuple[ScaleEvidence, ...]
+    evidence: ScaleEvidence | None
 
     @property
     def columns(self) -> list[slice]:
@@ -125,8 +126,8 @@ class FusionProblem:
         coefficients = unknowns[on_path]
         residual, slope = self.path.prior(coefficients)
         yield every[on_path], residual[:, None], slope[:, None], True
-        for evidence in self.evidence:
-            residual, slope = self.path.misfit(coefficients, evidence)
+        if self.evidence is not None:
+            residual, slope = self.path.misfit(coefficients, self.evidence)
             yield every[on_path], residual[None], slope[None], True
         for sensor, columns in zip(self.sensors, self.columns[1:], strict=True):
             residual, slope = sensor.prior(unknowns[columns])
@@ -140,16 +141,14 @@ def fuse(
     edges: RelativePoses,
     image: RigidTransform,
     share: float,
-    scale_sigma: float,
-    curves_sigma: float,
-    turn_sigma_per_mm: FloatArray,
+    shared: SharedErrors,
     centre_mm: FloatArray,
     frame_time_s: FloatArray,
     orientation: OrientationSensor | None = None,
     tracker: Tracker | None = None,
-    evidence: Sequence[ScaleEvidence] = (),
+    evidence: ScaleEvidence | None = None,
     settings: FusedSettings | None = None,
-) -> FusedPoses:
+) -> ScaledPoses:
     """Estimate poses from images, sensors and crossing sweep together.
 
     Parameters
@@ -160,17 +159,15 @@ def fuse(
         Image-based poses that were solved from `edges`.
     share : float
         Mean share of echoes that stay from frame to frame.
-    scale_sigma, curves_sigma : float
-        Relative standard deviation of the scale of distances, and the part of it that is the curves'.
-    turn_sigma_per_mm : ndarray, shape (2,)
-        Standard deviations of yaw and of tilt per mm that the images lack, rad/mm.
+    shared : SharedErrors
+        What all distances have wrong together.
     centre_mm : ndarray, shape (3,)
         The image's centre.
     frame_time_s : ndarray, shape (n,)
     orientation : OrientationSensor, optional
     tracker : Tracker, optional
         Sensors without a mounting, or with too few readings over the frames, are left out.
-    evidence : sequence of ScaleEvidence
+    evidence : ScaleEvidence, optional
         What a crossing sweep says of the scale.
     settings : FusedSettings, optional
 
@@ -181,15 +178,14 @@ def fuse(
 
     Returns
     -------
-    FusedPoses
+    ScaledPoses
         In the world of the tracker, or else of the orientation sensor with its origin at the first frame's
         image origin, or else of the first frame.
     """
     settings = settings or FusedSettings()
     centre = RigidTransform.from_translation(centre_mm)
     start = centre.inv() * (image[0].inv() * image) * centre
-    own_sigma = float(np.sqrt(max(scale_sigma**2 - curves_sigma**2, 0.0)))
-    path = ImagePath.of(edges, start, share, scale_sigma, own_sigma, turn_sigma_per_mm, frame_time_s)
+    path = ImagePath.of(edges, start, share, shared, frame_time_s)
     frames = start.as_matrix(), centre_mm, frame_time_s, settings
     readings = [SensorReadings.of(sensor, *frames) for sensor in (tracker, orientation)]
     sensors = tuple(sensor for sensor in readings if sensor is not None)
@@ -200,7 +196,7 @@ def fuse(
                 f"expected a tracker that travels as far as the images, within a factor of {FARTHEST:g}, got "
                 f"{ratio:.3g} times as far: compare modes image and pose"
             )
-    problem = FusionProblem(path, sensors, tuple(evidence))
+    problem = FusionProblem(path, sensors, evidence)
     unknowns, uncertainty, problem = problem.solve()
     on_path = problem.columns[0]
     coefficients = unknowns[on_path]
@@ -212,12 +208,12 @@ def fuse(
     if sensors:
         world = sensors[0].world_of(unknowns[problem.columns[1]])
         world = world * centre.inv() if sensors[0].places else RigidTransform.from_rotation(world.rotation)
-    return FusedPoses(
+    return ScaledPoses(
         poses=world * from_first,
         covariance=covariance,
         log_scale=float(np.log1p(path.mean_rates()[0] @ coefficients)),
-        log_scale_sigma=length_sigma(from_first, covariance, centre_mm),
-        evidence=tuple(evidence),
-        used=("images", *(sensor.name for sensor in sensors), *(source.source for source in evidence)),
-        sizes={f"{s.name} jitter": float(s.jitter[int(s.places)]) for s in problem.sensors},
+        length_sigma=length_sigma(from_first, covariance, centre_mm),
+        rests_on=("images", *(sensor.name for sensor in sensors), *["crossing"] * (evidence is not None)),
+        evidence=evidence,
+        details={f"{s.name} jitter": float(s.jitter[int(s.places)]) for s in problem.sensors},
     )

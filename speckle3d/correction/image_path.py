@@ -10,6 +10,7 @@ from scipy.sparse.linalg import splu
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import FloatArray, IntArray
+from speckle3d.core.reconstruction import SharedErrors
 from speckle3d.core.relative import HELD, SCALE_CHANGE_MM, SHARED, STRUCTURE, TURN_CHANGE_MM, RelativePoses
 from speckle3d.correction.curves import AXES, CorrectedChain
 from speckle3d.correction.scale import ScaleEvidence
@@ -56,9 +57,7 @@ class ImagePath:
         edges: RelativePoses,
         path: RigidTransform,
         share: float,
-        scale_sigma: float,
-        own_scale_sigma: float,
-        turn_sigma_per_mm: FloatArray,
+        shared: SharedErrors,
         frame_time_s: FloatArray,
     ) -> ImagePath:
         """Allow what the covariances of the edges and the images' common errors do.
@@ -69,10 +68,8 @@ class ImagePath:
             About the image's centre; the first is the identity.
         share : float
             Mean share of echoes that stay from frame to frame.
-        scale_sigma, own_scale_sigma : float
-            Relative standard deviation of the scale of distances, with and without that of the curves.
-        turn_sigma_per_mm : ndarray, shape (2,)
-            Of yaw and tilt, rad/mm.
+        shared : SharedErrors
+            What all distances have wrong together.
         frame_time_s : ndarray, shape (n,)
         """
         n = len(path)
@@ -84,13 +81,13 @@ class ImagePath:
         basis = np.zeros((n, 6, knots.size))
         basis[np.arange(1, n), :, interval + 1] = (length / travel[interval])[:, None]
         basis[:, :5, 0] = step[:, None]
-        yaw, tilt = turn_sigma_per_mm
+        yaw, tilt = shared.turn_sigma_per_mm
         x, y = SIDEWAYS + np.multiply(SIDEWAYS_BY_SHARE, share)
-        change = max(own_scale_sigma, LEAST_SCALE_CHANGE * scale_sigma)
+        change = max(shared.scale_sigma, LEAST_SCALE_CHANGE * shared.length_sigma)
         density = SCALE_CHANGE_MM * np.square([x, y, change, 0.0, 0.0, 0.0])
         density[3:5] = TURN_CHANGE_MM * np.square([tilt, yaw])
         sigma = np.ones((6, knots.size))
-        sigma[:5, 0] = x, y, scale_sigma, tilt, yaw
+        sigma[:5, 0] = x, y, shared.length_sigma, tilt, yaw
         scatter = np.square(SHARED * (1.0 + STRUCTURE * share))[:, None] * _knot_variances(edges, knots, n)
         sigma[:, 1:] = np.sqrt(scatter + density[:, None] * travel)
         sigma[3:5, 1:] = np.hypot(sigma[3:5, 1:], HAND_TURN_RAD * np.sqrt(np.diff(frame_time_s[knots])))

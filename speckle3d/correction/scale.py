@@ -1,8 +1,9 @@
-"""Poses whose length comes from a source other than the images, and the evidence for their scale."""
+"""Poses whose length comes from other sources than the images, and a crossing sweep's evidence for it."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -10,26 +11,19 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.shown import shown
 
-TERMS = ("log_scale", "tilt_per_mm", "yaw_per_mm")
-"""What `ScaleEvidence.values` are: the logarithm of true elevational distance over the images', and the
-turning about x and y per true mm travelled that the images lack, rad/mm."""
 
-
-@dataclass(frozen=True)
-class ScaleEvidence:
-    """Likelihood of the images' common errors along a sweep by one source, without any prior.
+class ScaleEvidence(NamedTuple):
+    """Likelihood of the images' common errors along a sweep by a crossing sweep, without any prior.
 
     Attributes
     ----------
-    source : str
-        "crossing".
     values : ndarray, shape (3,)
-        Most likely `TERMS`, means over the sweep.
+        Means over the sweep that are most likely: the logarithm of true elevational distance over the
+        images', and the turning about x and y per true mm travelled that the images lack, rad/mm.
     information : ndarray, shape (3, 3)
-        Inverse of their covariance; zero for what the source does not tell.
+        Inverse of their covariance; zero for what the crossing does not tell.
     """
 
-    source: str
     values: FloatArray
     information: FloatArray
 
@@ -37,7 +31,7 @@ class ScaleEvidence:
 @shown
 @dataclass(frozen=True)
 class ScaledPoses:
-    """Poses whose length comes from a source other than the images.
+    """Poses whose length comes from other sources than the images.
 
     Attributes
     ----------
@@ -46,44 +40,25 @@ class ScaledPoses:
     covariance : ndarray, shape (n, 6, 6)
         Of (x, y, z, tilt, yaw, roll) about the image's centre against the first frame, along its axes, mm and
         rad.
-    log_scale, log_scale_sigma : float
+    log_scale, length_sigma : float
         Logarithm of the corrected length over the images' own, and its standard deviation.
-    evidence : tuple of ScaleEvidence
-        What it rests on beside the images.
-    details : dict of str to float or str
+    rests_on : tuple of str
+        "images", and of "tracker", "orientation sensor" and "crossing" those that took part.
+    evidence : ScaleEvidence or None
+        What a crossing sweep alone says.
+    details : dict of str to float
         For tables and reports.
     """
 
     poses: RigidTransform
     covariance: FloatArray
     log_scale: float
-    log_scale_sigma: float
-    evidence: tuple[ScaleEvidence, ...] = ()
-    details: dict[str, float | str] = field(default_factory=dict)
-
-    @property
-    def length_sigma(self) -> float:
-        """Relative standard deviation of the length."""
-        return self.log_scale_sigma
+    length_sigma: float
+    rests_on: tuple[str, ...]
+    evidence: ScaleEvidence | None
+    details: dict[str, float]
 
     @property
     def scale(self) -> float:
         """Corrected length over the images' own."""
         return float(np.exp(self.log_scale))
-
-
-@shown
-@dataclass(frozen=True)
-class FusedPoses(ScaledPoses):
-    """Poses of mode `fused`.
-
-    Attributes
-    ----------
-    used : tuple of str
-        "images" and what else took part: "tracker", "orientation sensor", "crossing".
-    sizes : dict of str to float
-        Jitter found of the sensors: "tracker jitter" in mm, "orientation sensor jitter" in rad.
-    """
-
-    used: tuple[str, ...] = ()
-    sizes: dict[str, float] | None = None

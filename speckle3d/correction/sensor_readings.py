@@ -38,7 +38,8 @@ STEADY = 0.5
 """Probability, before anything is read, that it does not wander."""
 LEAST_JITTER = np.array([2e-5, 2e-3])
 """Of a turn, rad, and a place, mm: the last digits of sensors; simulated ones may have no noise."""
-TICK_S = 1e-3
+TICK = 1e-6
+"""Of an unknown, by which derivatives are taken."""
 ANYWHERE = 1e4
 """Standard deviation of what is not known at all, mm and rad."""
 WORLD_TURN, WORLD_SHIFT, MOUNTING_TURN, MOUNTING_SHIFT = (slice(k, k + 3) for k in (0, 3, 6, 9))
@@ -226,55 +227,22 @@ class SensorReadings:
         The columns are the path's coefficients, then the sensor's unknowns. A turn, or a place, is a row.
         """
         poses = path.chain.poses(coefficients)
-        errors = self.errors(poses, unknowns)
-        tick = np.zeros(self.size)
-        tick[CLOCK] = TICK_S
-        expected, later = self._expected(poses, unknowns), self._expected(poses, unknowns + tick)
-        ahead = (
-            (later.rotation * expected.rotation.inv()).as_rotvec() / TICK_S,
-            (later.translation - expected.translation) / TICK_S,
-        )
-        twists = path.chain.twists(coefficients, poses)
+        errors = np.stack(self.errors(poses, unknowns))
+        nudged = (self.errors(poses, unknowns + tick) for tick in TICK * np.eye(RIGID, self.size))
+        rigid = (np.stack([np.stack(error) for error in nudged], axis=-1) - errors[..., None]) / TICK
+        world, hats = self.world_of(unknowns), self._hats()
+        to_world, on_path = world.rotation.as_matrix(), world.inv() * self._expected(poses, unknowns)
+        twists, (before, share) = path.chain.twists(coefficients, poses), self._frames(unknowns)
         for first in range(0, self.time_s.size, PER_PIECE):
             rows = slice(first, first + PER_PIECE)
-            slopes = self._slopes(rows, twists, expected, unknowns, ahead)
+            at, part = before[rows], share[rows, None, None]
+            turn, shift = (twist[at] * (1.0 - part) + twist[at + 1] * part for twist in twists)
+            moves = turn, shift - skew(on_path.translation[rows]) @ turn
+            wander = np.einsum("mk,ij->mikj", hats[rows], np.eye(3)).reshape(len(at), 3, -1)
             for kind in range(1 + self.places):
-                yield errors[kind][rows] / self.jitter[kind], slopes[kind] / self.jitter[kind]
-
-    def _slopes(
-        self,
-        rows: slice,
-        twists: tuple[FloatArray, FloatArray],
-        expected: RigidTransform,
-        unknowns: FloatArray,
-        ahead: tuple[FloatArray, FloatArray],
-    ) -> tuple[FloatArray, FloatArray]:
-        """Derivatives of some readings' turns and places."""
-        before, share = (values[rows, None, None] for values in self._frames(unknowns))
-        at = before[:, 0, 0]
-        turn, shift = (part[at] * (1.0 - share) + part[at + 1] * share for part in twists)
-        world, axes = self.world_of(unknowns), expected[rows].rotation.as_matrix()
-        to_world, place, c = world.rotation.as_matrix(), expected.translation, turn.shape[-1]
-        turns, places = np.zeros((2, len(at), 3, c + self.size))
-        slopes = turns[:, :, c:]
-        turns[:, :, :c] = to_world @ turn
-        slopes[:, :, WORLD_TURN] = np.eye(3)
-        slopes[:, :, MOUNTING_TURN] = axes
-        slopes[:, :, CLOCK] = ahead[0][rows]
-        wander = np.einsum("mk,ij->mikj", self._hats()[rows], np.eye(3)).reshape(len(at), 3, -1)
-        if not self.places:
-            slopes[:, :, RIGID:] = wander
-        else:
-            on_path = (world.inv() * expected[rows]).translation
-            slopes = places[:, :, c:]
-            places[:, :, :c] = to_world @ (shift - skew(on_path) @ turn)
-            slopes[:, :, WORLD_TURN] = -skew(place[rows] - self.world_from_sensor.translation.mean(axis=0))
-            slopes[:, :, WORLD_SHIFT] = np.eye(3)
-            slopes[:, :, MOUNTING_SHIFT] = axes
-            slopes[:, :, CLOCK] = ahead[1][rows]
-            slopes[:, :, MILLIMETRES] = place[rows] - place.mean(axis=0)
-            slopes[:, :, RIGID:] = wander
-        return turns, places
+                own = [rigid[kind, rows], wander if kind == self.places else 0.0 * wander]
+                slopes = np.concatenate([to_world @ moves[kind], *own], axis=-1)
+                yield errors[kind, rows] / self.jitter[kind], slopes / self.jitter[kind]
 
     def prior(self, unknowns: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Residuals of what is known of mounting, clock, millimetres and wander, and their derivatives."""

@@ -8,8 +8,8 @@ import numpy as np
 
 from speckle3d.core.arrays import BoolArray, ByteArray, Float32Array, FloatArray
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.core.labels import EMPTY, FILLED, MEASURED
 from speckle3d.core.threads import in_parallel
+from speckle3d.core.volume import EMPTY, FILLED, MEASURED
 from speckle3d.imaging.axes import line_along
 from speckle3d.imaging.images import PosedImages
 

@@ -11,8 +11,8 @@ import numpy as np
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.files import PathLike
-from speckle3d.core.labels import LabelMap
 from speckle3d.core.sweep import BModeSettings, RFSettings, Sweep, stored_dtype
+from speckle3d.core.volume import LabelMap
 from speckle3d.io import calibrations, curves, reconstructions
 from speckle3d.io.calibrations import read_calibration
 from speckle3d.io.hdf5 import Source

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from speckle3d.core.errors import FileError, Speckle3DError
-from speckle3d.core.parts import cannot_write, locks
+from speckle3d.core.files import cannot_write, locks
 from speckle3d.io.hdf5 import make_folder, require_target
 
 

@@ -19,9 +19,8 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.core.arrays import AnyArray, FloatArray
 from speckle3d.core.errors import FileError, InvalidInputError, Speckle3DError, naming
 from speckle3d.core.files import PathLike as PathLike
-from speckle3d.core.files import open_regular
+from speckle3d.core.files import cannot_write, open_regular, whole_file
 from speckle3d.core.geometry import transforms_from_matrices
-from speckle3d.core.parts import cannot_write, whole_file
 
 Node: TypeAlias = h5py.Group | h5py.Dataset
 Source: TypeAlias = PathLike | h5py.File

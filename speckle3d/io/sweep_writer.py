@@ -20,9 +20,9 @@ import numpy.typing as npt
 
 from speckle3d.core.arrays import AnyArray, FloatArray
 from speckle3d.core.errors import FileError, InvalidInputError, Speckle3DError, naming
+from speckle3d.core.files import cannot_write
 from speckle3d.core.geometry import require_finite, rotations_from_quaternions, transforms_from_matrices
 from speckle3d.core.grid import ImageGrid
-from speckle3d.core.parts import cannot_write
 from speckle3d.core.progress import Progress
 from speckle3d.core.sweep import (
     INERTIAL,

@@ -7,12 +7,7 @@ import math
 from numba import njit
 
 from speckle3d.core.arrays import Float32Array, FloatArray
-from speckle3d.kernels.slicing import bilinear
-
-
-@njit(cache=True, nogil=True, inline="always", fastmath=False)
-def _local(pose, p0, p1, p2, row):  # type: ignore[no-untyped-def]
-    return pose[row, 0] * p0 + pose[row, 1] * p1 + pose[row, 2] * p2 + pose[row, 3]
+from speckle3d.kernels.slicing import bilinear, coordinates
 
 
 @njit(cache=True, nogil=True, fastmath=False)
@@ -50,22 +45,19 @@ def look_up(
     for i in range(points.shape[0]):
         p0, p1, p2 = points[i, 0], points[i, 1], points[i, 2]
         values[i] = place[i] = math.nan
-        d = _local(planes[at], p0, p1, p2, 2)
         # The planes are in order along the path; neighbouring points lie near each other.
-        while d < 0.0 and at > 0:
+        while at > 0 and coordinates(planes[at], p0, p1, p2)[2] < 0.0:
             at -= 1
-            d = _local(planes[at], p0, p1, p2, 2)
         at = min(at, many - 2)
-        d, after = _local(planes[at], p0, p1, p2, 2), _local(planes[at + 1], p0, p1, p2, 2)
-        while after >= 0.0 and at < many - 2:
+        while at < many - 2 and coordinates(planes[at + 1], p0, p1, p2)[2] >= 0.0:
             at += 1
-            d, after = after, _local(planes[at + 1], p0, p1, p2, 2)
+        x, y, d = coordinates(planes[at], p0, p1, p2)
+        after_x, after_y, after = coordinates(planes[at + 1], p0, p1, p2)
         if d < 0.0 or after > 0.0 or d - after <= 0.0:
             continue
         gap = d - after
         f = d / gap
-        x, y = _local(planes[at], p0, p1, p2, 0), _local(planes[at], p0, p1, p2, 1)
-        dx, dy = _local(planes[at + 1], p0, p1, p2, 0) - x, _local(planes[at + 1], p0, p1, p2, 1) - y
+        dx, dy = after_x - x, after_y - y
         u, v = (x + f * dx - pixels[2]) / pixels[0], (y + f * dy - pixels[3]) / pixels[1]
         if not (0.0 <= u <= wide - 1.0 and 0.0 <= v <= high - 1.0):
             continue

@@ -7,7 +7,7 @@ import numpy.typing as npt
 from numba import njit
 
 from speckle3d.core.arrays import ByteArray, Float32Array, FloatArray, IntArray
-from speckle3d.core.labels import EMPTY, FILLED, MEASURED
+from speckle3d.core.volume import EMPTY, FILLED, MEASURED
 
 CountArray = npt.NDArray[np.uint32]
 

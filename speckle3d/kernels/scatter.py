@@ -8,6 +8,7 @@ import numpy as np
 from numba import njit
 
 from speckle3d.core.arrays import Complex64Array, Float32Array, FloatArray, IntArray
+from speckle3d.kernels.slicing import coordinates
 
 _SUMS = {"reassoc", "contract", "arcp"}
 _TURNS = 8192
@@ -78,6 +79,20 @@ def _unit_phasor(cycles: float) -> Any:
     return _PHASORS[nearest & (_TURNS - 1)] * np.complex64(complex(1.0, -angle))
 
 
+@njit(cache=True, inline="always", fastmath=_SUMS)
+def _first_array(array_from_face: FloatArray, x: float, y: float, right_mm: float) -> int:
+    """First array of a fan in which a place lies left of `right_mm`; in the next ones it is farther left."""
+    low, high = 0, array_from_face.shape[0]
+    while low < high:
+        middle = (low + high) // 2
+        t = array_from_face[middle, 0]
+        if t[0] * x + t[1] * y + t[2] < right_mm:
+            high = middle
+        else:
+            low = middle + 1
+    return low
+
+
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=_SUMS)
 def _interpolate(table: Float32Array, row: int, corners: Any, weights: Any, out: Float32Array) -> None:
     """Fill `out` with a weighted sum of eight pieces of a table.
@@ -127,12 +142,12 @@ def scatter_echoes(
     """
     rows, reach, reached_vectors, curvature_per_mm, grid = table
     first_depth_mm, sample_mm, cycles_per_mm = echoes
-    m = face_from_medium
     ny, nz = reached_vectors.shape[0], reached_vectors.shape[1]
     per_pitch = reach.shape[1]
     samples, width = out.shape[1:]
     vectors = out.shape[0] // array_from_face.shape[0]
     far_mm = reach.shape[2] * pitch_mm
+    right_mm = vectors * pitch_mm + far_mm
     row = rows.shape[3]
     cell = (per_pitch + 1) * row
     plane = nz * cell
@@ -140,20 +155,18 @@ def scatter_echoes(
     one = np.float32(1.0)
     value = np.empty(rows.shape[3], dtype=np.float32)
     for j in range(position_mm.shape[0]):
-        a, b, c = position_mm[j, 0], position_mm[j, 1], position_mm[j, 2]
-        z = m[2, 0] * a + m[2, 1] * b + m[2, 2] * c + m[2, 3]
+        a, b, c = position_mm[j]
+        face_x, face_y, z = coordinates(face_from_medium, a, b, c)
         fz = abs(z) / grid[3]
         iz = int(fz)
         if iz >= nz - 1:
             continue
         wz = np.float32(fz - iz)
-        face_x = m[0, 0] * a + m[0, 1] * b + m[0, 2] * c + m[0, 3]
-        face_y = m[1, 0] * a + m[1, 1] * b + m[1, 2] * c + m[1, 3]
-        for array in range(array_from_face.shape[0]):
+        for array in range(_first_array(array_from_face, face_x, face_y, right_mm), array_from_face.shape[0]):
             t = array_from_face[array]
             x = t[0, 0] * face_x + t[0, 1] * face_y + t[0, 2]
-            if x <= -far_mm or x >= vectors * pitch_mm + far_mm:
-                continue
+            if x <= -far_mm:
+                break
             y = t[1, 0] * face_x + t[1, 1] * face_y + t[1, 2]
             fy = (y - grid[0]) / grid[1]
             iy = int(np.floor(fy))

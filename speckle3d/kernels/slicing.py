@@ -95,6 +95,26 @@ def bilinear(image, u, v):  # type: ignore[no-untyped-def]
     return near + a * (far - near), far - near, right - left
 
 
+@njit(cache=True, inline="always", error_model="numpy", fastmath=False)
+def coordinates(pose, x, y, z):  # type: ignore[no-untyped-def]
+    """Coordinates of a point in the frame that rows of a pose, shape (3 or more, 4), lead to."""
+    return (
+        pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z + pose[0, 3],
+        pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * z + pose[1, 3],
+        pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z + pose[2, 3],
+    )
+
+
+@njit(cache=True, inline="always", error_model="numpy", fastmath=False)
+def _turned_back(pose, x, y, z):  # type: ignore[no-untyped-def]
+    """Components of a vector in the frame that a pose leads from."""
+    return (
+        pose[0, 0] * x + pose[1, 0] * y + pose[2, 0] * z,
+        pose[0, 1] * x + pose[1, 1] * y + pose[2, 1] * z,
+        pose[0, 2] * x + pose[1, 2] * y + pose[2, 2] * z,
+    )
+
+
 _SUMS_IN_ANY_ORDER = {"reassoc", "contract", "arcp", "nsz"}
 """Lets the compiler sum several terms at once; NaN keeps its meaning."""
 
@@ -166,16 +186,12 @@ def _images_near(
     half_v = 0.5 * (patches.sides[1] - 1) * patches.stride * pixels[1]
     reach = math.sqrt(half_u * half_u + half_v * half_v) + max_gap_mm
     k, u0, v0 = patches.where[p]
-    pose = sample.poses[k]
     x = pixels[2] + u0 * pixels[0] + half_u
     y = pixels[3] + v0 * pixels[1] + half_v
-    wx = pose[0, 0] * x + pose[0, 1] * y + pose[0, 3]
-    wy = pose[1, 0] * x + pose[1, 1] * y + pose[1, 3]
-    wz = pose[2, 0] * x + pose[2, 1] * y + pose[2, 3]
+    wx, wy, wz = coordinates(sample.poses[k], x, y, 0.0)
     count = 0
     for j in range(source.poses.shape[0]):
-        t = source.poses[j]
-        if abs(t[2, 0] * wx + t[2, 1] * wy + t[2, 2] * wz + t[2, 3]) <= reach:
+        if abs(coordinates(source.poses[j], wx, wy, wz)[2]) <= reach:
             near[count] = j
             count += 1
     return count
@@ -220,9 +236,7 @@ def _cut_patch(
             total += 1
             x = pixels[2] + u * pixels[0]
             y = pixels[3] + v * pixels[1]
-            wx = pose[0, 0] * x + pose[0, 1] * y + pose[0, 3]
-            wy = pose[1, 0] * x + pose[1, 1] * y + pose[1, 3]
-            wz = pose[2, 0] * x + pose[2, 1] * y + pose[2, 3]
+            wx, wy, wz = coordinates(pose, x, y, 0.0)
             for index in range(n_near):
                 away[index] = (
                     planes[0, index] * wx + planes[1, index] * wy + planes[2, index] * wz + planes[3, index]
@@ -240,9 +254,7 @@ def _cut_patch(
             for s in range(2):
                 # The nearest image on this side that shows something there: mostly the first one tried.
                 while best[s] >= 0:
-                    t = source.poses[near[best[s]]]
-                    px = t[0, 0] * wx + t[0, 1] * wy + t[0, 2] * wz + t[0, 3]
-                    py = t[1, 0] * wx + t[1, 1] * wy + t[1, 2] * wz + t[1, 3]
+                    px, py, _ = coordinates(source.poses[near[best[s]]], wx, wy, wz)
                     su = (px - cut_pixels[2]) / cut_pixels[0]
                     sv = (py - cut_pixels[3]) / cut_pixels[1]
                     if 0.0 <= su <= last_u and 0.0 <= sv <= last_v:
@@ -300,14 +312,9 @@ def _fill_rows(
     for s in range(2):
         amount = part if s == 1 else 1.0 - part
         ax, ay, az = amount * slope[s, 0], amount * slope[s, 1], slope[s, 2]
-        t = poses[frame[s]]
         # The same slope along the axes of the world, then of the sample's image.
-        gx = t[0, 0] * ax + t[1, 0] * ay + t[2, 0] * az
-        gy = t[0, 1] * ax + t[1, 1] * ay + t[2, 1] * az
-        gz = t[0, 2] * ax + t[1, 2] * ay + t[2, 2] * az
-        bx = pose[0, 0] * gx + pose[1, 0] * gy + pose[2, 0] * gz
-        by = pose[0, 1] * gx + pose[1, 1] * gy + pose[2, 1] * gz
-        bz = pose[0, 2] * gx + pose[1, 2] * gy + pose[2, 2] * gz
+        gx, gy, gz = _turned_back(poses[frame[s]], ax, ay, az)
+        bx, by, bz = _turned_back(pose, gx, gy, gz)
         px, py, pz = place[s]
         row[0] += y * bz - (py * az - pz * ay)
         row[1] += -x * bz - (pz * ax - px * az)

@@ -59,25 +59,6 @@ _OFF_POINT_MM = 0.15
 
 
 @dataclass(frozen=True)
-class HandMotion:
-    """Deliberate motion of a hand-held sweep: start angles, turns, reversal.
-
-    Parameters
-    ----------
-    start_rad : tuple of float
-        Tilt, yaw and roll of the first frame.
-    turn_rad : tuple of float
-        Deliberate tilt, yaw and roll from the first frame to the last.
-    reverse : bool
-        Sweep forward, then back over the same tissue.
-    """
-
-    start_rad: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    turn_rad: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    reverse: bool = False
-
-
-@dataclass(frozen=True)
 class Trajectory:
     """A smooth pose of the image in the medium as a function of time.
 
@@ -136,36 +117,42 @@ def _spline(time: FloatArray, columns: FloatArray) -> BSpline[np.float64]:
 
 
 def hand_sweep(
-    length_mm: float,
+    settings: SimulationSettings,
     duration_s: float,
     face_mm: float,
-    motion: HandMotion,
-    medium_from_start: RigidTransform,
-    world_from_medium: RigidTransform,
+    world: RigidTransform,
     rng: np.random.Generator,
+    number: int = 0,
 ) -> Trajectory:
-    """Sweep `length_mm` along the starting image's elevation in `duration_s`, as a hand would.
+    """Sweep along the starting image's elevation, as a hand would.
 
     Parameters
     ----------
     face_mm : float
         Width of the image.
-    medium_from_start : RigidTransform
-        Where and in which direction the sweep starts.
+    world : RigidTransform
+        Of the medium.
+    number : int
+        Of crossed sweeps.
     """
+    fan, turn, crossing = np.deg2rad([settings.fan_deg, settings.turn_deg, settings.crossing_deg]).tolist()
     time = _knot_times(duration_s)
     columns = np.zeros((time.size, 6))
     columns[:, 0] = face_mm / 2.0
-    columns[:, 2] += _progress(time, duration_s, motion.reverse, rng) * length_mm
+    reverse = settings.preset == "reversal"
+    columns[:, 2] += _progress(time, duration_s, reverse, rng) * settings.length_mm
     phase = np.clip(time / duration_s, 0.0, 1.0)
-    turn = phase * phase * (3.0 - 2.0 * phase)
-    columns[:, 3:] = motion.start_rad + turn[:, None] * motion.turn_rad
+    turned = phase * phase * (3.0 - 2.0 * phase)
+    if settings.preset == "rotation":
+        columns[:, 3 if settings.turn_axis == "tilt" else 4] = turned * turn
+    elif settings.preset == "crossed":
+        columns[:, 3] = (turned - 0.5) * fan
     for axis in range(6):
         if _WANDER[axis] > 0:
             columns[:, axis] += _WANDER[axis] * _band_noise(time, (0.0, 1.0 / duration_s), rng)
         columns[:, axis] += _TREMOR[axis] * _band_noise(time, _TREMOR_HZ, rng)
-    spline = _spline(time, columns)
-    return Trajectory(spline, "ZYX", np.ones(3), face_mm, world_from_medium, medium_from_start)
+    start = _turned_about(np.array([face_mm / 2.0, 0.0, settings.length_mm / 2.0]), crossing * number)
+    return Trajectory(_spline(time, columns), "ZYX", np.ones(3), face_mm, world, start)
 
 
 def calibration_scan(
@@ -190,8 +177,7 @@ def calibration_scan(
         columns[:, axis] += _TREMOR[axis] * _band_noise(time, _TREMOR_HZ, rng)
     columns[:, 1] += (_NEAREST_MM + _FARTHEST_MM) / 2.0
     in_medium = np.array([1.0, 0.0, 1.0]) * over_floor
-    spline = _spline(time, columns)
-    return Trajectory(spline, "YXZ", in_medium, face_mm, world, RigidTransform.identity())
+    return Trajectory(_spline(time, columns), "YXZ", in_medium, face_mm, world, RigidTransform.identity())
 
 
 def stepped_poses(steps: int, step_mm: float, blocks: int, gap_mm: float) -> RigidTransform:
@@ -200,7 +186,7 @@ def stepped_poses(steps: int, step_mm: float, blocks: int, gap_mm: float) -> Rig
     return RigidTransform.from_translation(np.outer(z.ravel(), [0.0, 0.0, 1.0]))
 
 
-def turned_about(centre_mm: FloatArray, angle_rad: float) -> RigidTransform:
+def _turned_about(centre_mm: FloatArray, angle_rad: float) -> RigidTransform:
     """Turn about the beam axis through `centre_mm`: where a crossing sweep starts."""
     turn = Rotation.from_rotvec([0.0, angle_rad, 0.0])
     return RigidTransform.from_components(centre_mm - turn.apply(centre_mm), turn)

@@ -15,13 +15,10 @@ from speckle3d.simulation.bath import CrossedThreads, WaterBath
 from speckle3d.simulation.beam import BeamTable, Probe, tabulate_beam
 from speckle3d.simulation.medium import Medium, fully_developed, phantom, tissue
 from speckle3d.simulation.movement import (
-    HandMotion,
-    Trajectory,
     calibration_scan,
     frame_times,
     hand_sweep,
     stepped_poses,
-    turned_about,
     world_from_medium,
 )
 from speckle3d.simulation.receiver import received
@@ -141,7 +138,7 @@ def _sweep(
         if in_bath:
             trajectory = calibration_scan(settings, image.width_mm, world, motion_rng)
         else:
-            trajectory = _hand_sweep(settings, image.width_mm, duration_s, world, number, motion_rng)
+            trajectory = hand_sweep(settings, duration_s, image.width_mm, world, motion_rng, number)
         poses, span = trajectory.medium_from_image(times), (-0.3, duration_s + 0.3)
         noise = settings.sensor_noise if in_bath else 1.0
         tracker = simulate_tracker(trajectory, span, np.random.default_rng(tracker_seed), noise)
@@ -167,23 +164,3 @@ def _image_grid(settings: SimulationSettings, probe: Probe) -> ImageGrid:
     half = float(np.deg2rad(settings.sector_deg)) / 2
     radius_mm = settings.radius_mm if settings.array == "curved" else 0.0
     return ImageGrid.of_fan(settings.vectors, settings.samples, spacing_mm, radius_mm, (-half, half))
-
-
-def _hand_sweep(
-    settings: SimulationSettings,
-    face_mm: float,
-    duration_s: float,
-    world: RigidTransform,
-    number: int,
-    rng: np.random.Generator,
-) -> Trajectory:
-    fan, turn, crossing = np.deg2rad([settings.fan_deg, settings.turn_deg, settings.crossing_deg]).tolist()
-    tilt, turns = 0.0, (0.0, 0.0, 0.0)
-    if settings.preset == "crossed":
-        tilt, turns = -fan / 2.0, (fan, 0.0, 0.0)
-    elif settings.preset == "rotation":
-        turns = (turn, 0.0, 0.0) if settings.turn_axis == "tilt" else (0.0, turn, 0.0)
-    motion = HandMotion((tilt, 0.0, 0.0), turns, settings.preset == "reversal")
-    centre = np.array([face_mm / 2.0, 0.0, settings.length_mm / 2.0])
-    start = turned_about(centre, crossing * number)
-    return hand_sweep(settings.length_mm, duration_s, face_mm, motion, start, world, rng)

@@ -324,8 +324,7 @@ def _details_of(
             parameters = dict(zip(fit.names, fit.fit.x.tolist(), strict=True))
             fits[mode] = {"curves": fit.settings.curves, "coverage": fit.coverage, "parameters": parameters}
         else:
-            sources = [evidence.source for evidence in fit.evidence]
-            fits[mode] = {"length_over_images": fit.scale, "rests_on": sources, **fit.details}
+            fits[mode] = {"length_over_images": fit.scale, "rests_on": fit.rests_on, **fit.details}
     return {
         "provenance": provenance,
         "pairs": tracked.pairs,

@@ -9,6 +9,7 @@ from scipy.spatial.transform import RigidTransform
 from spoiled_images import first_vectors, in_order
 
 from speckle3d.core.errors import MismatchError
+from speckle3d.core.reconstruction import SharedErrors
 from speckle3d.core.streams import TimedPoses
 from speckle3d.correction.fused import fuse
 from speckle3d.correction.scale import ScaleEvidence
@@ -18,9 +19,9 @@ from speckle3d.tracking import track
 
 
 def fuse_images(tracking, sweep, scale_sigma=0.03, **evidence):
-    turns, centre_mm = tracking.shared.turn_sigma_per_mm, sweep.grid.centre_mm
-    images = tracking.edges, tracking.image, 0.0, scale_sigma, 0.0
-    return fuse(*images, turns, centre_mm, sweep.frame_time_s, **evidence)
+    shared = SharedErrors(scale_sigma, 0.0, tracking.shared.turn_sigma_per_mm)
+    images = tracking.edges, tracking.image, 0.0, shared, sweep.grid.centre_mm
+    return fuse(*images, sweep.frame_time_s, **evidence)
 
 
 def displace(tracker, shift_mm=0.0, factor=1.0):
@@ -31,18 +32,18 @@ def displace(tracker, shift_mm=0.0, factor=1.0):
 
 
 def test_evidence_of_the_scale_counts_by_its_information_against_the_images_claim(sweep, tracking):
-    evidence = ScaleEvidence("crossing", np.array([0.04, 0.0, 0.0]), np.diag([1.0 / 0.01**2, 0.0, 0.0]))
-    poses = fuse_images(tracking, sweep, 0.02, evidence=[evidence])
+    evidence = ScaleEvidence(np.array([0.04, 0.0, 0.0]), np.diag([1.0 / 0.01**2, 0.0, 0.0]))
+    poses = fuse_images(tracking, sweep, 0.02, evidence=evidence)
     # Variances before: of the common scale, and of its changes along the sweep between nothing and as much.
     least, most = (0.04 * prior / (prior + 0.01**2) for prior in (0.02**2, 2 * 0.02**2))
     assert least - 5e-4 < poses.log_scale < most + 5e-4
-    assert poses.log_scale_sigma == pytest.approx(0.01, rel=0.2)
-    assert poses.used == ("images", "crossing")
+    assert poses.length_sigma == pytest.approx(0.01, rel=0.2)
+    assert poses.rests_on == ("images", "crossing")
 
 
 def test_a_sensor_without_a_mounting_costs_itself_alone(sweep, tracking):
     loose = replace(sweep, orientation=replace(sweep.orientation, sensor_from_image=None))
-    assert correct(tracking, loose, "fused")["fused"].used == ("images", "tracker")
+    assert correct(tracking, loose, "fused")["fused"].rests_on == ("images", "tracker")
 
 
 def test_a_loop_of_the_images_says_nothing_of_their_scale(sweep, curves):
@@ -50,7 +51,7 @@ def test_a_loop_of_the_images_says_nothing_of_their_scale(sweep, curves):
     loop = in_order(first_vectors(sweep), [*range(32), *range(31, -1, -1)])
     poses = fuse_images(track(loop, curves), loop)
     assert poses.log_scale == pytest.approx(0.0, abs=1e-3)
-    assert poses.log_scale_sigma > 0.8 * 0.03
+    assert poses.length_sigma > 0.8 * 0.03
 
 
 def test_a_tracker_much_too_far_from_the_images_is_not_averaged_with_them(sweep, tracking):
@@ -77,5 +78,5 @@ def test_a_tracker_that_wanders_is_claimed_to(sweep, tracking):
         shifts = displace(sweep.tracker, 0.5 * wander / wander.std())
         poses = fuse_images(tracking, sweep, 0.08, tracker=shifts)
         (row,) = compare_modes({"fused": poses.poses}, sweep.truth, sweep.grid.centre_mm, end_frames=1)
-        errors.append(row.length_error_percent / 100 / poses.log_scale_sigma)
+        errors.append(row.length_error_percent / 100 / poses.length_sigma)
     assert np.sqrt(np.mean(np.square(errors))) < 0.65

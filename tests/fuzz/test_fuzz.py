@@ -53,8 +53,8 @@ def write_images(folder):
 def write_shapes(folder):
     from old_files import POSES
 
-    from speckle3d.core.labels import STATE_SEGMENTS, LabelMap
     from speckle3d.core.surface import Surface
+    from speckle3d.core.volume import STATE_SEGMENTS, LabelMap
     from speckle3d.io import shapes
     from speckle3d.io.points import PickedPoints, write_points
     from speckle3d.io.tum import write_tum

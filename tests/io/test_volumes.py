@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.core.labels import STATE_SEGMENTS, LabelMap, Segment
-from speckle3d.core.volume import VOXEL_TYPES, Volume
+from speckle3d.core.volume import STATE_SEGMENTS, VOXEL_TYPES, LabelMap, Segment, Volume
 from speckle3d.io.voxels.volume_writer import SUFFIXES, write_volume
 from speckle3d.io.voxels.volumes import read_volume
 

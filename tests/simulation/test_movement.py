@@ -7,14 +7,13 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.geometry import relative_poses, roll_yaw_tilt
-from speckle3d.simulation.movement import HandMotion, hand_sweep
+from speckle3d.simulation.movement import hand_sweep
+from speckle3d.simulation.settings import SimulationSettings
 
-IDENTITY = RigidTransform.identity()
 
-
-def sweep(seed, motion=None, length_mm=20.0, duration_s=6.4):
+def sweep(seed, duration_s=6.4, **changes):
     rng = np.random.default_rng(seed)
-    return hand_sweep(length_mm, duration_s, 37.8, motion or HandMotion(), IDENTITY, IDENTITY, rng)
+    return hand_sweep(SimulationSettings(**changes), duration_s, 37.8, RigidTransform.identity(), rng)
 
 
 @settings(deadline=None, max_examples=25)
@@ -32,8 +31,7 @@ def test_a_sweep_stays_within_what_a_hand_does(seed):
 
 
 def test_a_reversal_comes_back():
-    motion = HandMotion(reverse=True)
-    z = sweep(3, motion, duration_s=12.8).medium_from_image(np.arange(320) / 25.0).apply([18.9, 0, 0])[:, 2]
+    z = sweep(3, 12.8, preset="reversal").medium_from_image(np.arange(320) / 25.0).apply([18.9, 0, 0])[:, 2]
     assert z.max() == pytest.approx(20.0, abs=0.2)
     assert z[[0, -1]] == pytest.approx([0.0, 0.0], abs=0.3)
     assert 120 < z.argmax() < 200

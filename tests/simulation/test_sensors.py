@@ -5,17 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.integrate import cumulative_trapezoid
-from scipy.spatial.transform import RigidTransform
 
-from speckle3d.simulation.movement import HandMotion, hand_sweep, world_from_medium
+from speckle3d.simulation.movement import hand_sweep, world_from_medium
 from speckle3d.simulation.sensors import (
     LEVER_MM,
     TRACKER_FROM_IMAGE,
     simulate_orientation,
     simulate_tracker,
 )
+from speckle3d.simulation.settings import SimulationSettings
 
-IDENTITY = RigidTransform.identity()
 SPAN_S = (-0.3, 20.3)
 FRAMES_S = np.arange(500) / 25.0
 
@@ -23,7 +22,7 @@ FRAMES_S = np.arange(500) / 25.0
 @pytest.fixture(scope="module")
 def trajectory():
     rng = np.random.default_rng(11)
-    return hand_sweep(20.0, 20.0, 37.8, HandMotion(), IDENTITY, world_from_medium(0.6), rng)
+    return hand_sweep(SimulationSettings(), 20.0, 37.8, world_from_medium(0.6), rng)
 
 
 def test_tracker_errors_are_the_stated_jitter(trajectory):

@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, closing, suppress
 
 from speckle3d.core.errors import FileError, InvalidInputError, Speckle3DError, naming
-from speckle3d.core.parts import cannot_write
+from speckle3d.core.files import cannot_write
 from xsens.live.device import Device, DeviceError, DeviceInfo, DeviceSettings, connect, prepare
 from xsens.live.monitor import LiveState, Monitor, warm_up
 from xsens.messages.control import MessageId, utc_message

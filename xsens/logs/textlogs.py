@@ -18,7 +18,7 @@ import numpy as np
 
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError, naming
-from speckle3d.core.parts import whole_file
+from speckle3d.core.files import whole_file
 from xsens.logs.clocks import SHORTEST_S, TICK_S, Stamps, usual_step
 from xsens.logs.parts import Hints, Parts, assemble_log
 from xsens.logs.samples import VECTORS, ImuLog, median_norm

@@ -144,7 +144,7 @@ def surface(
     --------
     $ speckle3d surface volume.nrrd -o cyst.stl --level 60 --below --largest
     """
-    from speckle3d.core.labels import EMPTY
+    from speckle3d.core.volume import EMPTY
     from speckle3d.imaging.measures.surface import (
         largest_part,
         smooth_surface,

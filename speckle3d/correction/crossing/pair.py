@@ -26,6 +26,7 @@ from speckle3d.correction.crossing.similarity import PARAMETERS, RIGID, BlurredS
 from speckle3d.correction.crossing.sweep import CrossingSettings, CrossingSweep
 from speckle3d.correction.drift import correct_orientation
 from speckle3d.correction.scale import ScaledPoses, ScaleEvidence
+from speckle3d.correction.settings import FusedSettings
 
 _STARTS = 4
 """Candidates refined."""
@@ -36,11 +37,10 @@ _FEWEST, _PER_CELL = 3000, 12.0
 _LARGEST_SHARE = 0.45
 """Displacement over blur above which residuals no longer follow it: at 0.9 mm, 0.6 mm rms are taken for 0.46
 and 1.0 mm for 0.62, and lengths came out wrong by up to 8 %. Of 0.3 mm at most 0.41 were made."""
-_INCLINATION_RAD, _HEADING_RAD = np.deg2rad([0.15, 0.5])
-"""How far a sensor's slow errors change over a sweep, standard deviation: about horizontal axes and about the
-vertical."""
+_SENSOR = FusedSettings()
+"""How far a sensor's slow errors change over a sweep."""
 _BETWEEN_INCLINATION_RAD, _BETWEEN_HEADING_RAD = np.deg2rad([1.0, 8.0])
-"""The same between two sweeps: minutes apart, the probe, and its iron, turned in the earth's field."""
+"""How far they do between two: minutes apart, the probe, and its iron, turned in the earth's field."""
 
 
 @shown
@@ -208,7 +208,7 @@ class _Crossing:
         most_mm = _LARGEST_SHARE * limits.blurs_mm[-2:][0]
         uncertainty = covariance(self.fit, displacement_mm)
         poses = [self._scaled_poses(number, uncertainty, displacement_mm) for number in (0, 1)]
-        sigma = max(side.log_scale_sigma for side in poses)
+        sigma = max(side.length_sigma for side in poses)
         for wrong, error, expectation in (
             (
                 so_far.similarity < limits.least_similarity,
@@ -285,7 +285,7 @@ class _Crossing:
         posterior, expectation = (np.linalg.inv(terms @ bend @ terms.T) for bend in (after, before))
         size, axes = np.linalg.eigh(posterior - expectation)
         information = (axes * np.maximum(size, 0.0)) @ axes.T
-        evidence = ScaleEvidence("crossing", np.linalg.pinv(information) @ posterior @ values, information)
+        evidence = ScaleEvidence(np.linalg.pinv(information) @ posterior @ values, information)
         chain = self.sides[number].frames
         slopes = chain.frame_errors(bends, chain.poses(bends))
         return ScaledPoses(
@@ -293,7 +293,8 @@ class _Crossing:
             slopes @ after @ slopes.transpose(0, 2, 1),
             float(values[0]),
             float(np.sqrt(np.linalg.inv(posterior)[0, 0])),
-            (evidence,),
+            ("images", "crossing"),
+            evidence,
             {"similarity": self.fit.correlation, "tissue_moved_mm": displacement_mm},
         )
 
@@ -330,7 +331,8 @@ def _prior(
         if sweep.orientation is not None:
             up = sweep.orientation.inv().apply([0.0, 0.0, 1.0]).mean(axis=0)
             share = (up / np.linalg.norm(up))[:2] ** 2
-            over = np.sqrt(_INCLINATION_RAD**2 * (1.0 - share) + _HEADING_RAD**2 * share)
+            level, heading = _SENSOR.inclination_sigma_rad, _SENSOR.heading_sigma_rad
+            over = np.sqrt(level**2 * (1.0 - share) + heading**2 * share)
             # A drift from -1 to 1 along the sweep has a standard deviation of 1 / sqrt(3).
             rates = np.minimum(rates, 2.0 * np.sqrt(3.0) * over / side.length_mm)
         block = slice(number * BENDS, (number + 1) * BENDS)

@@ -28,7 +28,7 @@ def fill_holes(
     voxels : ndarray of float32, shape (n_k, n_j, n_i), C order, changed in place
         What empty ones hold does not matter.
     state : ndarray of uint8, shape (n_k, n_j, n_i), C order, changed in place
-        `EMPTY`, `MEASURED` or `FILLED` of `speckle3d.core.labels`.
+        `EMPTY`, `MEASURED` or `FILLED` of `speckle3d.core.volume`.
     radius_mm, spacing_mm : float, tuple of float
         Of the largest box, as for `boxes_within`; in voxels without a spacing.
 

@@ -39,7 +39,7 @@ class CompoundedVolume(Volume):
     Attributes
     ----------
     state : ndarray of uint8, shape (n_i, n_j, n_k)
-        `EMPTY`, `MEASURED` or `FILLED`; see `speckle3d.core.labels`.
+        `EMPTY`, `MEASURED` or `FILLED`; see `speckle3d.core.volume`.
     """
 
     state: ByteArray = field(kw_only=True)
@@ -194,7 +194,7 @@ def look_up_voxels(
     voxels : ndarray of float32, shape (n_k, n_j, n_i)
         NaN where they are empty.
     state : ndarray of uint8
-        `EMPTY`, `MEASURED` or `FILLED` of `speckle3d.core.labels`.
+        `EMPTY`, `MEASURED` or `FILLED` of `speckle3d.core.volume`.
 
     Raises
     ------

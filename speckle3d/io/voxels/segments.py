@@ -11,7 +11,7 @@ import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.core.labels import Segment
+from speckle3d.core.volume import Segment
 from speckle3d.io.text import numbers, unescape
 
 _FIELD = re.compile(r"Segment(\d{1,5})_(\w+)")

@@ -15,8 +15,7 @@ from speckle3d.core.arrays import AnyArray, ByteArray, FloatArray
 from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.files import PathLike
 from speckle3d.core.geometry import transforms_from_matrices
-from speckle3d.core.labels import LABEL_TYPES, LabelMap
-from speckle3d.core.volume import VOXEL_TYPES, Volume
+from speckle3d.core.volume import LABEL_TYPES, VOXEL_TYPES, LabelMap, Volume
 from speckle3d.io.hdf5 import reading
 from speckle3d.io.images.header_fields import is_image, mm_per
 from speckle3d.io.images.headers import read_header
@@ -128,7 +127,7 @@ def read_states(path: PathLike, volume: Volume) -> ByteArray:
     Returns
     -------
     ndarray of uint8, shape (n_i, n_j, n_k)
-        `EMPTY`, `MEASURED` or `FILLED`; see `speckle3d.core.labels`.
+        `EMPTY`, `MEASURED` or `FILLED`; see `speckle3d.core.volume`.
 
     Raises
     ------

@@ -50,5 +50,5 @@ def sides_of(case):
         )
         turns = [(poses[0].inv() * poses[-1]).rotation for poses in (truth, side.poses)]
         tilt_deg = (turns[0].inv() * turns[1]).as_rotvec(degrees=True)[0]
-        sides.append((100 * np.log(length / true), tilt_deg, 100 * side.log_scale_sigma))
+        sides.append((100 * np.log(length / true), tilt_deg, 100 * side.length_sigma))
     return sides

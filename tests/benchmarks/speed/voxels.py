@@ -10,8 +10,8 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.grid import ImageGrid
-from speckle3d.core.labels import MEASURED
 from speckle3d.core.threads import on_one_thread
+from speckle3d.core.volume import MEASURED
 from speckle3d.imaging.voxels.grid import VoxelGrid
 from speckle3d.imaging.voxels.holes import fill_holes
 from speckle3d.imaging.voxels.volume import compound

@@ -38,7 +38,7 @@ def test_finds_lengths_that_were_a_fifth_wrong():
         # Targets of 90th percentiles over many pairs.
         assert abs(length) < 2.0
         assert abs(tilt) < 1.0
-        assert abs(length) < 3 * 100 * side.log_scale_sigma
+        assert abs(length) < 3 * 100 * side.length_sigma
     assert solution.mirrored == (False, False)
     expected = pair.truth[0][0].inv() * pair.truth[1][0]
     away = expected.inv() * solution.first_from_second
@@ -80,8 +80,8 @@ def test_claims_for_tissue_that_moved_a_little():
     assert 0.2 < solution.first.details["tissue_moved_mm"] < 0.6
     for side, truth in zip((solution.first, solution.second), pair.truth, strict=True):
         # 0.3 mm either way, smooth over 8 mm, make a per cent of 24 mm; without them 0.7 % were claimed.
-        assert side.log_scale_sigma > 0.01
-        assert abs(errors(side.poses, truth)[0]) < 2 * 100 * side.log_scale_sigma
+        assert side.length_sigma > 0.01
+        assert abs(errors(side.poses, truth)[0]) < 2 * 100 * side.length_sigma
 
 
 REFUSED = {

@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from speckle3d.core.labels import EMPTY, FILLED, MEASURED
+from speckle3d.core.volume import EMPTY, FILLED, MEASURED
 from speckle3d.imaging.voxels.holes import boxes_within, fill_holes
 
 

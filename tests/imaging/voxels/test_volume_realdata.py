@@ -9,7 +9,7 @@ from igsio_twin import Clip, grid_of
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.grid import ImageGrid
-from speckle3d.core.labels import MEASURED
+from speckle3d.core.volume import MEASURED
 from speckle3d.imaging.images import PosedImages
 from speckle3d.imaging.voxels.grid import VoxelGrid
 from speckle3d.imaging.voxels.splatting import splat_images

@@ -2,7 +2,7 @@
 
 import pytest
 
-from speckle3d.core.parts import whole_file
+from speckle3d.core.files import whole_file
 
 
 def fail_to_write(target):
