@@ -21,8 +21,12 @@ that share a frame share its speckle, and in-plane shifts their interpolation's 
 phantoms, as the other figures here."""
 STRUCTURE = np.array([19.0, 0.0, 0.0, 0.0, 0.0, 8.0])
 """Growth of these with the share of echoes that stay: structure that runs across hides motion along it."""
-SCALE_CHANGE_MM, TURN_CHANGE_MM = 2.0, 15.0
-"""Travel over which the error of the scale changes, with the tissue, and a hand's tilt and yaw wander."""
+SCALE_CHANGE_MM = 2.0
+"""Travel over which the error of the scale changes, with the tissue."""
+TURN_CHANGE_MM = 40.0
+"""Travel up to which a hand's turns wander rather than go on: with a steady rate of 0.05 degrees/mm they
+grow to 0.3 degrees in 1 mm, 0.7 in 4, 1.0 in 8 and 2.0 in 24. Tracked hands over phantoms turn by 0.3, 0.7 to
+0.9, 1.0 to 1.7 and 1.7 to 4.5 about each axis."""
 
 HELD = np.array([1.0, 1.0, 1.0, 0.05, 0.05, 0.05])
 """How far a probe may go between two frames that no pair joins, deviations of (x, y, z, tilt, yaw, roll), mm

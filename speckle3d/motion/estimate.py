@@ -132,14 +132,14 @@ def estimate_motion(problem: MotionProblem, table: CorrelationTable, sound: Bool
         for _ in range(ROUNDS):
             coherence = estimate_coherence(problem, table, sound, path)
             pairs = _signed_planes(problem, table, sound, path * coherence.scale, coherence)
-            slopes = weigh_slopes(pairs, coherence.covariance, problem.planes)
+            slopes = weigh_slopes(pairs, coherence.covariance, problem.planes, path)
             _, trajectory = solve_planes(problem, table, slopes.applied(pairs))
             path = elevation_of(trajectory.poses, problem.centre_mm)
         coherence = estimate_coherence(problem, table, sound, path)
         if lens_round and sheet and coherence.rows:
             path = path * coherence.scale
             problem = replace(problem, curves=with_fitted_lens(problem.curves, coherence.rows, sheet))
-    slopes = weigh_slopes(pairs, coherence.covariance, problem.planes)
+    slopes = weigh_slopes(pairs, coherence.covariance, problem.planes, path)
     pairs = pairs.scaled(coherence.scale)
     edges, trajectory = solve_planes(problem, table, slopes.applied(pairs))
     return Motion(problem, table, pairs, coherence, slopes, edges, trajectory.poses, trajectory.covariance)

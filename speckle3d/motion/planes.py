@@ -37,8 +37,11 @@ CROSSING_EVIDENCE = 6.0
 OUTLYING = 9.0
 """Squared deviations at which the misfit of a patch, or of a pair on a path, is capped: it may be wrong.
 Where frames cross, correlation is known to a few thousandths; one patch that lost it would outvote all."""
-LOOSE_SLOPE = 0.05
-"""Standard deviation of the slopes' prior, 3 degrees between frames that share speckle: keeps fits finite."""
+HAND_SLOPE = 0.015
+"""Standard deviation of slopes between frames that share speckle, 0.9 degrees: three times what tracked hands turn
+over a millimetre. With 0.05 a few patches take distance for turns: sweeps of six fold by rounding."""
+CROSSING_SLOPE = 0.05
+"""Largest slope, 3 degrees, of frames that are tried as crossing in the image: a probe rocked in place."""
 SENSED_SLOPE = 5e-4
 """Standard deviation of slopes between near frames from a smoothed orientation sensor: 0.03 degrees."""
 LEAST_SIGMA_MM = 1e-3
@@ -250,8 +253,10 @@ def pair_planes(
     start_slopes = np.zeros((rows.size, 2)) if slopes is None else np.ascontiguousarray(slopes)
     side = np.zeros(rows.size, dtype=bool) | either_side
     settings = problem.planes
-    slope_sd = SENSED_SLOPE if from_sensor else LOOSE_SLOPE
-    rules = FitRules(from_sensor, slope_sd, LOOSE_SLOPE, settings.huber, OUTLYING, CROSSING_EVIDENCE, ROUNDS)
+    slope_sd = SENSED_SLOPE if from_sensor else HAND_SLOPE
+    rules = FitRules(
+        from_sensor, slope_sd, CROSSING_SLOPE, settings.huber, OUTLYING, CROSSING_EVIDENCE, ROUNDS
+    )
     shift = _lever_shift(problem, table.inplane[rows, :2])
     fits = FittedPlanes(
         np.full((rows.size, 3), np.nan), np.tile(np.eye(3), (rows.size, 1, 1)), np.zeros(rows.size)

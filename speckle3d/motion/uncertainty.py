@@ -127,7 +127,8 @@ class SlopeWeights:
     share : ndarray, shape (2,)
         Of the slopes seen along x and y, yaw and tilt, that is believed.
     deviation_per_mm : ndarray, shape (2,)
-        Standard deviation of the slopes per distance that is left, rad/mm.
+        Standard deviation of the slopes per distance that is left and steady, rad/mm; the rest wanders as
+        `SharedErrors` has it.
     lever_mm : ndarray, shape (2,)
         Where patches lie from the image's centre, on average as planes weigh them.
     """
@@ -153,19 +154,28 @@ class SlopeWeights:
         return replace(planes, coefficients=coefficients, covariance=covariance)
 
 
-def weigh_slopes(planes: PairPlanes, covariance: FloatArray, settings: PlaneSettings) -> SlopeWeights:
+def weigh_slopes(
+    planes: PairPlanes, covariance: FloatArray, settings: PlaneSettings, path: FloatArray
+) -> SlopeWeights:
     """Weights of all pairs' slopes against false slopes from uneven errors of distances.
+
+    A hand's turn is expected to be steady and to wander, so that its mean per distance is the less certain
+    the shorter the sweep; what is feigned changes as much along the way.
 
     Parameters
     ----------
     covariance : ndarray, shape (3, 3)
         Of scale, yaw and tilt per distance; see `Coherence`.
+    path : ndarray, shape (n, 2) or (n, 3)
+        Its first column is each frame's elevational position, mm.
     """
     false = np.sqrt(np.diagonal(covariance)[1:])
-    travel = np.maximum((planes.offset_mm**2).sum(), 1e-12)
-    mean_slope = (planes.coefficients[:, 1:] * planes.coefficients[:, :1]).sum(axis=0) / travel
-    usual = np.deg2rad(settings.turn_deg_per_mm) ** 2
+    squares = np.maximum((planes.offset_mm**2).sum(), 1e-12)
+    mean_slope = (planes.coefficients[:, 1:] * planes.coefficients[:, :1]).sum(axis=0) / squares
+    way_mm = max(float(np.abs(np.diff(path[:, 0])).sum()), 1e-6)
+    steady = way_mm / (way_mm + TURN_CHANGE_MM)
+    usual = np.deg2rad(settings.turn_deg_per_mm) ** 2 / steady
     expected = np.maximum(usual, mean_slope**2 - BEYOND_DOUBT**2 * false**2)
     share = expected / (expected + false**2)
     information = np.linalg.inv(planes.covariance).sum(axis=0)
-    return SlopeWeights(share, np.sqrt(share) * false, information[0, 1:] / information[0, 0])
+    return SlopeWeights(share, np.sqrt(share * steady) * false, information[0, 1:] / information[0, 0])

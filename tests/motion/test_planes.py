@@ -10,7 +10,7 @@ from pair_planes import AT, PATCHES, TILT, fit, fit_many, problem_of
 from speckle3d.kernels.statistics import correlation_variance
 
 SIGMA_MM, CELLS = 0.45, 50
-PLANES = [(0.3, 0.0, 0.0), (0.25, 0.006, 0.0), (0.35, -0.003, 0.008), (0.9, 0.005, 0.01)]
+PLANES = [(0.3, 0.0, 0.0), (0.25, 0.006, 0.0), (0.35, -0.003, 0.008), (0.9, 0.005, 0.005)]
 CROSSING = [(0.0, 0.03, 0.0), (0.1, 0.03, 0.0), (0.3, -0.03, 0.0), (0.1, 0.015, 0.004)]
 PARALLEL = [(0.02, 0.0, 0.0), (0.1, 0.0, 0.0), (0.3, 0.006, 0.0), (0.3, 0.015, 0.0)]
 
@@ -79,7 +79,7 @@ def test_in_plane_motion_shifts_the_patches_with_the_second_frame():
 def test_curves_that_know_nothing_of_tilt_say_nothing_of_it():
     estimate = fit(problem(tilt=None), correlations((0.3, 0.006, 0.0), None))
     np.testing.assert_allclose(estimate.coefficients, (0.3, 0.006, 0.0), atol=2e-4)
-    assert np.sqrt(estimate.covariance[2, 2]) > 0.04
+    assert np.sqrt(estimate.covariance[2, 2]) > 0.01
     assert np.sqrt(fit(problem(), correlations(PLANES[0])).covariance[2, 2]) < 0.002
 
 
