@@ -170,8 +170,7 @@ def _fit_rows(
             model = np.logaddexp(reference + gain - fall * f, log_noise)
             return np.append(weight * (log_echo - model), (log_noise - LITTLE_NOISE) / NOISE_SIGMA)
 
-        starts = ([0.0, 0.0, log_noise] for log_noise in (LITTLE_NOISE, -1.0))
-        fit = min((least_squares(misfit, x, method="lm", args=row) for x in starts), key=lambda f: f.cost)
+        fit = least_squares(misfit, [0.0, 0.0, LITTLE_NOISE], method="lm", args=row)
         jacobian = np.asarray(fit.jac)
         variance = np.linalg.inv(jacobian.T @ jacobian)[1, 1]
         rows.append((fit.x[1], variance, 2.0 * fit.cost / (f.size - 3)))

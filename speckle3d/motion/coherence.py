@@ -61,8 +61,8 @@ LARGER_SHARES = [0.65, 0.8, 0.95]
 """Values of c. An echo that is structure for the most part is r^a alone, a curve of another width, and tells
 no scale; of intensity, structure's share is larger, because its phase does not count."""
 LEAST_GAIN, TINY = 0.05, 1e-12
-ROUNDS, LEAST_MEAN = 30, 1e-3
-"""Of the mean share, by expectation and maximisation; and the least that it comes to."""
+ROUNDS = 30
+"""Of the mean share, by expectation and maximisation."""
 
 
 @dataclass(frozen=True)
@@ -263,7 +263,7 @@ def _share_prior(by_share: FloatArray, share: FloatArray) -> FloatArray:
     mean, width = float(share.mean()), np.gradient(share)
     for _ in range(ROUNDS):
         log_prior = np.asarray(log_softmax(np.log(width) - share / mean))
-        mean = max(float((softmax(by_share + log_prior, axis=1) @ share).mean()), LEAST_MEAN)
+        mean = max(float((softmax(by_share + log_prior, axis=1) @ share).mean()), TINY)
     return log_prior
 
 

@@ -18,9 +18,8 @@ from speckle3d.core.relative import HELD, RelativePoses
 from speckle3d.matching.table import CorrelationTable
 from speckle3d.motion.planes import PairPlanes
 
-LAST_STEP = 1e-4
-"""Largest step, mm or rad, after which no further round is made."""
-ROUNDS = 6
+ROUNDS = 4
+"""Of Gauss-Newton; the next has steps below 1e-4 mm and rad."""
 COVARIANCE_FRAMES = 40
 """Frames whose covariance is computed; those of the others are interpolated."""
 INPLANE_FLOOR = (1e-6, 1e-6, 1e-9)
@@ -86,8 +85,6 @@ def solve_trajectory(
         step = np.zeros((frames, 6))
         step[1:] = -normal.solve(gradient).reshape(-1, 6)
         poses = poses * RigidTransform.from_exp_coords(step[:, _TWIST])
-        if np.abs(step).max() < LAST_STEP:
-            break
     centre = RigidTransform.from_translation(centre_mm)
     return Trajectory(centre * poses * centre.inv(), normal)
 
