@@ -56,7 +56,7 @@ def track(
     problem = MotionProblem(
         tissue.curves, matcher.patches, matcher.centre_mm, len(sweep), settings.planes, settings.trajectory
     )
-    motion = estimate_motion(problem, matches.table, matches.sound)
+    motion = estimate_motion(problem, matches.table.where(matches.sound))
     flags = placed_flags(matches.flags, motion.unplaced)
 
     credible, sensor_doubts = examine_sensors(sweep, motion.poses, settings.sensors.examine)

@@ -244,7 +244,7 @@ class LiveTracker:
             second=np.full(len(self._tables[number]), frames.size - 1),
         )
         problem, before = replace(motion.problem, frames=frames.size), self._poses[frames[:-1]]
-        rows = alike_pairs(problem, table)
+        rows = alike_pairs(problem, table, table.median)
         models = motion.coherence.models(np.full(rows.size, LAST))
         pairs, has_plane = pair_planes(problem, table, rows, models)
         pairs = pairs[has_plane].scaled(motion.coherence.scale)
@@ -276,7 +276,7 @@ class LiveTracker:
             return
         problem = replace(self._problem, frames=count - begin)
         try:
-            motion = estimate_motion(problem, table, sound)
+            motion = estimate_motion(problem, table.where(sound))
         except (InsufficientDataError, np.linalg.LinAlgError):
             # Frames that come later may tell.
             return

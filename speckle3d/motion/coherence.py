@@ -22,7 +22,7 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 from scipy.special import log_softmax, logsumexp, softmax
 
-from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
+from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.shown import shown
 from speckle3d.kernels.plane_misfit import EchoModels
 from speckle3d.kernels.statistics import INTERPOLATION, correlation_variance
@@ -159,10 +159,10 @@ class _Binning:
 
 
 def _bin_correlations(
-    problem: MotionProblem, table: CorrelationTable, sound: BoolArray, path: FloatArray
+    problem: MotionProblem, table: CorrelationTable, path: FloatArray
 ) -> tuple[_Binning, FloatArray]:
     """Average correlations over pairs of like distance; returns the middles of the sweep's pieces, too."""
-    first, second, correlation = table.first[sound], table.second[sound], table.correlation[sound]
+    first, second, correlation = table.first, table.second, table.correlation
     curves, levers, grid = problem.at_patches, problem.levers, problem.curves.distance_mm
     travel = np.append(0.0, np.cumsum(np.abs(np.diff(path[:, 0]))))
     pieces = max(1, int(travel[-1] / PIECE_MM))
@@ -197,9 +197,7 @@ def _bin_correlations(
     return binning, (ends[1:] + ends[:-1]) / 2
 
 
-def estimate_coherence(
-    problem: MotionProblem, table: CorrelationTable, sound: BoolArray, path: FloatArray
-) -> Coherence:
+def estimate_coherence(problem: MotionProblem, table: CorrelationTable, path: FloatArray) -> Coherence:
     """Estimate shares of structure, gains, and the scale of distances along the path.
 
     Shares are exponentially distributed, their mean being that of all patches, and all powers alike likely.
@@ -208,12 +206,10 @@ def estimate_coherence(
 
     Parameters
     ----------
-    sound : ndarray of bool, shape (e,)
-        Pairs of the table that count.
     path : ndarray, shape (n, 2) or (n, 3)
         Elevational position of each frame's centre, and its slopes along x and, if known, y.
     """
-    binning, centres = _bin_correlations(problem, table, sound, path)
+    binning, centres = _bin_correlations(problem, table, path)
     patches = problem.patches
     unknown = np.diag([PHANTOM_SIGMA, *LOOSE]) ** 2
     as_measured = Coherence(np.zeros(1), *fully_developed(len(patches)), 1.0, unknown)

@@ -12,6 +12,7 @@ from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.geometry import mirrored
 from speckle3d.core.reconstruction import FramePairs, SharedErrors
 from speckle3d.core.relative import MIRROR, RelativePoses
+from speckle3d.kernels.plane_misfit import EchoModels
 from speckle3d.matching.table import CorrelationTable
 from speckle3d.motion.coherence import Coherence, estimate_coherence
 from speckle3d.motion.lens import with_fitted_lens
@@ -102,7 +103,7 @@ class Motion:
         )
 
 
-def estimate_motion(problem: MotionProblem, table: CorrelationTable, sound: BoolArray) -> Motion:
+def estimate_motion(problem: MotionProblem, table: CorrelationTable) -> Motion:
     """Estimate shares of structure, scale of distances and path by alternation.
 
     All that iterates does so here. Distances and their scale need the path, the path needs distances: both
@@ -112,30 +113,30 @@ def estimate_motion(problem: MotionProblem, table: CorrelationTable, sound: Bool
     Parameters
     ----------
     table : CorrelationTable
-    sound : ndarray of bool, shape (e,)
-        Pairs both of whose frames are to be trusted.
+        Of pairs both of whose frames are to be trusted.
 
     Raises
     ------
     InsufficientDataError
         If no pair determines a plane.
     """
-    models = fully_developed(table.correlation.shape[1])
-    alike, firm = pair_planes(problem, table, alike_pairs(problem, table), models)
-    apart = strangers(problem, table)
-    path = likeliest_path(alike[firm], problem.frames, apart)
+    rows, models = alike_pairs(problem, table, table.median), fully_developed(table.correlation.shape[1])
+    _, path = _signed_planes(problem, table, rows, models)
     sheet, tilt = problem.curves.nominal, problem.curves.tilt
     lens_rounds = LENS_ROUNDS * (problem.curves.origin == "data sheet")
     for lens_round in range(lens_rounds, -1, -1):
         # Tilt bends rows as a lens does: it is left out until the lens is known.
         problem = replace(problem, curves=replace(problem.curves, tilt=None if lens_round else tilt))
         for _ in range(ROUNDS):
-            coherence = estimate_coherence(problem, table, sound, path)
-            pairs = _signed_planes(problem, table, sound, path * coherence.scale, coherence)
+            coherence = estimate_coherence(problem, table, path)
+            apart_mm = coherence.scale * np.abs(path[table.second, 0] - path[table.first, 0])
+            rows = alike_pairs(problem, table, problem.typical_correlation(apart_mm))
+            models = coherence.models(table.first[rows])
+            pairs, _ = _signed_planes(problem, table, rows, models, apart_mm[rows])
             slopes = weigh_slopes(pairs, coherence.covariance, problem.planes, path)
             _, trajectory = solve_planes(problem, table, slopes.applied(pairs))
             path = elevation_of(trajectory.poses, problem.centre_mm)
-        coherence = estimate_coherence(problem, table, sound, path)
+        coherence = estimate_coherence(problem, table, path)
         if lens_round and sheet and coherence.rows:
             path = path * coherence.scale
             problem = replace(problem, curves=with_fitted_lens(problem.curves, coherence.rows, sheet))
@@ -153,49 +154,37 @@ def solve_planes(
     return edges, solve_trajectory(edges, problem.frames, problem.centre_mm, huber)
 
 
-def alike_pairs(problem: MotionProblem, table: CorrelationTable) -> IntArray:
-    """Rows of correlated pairs; for frames without any, of their best pair."""
-    alike = table.median >= problem.trajectory.least_correlation
-    return np.flatnonzero(alike | _is_best(table.second, table.median))
+def alike_pairs(problem: MotionProblem, table: CorrelationTable, correlation: FloatArray) -> IntArray:
+    """Rows of correlated pairs; for frames without any, of their best pair, if it tells a little.
 
-
-def _is_best(frame: IntArray, score: FloatArray) -> BoolArray:
-    """Whether no pair of the same frame scores higher, shape (e,); frames increase."""
-    _, begin, count = np.unique(frame, return_index=True, return_counts=True)
-    return np.asarray(score >= np.repeat(np.fmax.reduceat(score, begin), count))
+    Parameters
+    ----------
+    correlation : ndarray, shape (e,)
+        As measured, or of fully developed speckle as far apart.
+    """
+    _, begin, count = np.unique(table.second, return_index=True, return_counts=True)
+    is_best = correlation >= np.repeat(np.fmax.reduceat(correlation, begin), count)
+    alike = correlation >= problem.trajectory.least_correlation
+    return np.flatnonzero(alike | (is_best & (table.median >= LEAST_CORRELATION)))
 
 
 def _signed_planes(
     problem: MotionProblem,
     table: CorrelationTable,
-    sound: BoolArray,
-    path: FloatArray,
-    coherence: Coherence,
-) -> PairPlanes:
-    """Planes of the pairs near enough on a path, with the signs of the likeliest path through them."""
-    apart = np.abs(path[table.second, 0] - path[table.first, 0])
-    rows = _near_pairs(problem, table, apart, sound)
-    planes, firm = pair_planes(problem, table, rows, coherence.models(table.first[rows]), apart[rows])
+    rows: IntArray,
+    models: EchoModels,
+    start_mm: FloatArray | None = None,
+) -> tuple[PairPlanes, FloatArray]:
+    """Planes of some pairs, with the signs of the likeliest path through them, and that path."""
+    planes, firm = pair_planes(problem, table, rows, models, start_mm)
     planes = planes[firm]
     if not len(planes):
         raise InsufficientDataError(
             f"expected frame pairs whose patches determine a plane, got none in {len(table)} pairs of "
             f"{table.correlation.shape[1]} patches: is the image wide enough, and do the curves fit it?"
         )
-    apart = strangers(problem, table.where(sound))
-    return on_path(planes, likeliest_path(planes, problem.frames, apart))
-
-
-def _near_pairs(
-    problem: MotionProblem, table: CorrelationTable, apart_mm: FloatArray, sound: BoolArray
-) -> IntArray:
-    """Rows of pairs so near that fully developed speckle would keep enough correlation.
-
-    Frames without any take the pair of which it would keep most, if that tells a little.
-    """
-    left = np.where(sound, problem.typical_correlation(apart_mm), -1.0)
-    nearest = _is_best(table.second, left) & (table.median >= LEAST_CORRELATION)
-    return np.flatnonzero(sound & ((left >= problem.trajectory.least_correlation) | nearest))
+    path = likeliest_path(planes, problem.frames, strangers(problem, table))
+    return on_path(planes, path), path
 
 
 def strangers(problem: MotionProblem, table: CorrelationTable) -> Strangers:

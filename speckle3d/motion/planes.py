@@ -38,8 +38,8 @@ OUTLYING = 9.0
 """Squared deviations at which the misfit of a patch, or of a pair on a path, is capped: it may be wrong.
 Where frames cross, correlation is known to a few thousandths; one patch that lost it would outvote all."""
 HAND_SLOPE = 0.015
-"""Standard deviation of slopes between frames that share speckle, 0.9 degrees: three times what tracked hands turn
-over a millimetre. With 0.05 a few patches take distance for turns: sweeps of six fold by rounding."""
+"""Standard deviation of slopes between frames that share speckle, 0.9 degrees: three times what tracked hands
+turn over a millimetre. With 0.05 a few patches take distance for turns: sweeps of six fold by rounding."""
 CROSSING_SLOPE = 0.05
 """Largest slope, 3 degrees, of frames that are tried as crossing in the image: a probe rocked in place."""
 SENSED_SLOPE = 5e-4
