@@ -63,8 +63,6 @@ _LEAST_EFFECT = 1e-9
 """Share of the largest squared effect below which an error along an axis moves no residual."""
 _STEPS = 3
 """The first finds the answer, the second takes the errors out of the derivatives, the third the rest."""
-_SMALL_STEP = 0.05
-"""Standard errors of a second step below which there is no third."""
 
 
 @dataclass(frozen=True)
@@ -258,7 +256,7 @@ def fit_noise(
     effects = effects.reshape(-1, 7) @ axes.T
     lonely = len(starts) - 1 == len(further_slopes)
     grid = make_grid(effects, frame_time_s, proportions, (0.0,) if lonely else JITTER)
-    for number in range(_STEPS):
+    for _ in range(_STEPS):
         values, derivatives = exact.at(chain)
         # What was taken out of the points, put back as the small thing that it is.
         residuals = values.ravel() + expected + further_slopes @ further
@@ -273,8 +271,6 @@ def fit_noise(
         step[columns] = noise.step[:count]
         chain, further = chain.displace(step), further + noise.step[count:]
         exact, expected = _denoise(equations, chain, residuals, effects, axes, starts, noise)
-        if number > 0 and (np.abs(noise.step) <= _SMALL_STEP * np.sqrt(np.diag(noise.covariance))).all():
-            break
     return chain, further, noise.covariance
 
 

@@ -20,7 +20,7 @@ from calibration.detection.labelling import label_by_calibration, label_dots
 from calibration.points import Detections, ImagePoints
 from calibration.wires import Wires, solve_wires
 from speckle3d.core.arrays import FloatArray
-from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.wires import WirePhantom
 
 _PLUS_SHARE = 0.95
@@ -61,11 +61,9 @@ def middle_wires(points: ImagePoints, phantom: WirePhantom) -> tuple[ImagePoints
     InvalidInputError
         If the points have no wires.
     """
-    if points.wire is None:
-        raise InvalidInputError("points: expected the wire of each, got none")
     # Number of the point that shows each wire in each frame; none is -1.
     point_of = np.full((points.frame.max(initial=0) + 1, len(phantom)), -1)
-    point_of[points.frame, points.wire] = np.arange(len(points))
+    point_of[points.frame, points.wires] = np.arange(len(points))
     middles, places = [np.zeros(0, dtype=np.int64)], [np.zeros((0, 3))]
     for shape, crossings in zip(phantom.n_shapes, phantom.crossings_mm(), strict=True):
         together = point_of[:, list(shape)]

@@ -15,7 +15,6 @@ References
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -44,8 +43,7 @@ _HOPELESS = 3.0
 """Ends whose mean absolute residual is as many times the least are not looked at again."""
 _TINY = 1e-12
 """Of a normal matrix's diagonal, where residuals do not depend on a parameter at all."""
-_HALF_TURN_Z, _HALF_TURN_X = np.diag([-1.0, -1.0, 1.0, 1.0]), np.diag([1.0, -1.0, -1.0, 1.0])
-"""Half a turn about the z axis, and about the x axis."""
+_HALF_TURN_X = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 # 1. The chain: image -> sensor -> world -> phantom (TR 303, section 3)
@@ -95,13 +93,20 @@ class Chain:
         of_target[:3, :3], of_target[:3, 3] = turns[1], step[8:11]
         return Chain(np.abs(size), self.probe @ of_image, of_target @ self.target)
 
+    def half_turn(self, axis: int, centre_mm: FloatArray | float = 0.0) -> Chain:
+        """Turn the image by half about one of its axes through a place in it."""
+        turn = np.diag([*(2.0 * np.eye(3)[axis] - 1.0), 1.0])
+        turn[:3, 3] = (1.0 - np.diag(turn)[:3]) * centre_mm
+        return replace(self, probe=self.probe @ turn)
+
     def mirror(self) -> Chain:
-        """The image turned by half in its plane: lines of a plane have the same directions."""
-        return replace(self, probe=self.probe @ _HALF_TURN_Z)
+        """Turn the image by half in its plane: lines of a plane have the same directions."""
+        return self.half_turn(2)
 
 
-class Phantom(ABC):
-    """Residuals of a phantom in its own frame.
+@dataclass(frozen=True)
+class Phantom:
+    """A plane through the origin of its own frame, or a point there.
 
     Attributes
     ----------
@@ -109,40 +114,31 @@ class Phantom(ABC):
         Those of `TARGET` that images of the phantom determine.
     seen_as : str
         What the points are.
+    across : tuple of tuple of float, shape (r, 3)
+        Directions along which a point's distance from the origin must vanish: the plane's normal (TR 303,
+        equation 8), or all three (equation 3).
     """
 
     unknowns: tuple[str, ...]
     seen_as: SeenAs
-
-    @abstractmethod
-    def vanishing(self, points: ImagePoints) -> tuple[FloatArray, FloatArray]:
-        """Rows, shape (n, r, 3), and offsets, (n, r): ``rows @ position - offsets`` is the residual, mm."""
+    across: tuple[tuple[float, ...], ...] = ((0.0, 0.0, 1.0),)
 
     def equations(self, points: ImagePoints) -> Equations:
         """Residual equations of some points."""
-        return Equations(points, *self.vanishing(points))
+        rows = np.broadcast_to(self.across, (len(points), len(self.across), 3))
+        return Equations(points, rows, np.zeros(rows.shape[:2]))
 
 
-@dataclass(frozen=True)
-class Plane(Phantom):
-    """A plane at z = 0 of its own frame: one equation for each point (TR 303, equation 8)."""
-
-    unknowns: tuple[str, ...] = ("z_c", "beta_c", "gamma_c")
-    seen_as: SeenAs = "line"
-
-    def vanishing(self, points: ImagePoints) -> tuple[FloatArray, FloatArray]:
-        """Height above the plane."""
-        n = len(points)
-        return np.broadcast_to(np.array([[0.0, 0.0, 1.0]]), (n, 1, 3)), np.zeros((n, 1))
+PLANE = Phantom(("z_c", "beta_c", "gamma_c"), "line")
 
 
-def line_directions(level: bool = False) -> Plane:
+def line_directions(level: bool = False) -> Phantom:
     """A plane of which line directions alone are used, wherever it is (TR 303, appendix A; Housden 2008).
 
     `ImagePoints.pixels` then holds directions (`as_directions`), and the poses have no translation: what
     vanishes is the sine of the angle between line and plane. A level one's normal is the world's z axis.
     """
-    return Plane(() if level else ("beta_c", "gamma_c"), "direction")
+    return Phantom(() if level else ("beta_c", "gamma_c"), "direction")
 
 
 # 2. Residuals, their derivatives, and least squares
@@ -155,7 +151,7 @@ class Equations:
     Attributes
     ----------
     rows, offsets : ndarray, shapes (n, r, 3) and (n, r)
-        See `Phantom.vanishing`.
+        ``rows @ position - offsets`` is the residual, mm.
     """
 
     points: ImagePoints
@@ -288,7 +284,7 @@ def calibrate_plane(
         determine the answer; then the missing motions are named.
     """
     s = settings or PlaneFit()
-    problem = Problem.of(Plane(), pixel_mm, s, s.pixel_error)
+    problem = Problem.of(PLANE, pixel_mm, s, s.pixel_error)
     solution = _from_stages(lines, problem)
     if solution.contradicts_prior:
         # Lines that contradict the pixel size given are believed if they determine it by themselves.

@@ -145,6 +145,13 @@ class ImagePoints:
         """Translations of the poses, shape (n, 3)."""
         return np.asarray(self.world_from_sensor.translation)
 
+    @property
+    def wires(self) -> IntArray:
+        """`wire`, which must be known."""
+        if self.wire is None:
+            raise InvalidInputError("points: expected the wire of each, got none")
+        return self.wire
+
     @cached_property
     def frames(self) -> IntArray:
         """Numbers of the frames that have points, ascending."""

@@ -10,7 +10,6 @@ from math import ceil
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.special import ndtr, stdtrit
 
 from calibration.motion import DOUBTS, Adequacy, judge
@@ -302,7 +301,7 @@ class Problem:
         InsufficientDataError
             If there are too few frames, or fewer than half of them agree.
         """
-        frames, equations = len(points.frames), self.phantom.vanishing(points)[1].size
+        frames, equations = len(points.frames), self.phantom.equations(points).offsets.size
         fewest = max(_FEWEST_FRAMES, ceil(_FEWEST_EQUATIONS * len(self.free) * frames / max(equations, 1)))
         if frames < fewest:
             raise InsufficientDataError(
@@ -394,9 +393,7 @@ def half_turns(chain: Chain, points: ImagePoints, phantom: Phantom) -> list[Chai
     """
     directions = phantom.seen_as == "direction"
     middle = np.append(np.median(points.pixels, axis=0) * chain.pixel_mm, 0.0) * (not directions)
-    turns = [Rotation.from_rotvec(np.pi * axis) for axis in np.eye(3)[: 2 if directions else 3]]
-    steps = [RigidTransform.from_components(middle - turn.apply(middle), turn) for turn in turns]
-    return [replace(chain, probe=chain.probe @ step.as_matrix()) for step in steps]
+    return [chain.half_turn(axis, middle) for axis in range(2 if directions else 3)]
 
 
 def are_distinct(first: Chain, second: Chain, points: ImagePoints, phantom: Phantom) -> bool:

@@ -12,7 +12,7 @@ References
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.linalg import toeplitz
@@ -20,13 +20,12 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from calibration.consensus import GATES_MM, choose_by_frame, find_consensus
 from calibration.motion import require_adequate
-from calibration.plane import Chain, Phantom
-from calibration.points import POSE, SOME_FRAMES, TARGET, ImagePoints, SeenAs, affine_equations
+from calibration.plane import Chain, Equations, Phantom
+from calibration.points import POSE, SOME_FRAMES, TARGET, ImagePoints, affine_equations
 from calibration.robust import robust_linear
 from calibration.settings import WireFit
 from calibration.solution import Problem, Solution
 from speckle3d.core.arrays import FloatArray
-from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.geometry import nearest_rotation
 from speckle3d.core.wires import WirePhantom
 
@@ -38,17 +37,8 @@ _AS_IT_IS = Rotation.identity()
 """A point has no orientation."""
 
 
-@dataclass(frozen=True)
-class CrossWire(Phantom):
-    """Two wires that cross, or a bead: one point, three equations (TR 303, equation 3)."""
-
-    unknowns: tuple[str, ...] = TARGET[:3]
-    seen_as: SeenAs = "dot"
-
-    def vanishing(self, points: ImagePoints) -> tuple[FloatArray, FloatArray]:
-        """Displacement from the crossing."""
-        n = len(points)
-        return np.broadcast_to(np.eye(3), (n, 3, 3)), np.zeros((n, 3))
+CROSSING = Phantom(TARGET[:3], "dot", ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)))
+"""Two wires that cross, or a bead: one point, three equations (TR 303, equation 3)."""
 
 
 @dataclass(frozen=True)
@@ -58,19 +48,13 @@ class Wires(Phantom):
     Parameters
     ----------
     geometry : WirePhantom
-    unknowns : tuple of str
-        Parameters of the phantom's place in the tracker's world that are estimated; the others are held.
     """
 
-    geometry: WirePhantom
-    unknowns: tuple[str, ...] = TARGET
-    seen_as: SeenAs = "dot"
+    geometry: WirePhantom = field(kw_only=True)
 
-    def vanishing(self, points: ImagePoints) -> tuple[FloatArray, FloatArray]:
-        """Displacement from the wire, along two directions across it."""
-        if points.wire is None:
-            raise InvalidInputError("expected points with the wire each lies on, got points without")
-        return self.geometry.equations(points.wire)
+    def equations(self, points: ImagePoints) -> Equations:
+        """Displacements from the wires, along two directions across each."""
+        return Equations(points, *self.geometry.equations(points.wires))
 
 
 def calibrate_cross_wire(
@@ -92,7 +76,7 @@ def calibrate_cross_wire(
         If there are too few points, no more of them agree than chance candidates would, or the motion does
         not determine the answer.
     """
-    s, phantom = settings or WireFit(), CrossWire()
+    s, phantom = settings or WireFit(), CROSSING
     problem = Problem.of(phantom, pixel_mm, s)
     consensus = find_consensus(points, pixel_mm)
     if not consensus.is_significant and len(points) == len(points.frames):
@@ -169,7 +153,8 @@ def solve_wires(
         place = place * RigidTransform.from_translation(middle)
     # In a frame whose origin is the wires' middle, about which the phantom may be turned.
     about_middle = replace(geometry, ends_mm=geometry.ends_mm - middle, world_from_phantom=place)
-    phantom = Wires(about_middle, TARGET if place is None else _REGISTRATIONS[s.registration])
+    unknowns = TARGET if place is None else _REGISTRATIONS[s.registration]
+    phantom = Wires(unknowns, "dot", geometry=about_middle)
     problem = Problem.of(phantom, pixel_mm, s)
     few = points.of_some_frames(SOME_FRAMES)
     # Without a place, the rotations of an icosahedron, 36 degrees apart.
@@ -210,8 +195,8 @@ def wire_start(
     median_mm : float
         Of the residuals' magnitudes, before the axes are squared.
     """
-    rows, offsets = problem.phantom.vanishing(points)
-    target = np.eye(4)
+    equations = problem.phantom.equations(points)
+    rows, offsets, target = equations.rows, equations.offsets, np.eye(4)
     if isinstance(target_from_world, Rotation):
         target[:3, :3] = target_from_world.as_matrix()
     else:

@@ -84,7 +84,7 @@ def crossings_in_frames(
         If an argument is not what it must be.
     """
     size, standing = checked_pixel(pixel_mm), standing_still(frames)
-    inside = None if region_px is None else region_mask(frames.shape[1:], region_px)
+    inside = region_mask(frames.shape[1:], region_px)
     return detect_in_frames(frames, lambda image: _crossings(image, size, inside, standing), progress)
 
 
@@ -103,14 +103,13 @@ def standing_still(frames: Frames) -> Float32Array | None:
 def _crossings(
     image: npt.NDArray[Any],
     pixel_mm: FloatArray,
-    inside: BoolArray | None,
+    inside: BoolArray,
     standing: Float32Array | None,
 ) -> tuple[FloatArray, FloatArray]:
     grey = finite_grey(image)
     if standing is not None:
         grey = grey - standing
-    if inside is not None:
-        grey = np.where(inside, grey, np.float32(0.0))
+    grey = np.where(inside, grey, np.float32(0.0))
     features = extra_module("skimage.feature", "calibrate", "finding crossings")
     places, scores = [], []
     for width in _WIDTH_MM * np.array(_WIDTHS):
@@ -125,9 +124,8 @@ def _crossings(
         places.append((peaks + np.clip(between, -0.5, 0.5).T) * step_px)
         scores.append(response[tuple(peaks.T)])
     pixels, score = np.concatenate(places), np.concatenate(scores)
-    if inside is not None:
-        column, row = np.minimum(np.rint(pixels).astype(int), np.array(grey.shape) - 1).T
-        pixels, score = pixels[inside[column, row]], score[inside[column, row]]
+    column, row = np.minimum(np.rint(pixels).astype(int), np.array(grey.shape) - 1).T
+    pixels, score = pixels[inside[column, row]], score[inside[column, row]]
     best: list[int] = []
     for k in np.argsort(-score, kind="stable"):
         away = np.linalg.norm((pixels[best] - pixels[k]) * pixel_mm, axis=1)

@@ -65,24 +65,21 @@ def dots_in_frames(
     InvalidInputError
         If an argument is not what it must be.
     """
-    size = checked_pixel(pixel_mm)
-    inside = None if region_px is None else region_mask(frames.shape[1:], region_px)
+    size, inside = checked_pixel(pixel_mm), region_mask(frames.shape[1:], region_px)
     return detect_in_frames(frames, lambda image: _dots(image, size, inside), progress)
 
 
-def _dots(
-    image: npt.NDArray[Any], pixel_mm: FloatArray, inside: BoolArray | None
-) -> tuple[FloatArray, FloatArray]:
+def _dots(image: npt.NDArray[Any], pixel_mm: FloatArray, inside: BoolArray) -> tuple[FloatArray, FloatArray]:
     grey = finite_grey(image)
     contrast = ndimage.gaussian_filter(grey, _DOT_MM / pixel_mm)
     contrast -= ndimage.gaussian_filter(grey, _SURROUND_MM / pixel_mm, truncate=3.0)
     # Every seventh pixel: enough for the noise, in a seventh of the time.
-    levels = (contrast if inside is None else contrast[inside]).ravel()
+    levels = contrast[inside]
     limit = max(_NOISE_SDS * robust_sigma(levels[::7]), _FAINTEST * float(levels.max()))
     near = np.ones(2 * np.maximum(np.rint(_APART_MM / pixel_mm), 1).astype(int) + 1, dtype=bool)
     features = extra_module("skimage.feature", "calibrate", "finding dots of wires")
     peaks = features.peak_local_max(contrast, footprint=near, threshold_abs=limit, exclude_border=False)
-    peaks = peaks if inside is None else peaks[inside[tuple(peaks.T)]]
+    peaks = peaks[inside[tuple(peaks.T)]]
     score = contrast[tuple(peaks.T)] - _along_lines(contrast, peaks, pixel_mm)
     best = np.argsort(-score, kind="stable")
     best = best[score[best] > limit][:_MOST_DOTS]

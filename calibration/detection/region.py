@@ -56,21 +56,23 @@ class Columns:
         return np.take_along_axis(samples, self._nearest, axis=1)
 
 
-def region_mask(shape: tuple[int, ...], region_px: npt.ArrayLike) -> BoolArray:
+def region_mask(shape: tuple[int, ...], region_px: npt.ArrayLike | None) -> BoolArray:
     """Mask of an image's pixels in a polygon, its sides included.
 
     Parameters
     ----------
     shape : tuple of int
         Columns and rows of the image.
-    region_px : array_like, shape (k, 2)
-        Corners (column, row) of any simple polygon.
+    region_px : array_like, shape (k, 2), or None
+        Corners (column, row) of any simple polygon; None is the whole image.
 
     Raises
     ------
     InvalidInputError
         If the region is not a polygon, or covers nothing.
     """
+    if region_px is None:
+        return np.ones(shape, dtype=bool)
     mask = polygon_mask(np.moveaxis(np.indices(shape, float), 0, -1), region_px, "region_px")
     if not mask.any():
         raise InvalidInputError(
@@ -94,14 +96,9 @@ def lay_columns(shape: tuple[int, ...], count: int, region_px: npt.ArrayLike | N
     InvalidInputError
         If the region is not a polygon, or covers nothing.
     """
-    if region_px is None:
-        column = spread(shape[0], count)
-        return Columns(column, np.ones((column.size, shape[1]), dtype=bool))
     mask = region_mask(shape, region_px)
-    reach = np.asarray(region_px, dtype=float)[:, 0]
-    first, last = max(0, int(np.ceil(reach.min()))), min(shape[0] - 1, int(np.floor(reach.max())))
-    column = first + spread(last - first + 1, count)
-    column = column[mask[column].any(axis=1)]
+    column = np.flatnonzero(mask.any(axis=1))
+    column = column[spread(column.size, count)]
     return Columns(column, mask[column])
 
 

@@ -67,8 +67,7 @@ class Stack:
     @property
     def centre_mm(self) -> FloatArray:
         """The images' centre in the image's frame, shape (3,)."""
-        last = np.array(self.images.shape[1:]) - 1.0
-        return np.append(self.pixels[2:] + last * self.pixels[:2] / 2.0, 0.0)
+        return np.asarray(self.corners_mm.mean(axis=0))
 
     @property
     def corners_mm(self) -> FloatArray:

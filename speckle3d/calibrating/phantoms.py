@@ -30,7 +30,7 @@ from calibration.recording import (
 )
 from calibration.repeatability import validate
 from calibration.report import figure_report
-from calibration.wires import CrossWire, Wires, calibrate_cross_wire, calibrate_wires
+from calibration.wires import CROSSING, Wires, calibrate_cross_wire, calibrate_wires
 from speckle3d.calibrating.recordings import open_recording
 from speckle3d.calibrating.settings import (
     OrientationSettings,
@@ -202,7 +202,7 @@ def validation_notes(outcome: Outcome, settings: ScanSettings, progress: Progres
         detections = detect_phantom(recording, settings, progress)
         seconds = outcome.calibration.time_offset_s
         offset_s = recording.time_offset_s if seconds is None else seconds
-        if isinstance(outcome.solution.phantom, CrossWire):
+        if outcome.solution.phantom == CROSSING:
             detections = choose_crossings(recording, detections, [offset_s])
         points, _ = with_poses(recording, detections, offset_s)
         residuals = validate(outcome.solution, points)

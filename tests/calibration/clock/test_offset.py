@@ -5,7 +5,7 @@ import pytest
 from floor_scenes import Floor
 
 from calibration.clock.fitted import estimate_offset
-from calibration.plane import Chain, Plane
+from calibration.plane import PLANE, Chain
 from calibration.points import POSE, ImagePoints
 from calibration.solution import Problem
 from speckle3d.core.errors import InsufficientDataError
@@ -24,7 +24,7 @@ def estimate(seed, search_s):
     frame_s, pixels = frame_s[inside], pixels[inside]
     points = ImagePoints.of_lines(np.arange(len(frame_s)), pixels, readings.at(frame_s), frame_s)
     return estimate_offset(
-        lambda subset: Problem(Plane(), POSE).solve(subset, truth), points, readings, search_s=search_s
+        lambda subset: Problem(PLANE, POSE).solve(subset, truth), points, readings, search_s=search_s
     )
 
 
