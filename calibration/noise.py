@@ -254,8 +254,8 @@ def fit_noise(
     effects = error_effects(equations, chain)
     axes, proportions = _error_axes(effects, seen_as)
     effects = effects.reshape(-1, 7) @ axes.T
-    lonely = len(starts) - 1 == len(further_slopes)
-    grid = make_grid(effects, frame_time_s, proportions, (0.0,) if lonely else JITTER)
+    # Of one residual a frame, jitter is white noise.
+    grid = make_grid(effects, frame_time_s, proportions, JITTER[:1] if seen_as == "direction" else JITTER)
     for _ in range(_STEPS):
         values, derivatives = exact.at(chain)
         # What was taken out of the points, put back as the small thing that it is.
