@@ -146,7 +146,7 @@ class SequenceHeader:
         return values.reshape(self.frame_count, self.size[1], self.size[0])
 
     def numbers(self) -> AnyArray:
-        """Map or unpack the numbers, in one row; raw ones of the machine's byte order stay on the disk.
+        """Map or unpack the numbers, in one row, of the file's byte order; raw ones stay on the disk.
 
         Raises
         ------
@@ -169,7 +169,7 @@ class SequenceHeader:
         if values.size < count:
             whole = values.size * self.frame_count // count
             raise FileError(f"{self.path}: ends early: {whole} of {self.frame_count} frames")
-        return values[:count].astype(self.dtype.newbyteorder("="), copy=False)
+        return values[:count]
 
 
 def _unpack(content: bytes, encoding: str) -> bytes:
