@@ -103,7 +103,7 @@ def require_suffix(path: PathLike, suffixes: Sequence[str]) -> str:
     name = Path(path).name.lower()
     suffix = next((suffix for suffix in (LABELS_ALONE, *suffixes) if name.endswith(suffix)), None)
     if suffix is None or suffix not in suffixes:
-        others = f", not in {suffix}, of labels alone" if suffix else ""
+        others = f", not {suffix}, which is of labels alone" if suffix else ""
         raise InvalidInputError(f"{path}: expected a name ending in {', '.join(suffixes)}{others}")
     return suffix
 
