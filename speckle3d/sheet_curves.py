@@ -34,6 +34,8 @@ UNIFORM = 1.0 / np.sqrt(3.0)
 LATERAL_CELL = 1.5
 """Width of a cell of speckle over wavelength times f-number: 0.9 for an even aperture, more for tapered
 ones."""
+PULSE_EDGES = 1.0
+"""Width of what a pulse has on either side of the band that sheets state, -6 dB, over the band's."""
 GRID_MM = 0.01
 LEAST_AMPLITUDE = 1e-4
 
@@ -132,9 +134,11 @@ def data_sheet_curves(
         key, rows, texture = matcher.key, matcher.patches.row_depth_mm, measured_texture(like, matcher)
         size, spectra = texture.speckle_size(), texture.spectra()
         area = 2.0 * np.pi * _interpolate(rows, size.lateral_mm) * _interpolate(rows, size.axial_mm)
+    # Of grey levels no filter takes away what the pulse has beyond -6 dB.
+    edge_fraction = PULSE_EDGES
     if isinstance(key.signal, RFSettings):
-        band = key.signal.bandwidth_hz
-    frequency = band_nodes(band, key.edge_fraction)
+        band, edge_fraction = key.signal.bandwidth_hz, key.edge_fraction
+    frequency = band_nodes(band, edge_fraction)
     inside = key.patch_height_mm * ((np.arange(SUB_DEPTHS) + 0.5) / SUB_DEPTHS - 0.5)
     depths = np.maximum(rows[:, None] + inside, 1.0)
     if spectra is None:
@@ -142,11 +146,11 @@ def data_sheet_curves(
         spectrum = sheet_spectrum(frequency, (probe.low_hz, probe.high_hz), *exponents, depths)
     else:
         spectrum = spectra.at(depths, frequency)
-    weight = spectrum * band_weights(frequency, *band, key.edge_fraction * (band[1] - band[0])) ** 2
+    weight = spectrum * band_weights(frequency, *band, edge_fraction * (band[1] - band[0])) ** 2
     area = area if np.isfinite(area).all() else _speckle_area(sheet, frequency, weight.mean(axis=1))
     cells = key.patch_width_mm * key.patch_height_mm / area
     grid = GRID_MM * np.arange(round(settings.curves.largest_mm / GRID_MM) + 1, dtype=float)
-    rho = speckle_correlation(probe, depths, frequency, weight, grid, speed)
+    rho = speckle_correlation(probe, depths, frequency, weight, grid, speed, spectra is None)
     if key.correlation_of == "echo":
         rho += (1.0 - rho) ** 2 / cells[:, None]
     rho, tilt = np.minimum.accumulate(np.clip(rho, LEAST_AMPLITUDE, 1.0), axis=1), None

@@ -85,6 +85,7 @@ def speckle_correlation(
     power: FloatArray,
     distance_mm: FloatArray,
     speed_m_s: float = SPEED_M_S,
+    at_focus: bool = False,
 ) -> FloatArray:
     """Correlation of fully developed speckle, the squared magnitude of the echo's, shape (r, k).
 
@@ -95,15 +96,16 @@ def speckle_correlation(
     power : ndarray, shape (r, y, f)
         Of the echo at the frequencies, in any unit: each depth counts the same, as images are equalised.
     distance_mm : ndarray, shape (k,)
+    at_focus : bool
+        Whether the power is that of scatterers at the lens's focus. Away from it, high frequencies lose what
+        they gain there by a narrower beam.
     """
-    weight = power / power.sum(axis=-1, keepdims=True)
-    fields, z = _two_way_fields(probe, depth_mm.ravel(), frequency_hz, speed_m_s)
-    size = 2 * z.size
-    spectra = np.abs(fft.fft(fields, size, axis=-1)) ** 2
+    fields, z = _two_way_fields(probe, np.append(depth_mm, probe.focus_mm), frequency_hz, speed_m_s)
+    spectra = np.abs(fft.fft(fields, 2 * z.size, axis=-1)) ** 2
     energy = spectra.mean(axis=-1)
-    shares = weight.reshape(-1, weight.shape[-1]) / energy
-    kept = fft.ifft((shares[..., None] * spectra).sum(axis=1), axis=-1).real[:, : z.size]
-    mean = kept.reshape(*depth_mm.shape, -1).mean(axis=1)
+    shares = power.reshape(-1, power.shape[-1]) / (energy[-1] if at_focus else energy[:-1])
+    kept = fft.ifft((shares[..., None] * spectra[:-1]).sum(axis=1), axis=-1).real[:, : z.size]
+    mean = (kept / kept[:, :1]).reshape(*depth_mm.shape, -1).mean(axis=1)
     inside = np.minimum(distance_mm, STEP_MM * (z.size - 1))
     return np.asarray(CubicSpline(STEP_MM * np.arange(z.size), mean, axis=1)(inside) ** 2)
 
@@ -166,5 +168,5 @@ def log_width(
         frequency, band, probe.attenuation_db_cm_mhz, backscatter_exponent, depth_mm[:, None]
     )
     distance = STEP_MM / 2 * np.arange(int(probe.aperture_mm / STEP_MM), dtype=float)
-    rho = speckle_correlation(probe, depth_mm[:, None], frequency, power, distance)
+    rho = speckle_correlation(probe, depth_mm[:, None], frequency, power, distance, at_focus=True)
     return np.log(curve_widths(distance, np.maximum(rho, 1e-9)))
