@@ -27,7 +27,7 @@ from speckle3d.matching.schedule import PairSchedule
 from speckle3d.motion.estimate import estimate_motion, frame_pairs
 from speckle3d.motion.planes import MotionProblem
 from speckle3d.motion.sensors import consistent_poses, settle_direction
-from speckle3d.motion.tissue import averaging_loss, compression_error, tissue_curves
+from speckle3d.motion.tissue import averaging_loss, grey_error, tissue_curves
 from speckle3d.tracked import Tracked
 
 PairSink = Callable[[FramePairs], None]
@@ -66,11 +66,13 @@ def track(
 
     mismatch = motion.problem.curves.mismatch(settings.curves.same_probe, tissue.attenuation.log_length_sigma)
     averaging = averaging_loss(matches.table.where(matches.sound), matches.features)
-    compression = compression_error(matcher.signal) if curves.origin == "data sheet" else 0.0
-    error = float(np.linalg.norm([mismatch, averaging, compression]))
+    grey = grey_error(matcher.signal, matches.texture) if curves.origin == "data sheet" else 0.0
+    error = float(np.linalg.norm([mismatch, averaging, grey]))
     shared, covariance = motion.claims(float(np.hypot(error, tissue.structure)))
 
-    doubts += tissue.attenuation.doubts + examine_processing(tissue.structure, averaging)
+    doubts += tissue.attenuation.doubts + examine_processing(
+        float(np.hypot(tissue.structure, grey)), averaging
+    )
     # What structure leaves open is told by itself.
     doubts += examine_images(matches, motion, motion.claims(error)[1], tissue.unattenuated, flags == 0)
     doubts += sensor_doubts + disagreements(credible, motion.poses, covariance)

@@ -66,6 +66,8 @@ over fifty patches scatters by."""
 MOST_OUT_OF_TURN = 0.6
 """Share of such frames. A wobble of 3 Hz at 25 frames a second has a quarter of them, at its turns."""
 
+GREY_DOUBT = 0.08
+"""Relative standard deviation of lengths by grey levels, from which it is told: a curve's usual claim."""
 LARGEST_AVERAGING = 0.03
 """Of the length, from which averaging refuses it: the share is known to a factor of two."""
 
@@ -145,13 +147,13 @@ def doubt_gain(features: Sequence[FrameFeatures]) -> Doubt | None:
     return Doubt(IMAGES, "gain", evidence, False)
 
 
-def examine_processing(structure: float, short: float) -> tuple[Doubt, ...]:
-    """Report filtered images and averaged frames.
+def examine_processing(grey: float, short: float) -> tuple[Doubt, ...]:
+    """Report grey levels that are not the logarithm of speckle, and averaged frames.
 
     Parameters
     ----------
-    structure : float
-        Logarithm of the factor by which curves were stretched for it.
+    grey : float
+        Relative standard deviation of lengths by grey levels that are not speckle's.
     short : float
         Share of the length that averaging of frames takes.
 
@@ -166,13 +168,13 @@ def examine_processing(structure: float, short: float) -> tuple[Doubt, ...]:
             "expected grey levels that vary as much at speed as at rest, got frames that are means of "
             f"several (persistence, frame averaging): lengths come out some {short:.0%} short"
         )
-        doubts.append(Doubt("images", "averaged frames", evidence, short > LARGEST_AVERAGING))
-    if structure > 0.0:
+        doubts.append(Doubt(IMAGES, "averaged frames", evidence, short > LARGEST_AVERAGING))
+    if grey > GREY_DOUBT:
         evidence = (
-            "expected grey levels of speckle, got those of structure, which stays alike for longer: lengths "
-            f"are open by a factor of {np.exp(2 * structure):.1f}; curves of a tracked sweep know it"
+            "expected grey levels that vary as speckle's decibels, got those of structure, edge enhancement, "
+            f"smoothing or another map: lengths are open by {grey:.0%}; curves of a tracked sweep know it"
         )
-        doubts.append(Doubt("images", "filtered images", evidence, False))
+        doubts.append(Doubt(IMAGES, "filtered images", evidence, False))
     return require_usable(doubts, InsufficientDataError)
 
 

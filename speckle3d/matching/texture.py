@@ -28,6 +28,8 @@ SEGMENT = 1024
 """Samples of a transform of raw echoes: 65 kHz apart at 66.7 MHz."""
 LEAST_PATCHES = 8
 """Patches, over all frames, that a row's size is taken from at least."""
+SPECKLE_SPREAD_DB = 8.19, 5.21
+"""Distances of the 10th and the 90th percentile of an exponential variable's decibels from the median."""
 
 
 class _Look(NamedTuple):
@@ -123,13 +125,16 @@ class Texture:
         step = np.median([look.step for look in self._looks.values()])
         return float(step / self.signal.full_scale * self.signal.dynamic_range_db)
 
-    def balance(self) -> float:
-        """Spread of dark over that of bright decibels, about the median; infinite where there are none."""
+    def grey_spread_db(self) -> FloatArray:
+        """Distances of the 10th and the 90th percentile from the median, dB, of the median patch, shape (2,).
+
+        Speckle's if nothing tells otherwise, as in echoes.
+        """
         levels = [look.level for look in self._looks.values() if look.level.size]
         if not levels:
-            return float("inf")
-        low, middle, high = np.concatenate(levels, axis=1)
-        return float(np.median(middle - low) / max(float(np.median(high - middle)), 1e-9))
+            return np.array(SPECKLE_SPREAD_DB)
+        low, middle, high = 10.0 * np.log10(np.e) * np.concatenate(levels, axis=1)
+        return np.asarray(np.median([middle - low, high - middle], axis=1))
 
     def spectra(self) -> EchoSpectra | None:
         """Power spectrum within the band that is matched, at each row of patches; None without phase.
