@@ -1,5 +1,7 @@
 """Sweeps whose images are not one moving probe's, through the whole pipeline: never confident and wrong."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import spoiled_images as spoil
@@ -61,7 +63,8 @@ def test_what_stands_still_is_left_out_and_the_length_stays(sweep, curves, signa
         spoilt, probe_curves = spoil.ringing(part, slice(0, 16)), curves
     else:
         part = received(part, dynamic_range_db=60.0)
-        spoilt, probe_curves = spoil.text_overlay(part), data_sheet_curves(SHEET, part)
+        # The lens of a data sheet is not fitted: by fewer patches it is another one.
+        spoilt, probe_curves = spoil.text_overlay(part), replace(data_sheet_curves(SHEET, part), origin="")
     clean, spoilt = (length_of(s, track(s, probe_curves)) for s in (part, spoilt))
     assert spoilt[1] == pytest.approx(clean[1], rel=0.015)
 

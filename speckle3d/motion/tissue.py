@@ -18,7 +18,6 @@ import numpy as np
 from scipy.ndimage import uniform_filter1d
 from scipy.stats import ttest_1samp
 
-from speckle3d.core.arrays import FloatArray
 from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.core.sweep import BModeSettings, RFSettings
 from speckle3d.matching.quality import FrameFeatures
@@ -65,7 +64,7 @@ class TissueCurves:
     attenuation : Attenuation
         Of the tissue over the curves' phantom.
     structure : float
-        Logarithm of the factor by which they were stretched for structure in the place of speckle.
+        Relative standard deviation of distances that structure in the place of speckle leaves.
     """
 
     curves: DecorrelationCurves
@@ -77,10 +76,11 @@ class TissueCurves:
 def tissue_curves(curves: DecorrelationCurves, texture: Texture) -> TissueCurves:
     """Stretch curves of a phantom for a sweep's attenuation and structure."""
     attenuation = estimate_attenuation(curves, texture.spectra())
-    structure = 0.0 if curves.of_tissue else structure_openness(texture)
-    if structure:
-        curves = replace(stretched(curves, np.array(structure)), of_tissue=True)
-    return TissueCurves(attenuation.applied(curves), curves, attenuation, structure)
+    openness = 0.0 if curves.of_tissue else structure_openness(texture)
+    if openness:
+        curves = replace(stretched(curves, np.array(openness)), of_tissue=True)
+    # Anywhere between once and twice as much is as likely.
+    return TissueCurves(attenuation.applied(curves), curves, attenuation, openness / np.sqrt(3.0))
 
 
 def structure_openness(texture: Texture) -> float:

@@ -1,10 +1,12 @@
 """Averaged frames shorten a sweep, and are found; single ones are not taken for them."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 from accuracy_set import INDEPENDENT, SHEET
+from scipy import ndimage
 from spoiled_images import with_frames
 from sweep_examples import frames_of
 
@@ -44,9 +46,13 @@ def matches_of(sweep):
     return match_sweep(sweep, matcher, PairSchedule(Config().trajectory))
 
 
+def first_frames_loss(matches, count):
+    return averaging_loss(matches.table.where(matches.table.second < count), matches.features)
+
+
 def test_frames_of_one_moment_each_are_not_doubted(grey):
     matches = matches_of(grey)
-    assert averaging_loss(matches.table, matches.features) == 0.0
+    assert [first_frames_loss(matches, count) for count in (8, 16, 64)] == [0.0, 0.0, 0.0]
     assert structure_openness(matches.texture) == 0.0
 
 
@@ -54,6 +60,30 @@ def test_frames_of_one_moment_each_are_not_doubted(grey):
 def test_an_even_hand_over_tissue_is_not_doubted():
     matches = matches_of(b_mode(load_sweep(INDEPENDENT / "tissue_reverse.h5")))
     assert averaging_loss(matches.table, matches.features) == 0.0
+
+
+def sharpened(frame):
+    return frame + 2.0 * (frame - ndimage.gaussian_filter(frame, (1, 3)))
+
+
+@pytest.mark.parametrize(
+    ("process", "claims"),
+    [
+        (np.copy, (0.1, 0.13)),
+        (sharpened, (0.2, 0.3)),
+        (partial(ndimage.maximum_filter, size=3), (0.15, 0.25)),
+    ],
+)
+def test_processed_images_claim_by_how_far_their_grey_levels_are_from_speckles(grey, process, claims):
+    frames = [np.clip(np.rint(process(frame.astype(float))), 0, 255) for frame in grey.frames[:40]]
+    sweep = replace(with_frames(grey.part(0, 40), frames), frames=np.array(frames, np.uint8))
+    tracking, centre = track(sweep, data_sheet_curves(SHEET, sweep)), sweep.grid.centre_mm
+    true = (sweep.truth[0].inv() * sweep.truth).apply(centre)[-1, 2]
+    length = tracking.image.apply(centre)[-1, 2]
+    claim = np.sqrt(tracking.covariance[-1, 2, 2]) / abs(length)
+    assert claims[0] < claim < claims[1]
+    assert abs(length) == pytest.approx(abs(true), rel=0.1)
+    assert any(doubt.suspect == "filtered images" for doubt in tracking.doubts) == (process is not np.copy)
 
 
 def test_images_black_for_the_most_part_leave_lengths_open(grey):
@@ -64,6 +94,7 @@ def test_images_black_for_the_most_part_leave_lengths_open(grey):
 @pytest.mark.parametrize("count", [2, 3])
 def test_means_of_frames_are_refused(grey, count):
     sweep = frame_means(grey, count)
+    assert first_frames_loss(matches_of(sweep), 16) > 0.0
     with pytest.raises(InsufficientDataError):
         track(sweep, data_sheet_curves(SHEET, sweep))
 
