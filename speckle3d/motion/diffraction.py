@@ -168,5 +168,5 @@ def log_width(
         frequency, band, probe.attenuation_db_cm_mhz, backscatter_exponent, depth_mm[:, None]
     )
     distance = STEP_MM / 2 * np.arange(int(probe.aperture_mm / STEP_MM), dtype=float)
-    rho = speckle_correlation(probe, depth_mm[:, None], frequency, power, distance, at_focus=True)
+    rho = speckle_correlation(probe, depth_mm[:, None], frequency, power, distance)
     return np.log(curve_widths(distance, np.maximum(rho, 1e-9)))
