@@ -5,7 +5,7 @@ Drawn without pyplot: no window system, no global state. Only this module of the
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -51,20 +51,18 @@ class Turn(NamedTuple):
 
 def turns_about(angle: str, experiments: Mapping[str, PairErrors]) -> list[Turn]:
     """Turns about one axis, of at least `FEWEST_FRAMES` frames and nearly as long as the longest."""
-    turns = [turn for name, errors in experiments.items() for turn in _turns(name, errors, angle)]
+    axis, turns = ANGLES.index(angle), list[Turn]()
+    for name, errors in experiments.items():
+        n = errors.frames
+        reference, error = _between(errors.reference_rad.T, n), _between(errors.error_rad[..., axis], n)
+        alone = (np.abs(np.delete(reference, axis, axis=0)) <= OFF_AXIS_RAD).all(axis=0)
+        for start, angles in enumerate(reference[axis]):
+            frames = np.flatnonzero(alone[start] & (angles >= 0))
+            frames = frames[np.argsort(angles[frames], kind="stable")]
+            if frames.size >= FEWEST_FRAMES and angles[frames[-1]] > 0:
+                turns.append(Turn(name, angle, angles[frames], error[:, start, frames]))
     longest = max((turn.reference_rad[-1] for turn in turns), default=0.0)
     return [turn for turn in turns if turn.reference_rad[-1] >= _SHORTEST * longest]
-
-
-def _turns(name: str, errors: PairErrors, angle: str) -> Iterator[Turn]:
-    axis, n = ANGLES.index(angle), errors.frames
-    reference, error = _between(errors.reference_rad.T, n), _between(errors.error_rad[..., axis], n)
-    alone = (np.abs(np.delete(reference, axis, axis=0)) <= OFF_AXIS_RAD).all(axis=0)
-    for start, angles in enumerate(reference[axis]):
-        frames = np.flatnonzero(alone[start] & (angles >= 0))
-        frames = frames[np.argsort(angles[frames], kind="stable")]
-        if frames.size >= FEWEST_FRAMES and angles[frames[-1]] > 0:
-            yield Turn(name, angle, angles[frames], error[:, start, frames])
 
 
 def _between(values: FloatArray, n: int) -> FloatArray:

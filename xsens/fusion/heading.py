@@ -164,6 +164,7 @@ class HeadingFilter:
         self._rows = np.zeros(0, STEP)  # steps of a bin that is not whole
         self._north = np.zeros((0, len(UNKNOWN)))  # at the end of the last bin
         self._lately = np.zeros((0, _FILTERS + 1))  # angles of the filters, and slip
+        self._walks, self._bins = 0.0, 0  # north's, summed over minutes, and how many bins there were
 
     def follow(self, rows: Any, to_end: bool = False) -> FloatArray:
         """Values as in `UNKNOWN` after each step by the last whole bin; `to_end` what is left is one."""
@@ -177,7 +178,11 @@ class HeadingFilter:
             bins = averaged_bins(rows, rows["start"], rows["bias"], rows["sd"], self._settings)
             estimates = self._run(bins)
             weights, best = self._weights(estimates)
-            unsteady = self._unsteady(estimates, best, bins)
+            # A walk at random: its variance grows with time, by the mean of the minutes so far.
+            walks = self._walks + np.cumsum(self._unsteady(estimates, best, bins)) / _STEADY
+            minutes = (self._bins + 1.0 + np.arange(len(bins))) / _STEADY
+            unsteady = walks / np.maximum(minutes - 1.0, 1.0 / _STEADY) * minutes
+            self._walks, self._bins = float(walks[-1]), self._bins + len(bins)
             north = np.concatenate([north, _combine(estimates, weights, best, bins, unsteady)])
         self._north = north[-1:]
         north = north if len(north) else np.array([UNKNOWN])
