@@ -35,7 +35,7 @@ from speckle3d.core.sweep import RFSettings
 from speckle3d.motion.diffraction import NEPER_PER_DB
 from speckle3d.motion.lens import stretched
 
-UNKNOWN_SIGMA = 0.3 / np.sqrt(3.0)
+UNKNOWN_SIGMA = 0.1732
 """Standard deviation of the difference where no spectrum tells it: soft tissues and phantoms lie within 0.3
 dB/cm/MHz of each other, taken as evenly spread."""
 LENGTH_PER_UNIT = 0.18
@@ -48,8 +48,6 @@ most 0.01 on average over fourteen sweeps of tissue."""
 NOISE_WEIGHT = 0.03
 """Power over the largest at which a frequency has half its weight, -15 dB: without, one sweep in fifty is
 14 % off."""
-LARGEST = 1.5
-"""Largest difference that is looked for, dB/cm/MHz."""
 WIDENING = 1.3
 """Power of the echo's wavelength with which curves widen, mean over depth: 1.22 to 1.32 by diffraction for
 the probes of two simulators, 1 in front of the focus and 1.5 far behind it."""
@@ -193,7 +191,7 @@ def _difference(
     per_unit : ndarray, shape (r,)
         What 1 dB/cm/MHz adds to it.
     """
-    beta, common = np.arange(-LARGEST, LARGEST, 0.01), np.arange(-4.0, 4.1, 0.2)
+    beta, common = np.arange(-1.5, 1.5, 0.01), np.arange(-4.0, 4.1, 0.2)
     left = exponent - beta[:, None] * per_unit - common[:, None, None]
     likelihood = _log_likelihood(left, sigma)
     without = likelihood[common.size // 2]

@@ -92,8 +92,10 @@ class Coherence:
     share, gain : ndarray, shape (b, p)
     scale : float
         Of all distances over those of the path that they were read from.
-    covariance : ndarray, shape (3, 3)
-        Of its logarithm, and of the yaw and tilt per distance, rad/mm, that errors of distances feign.
+    scale_sigma : float
+        Standard deviation of its logarithm.
+    false_turn : ndarray, shape (2,)
+        Standard deviation of yaw and tilt per distance that errors of distances feign, rad/mm.
     rows : RowScales or None
         None where too few distances tell them.
     """
@@ -102,13 +104,9 @@ class Coherence:
     share: FloatArray
     gain: FloatArray
     scale: float
-    covariance: FloatArray
+    scale_sigma: float
+    false_turn: FloatArray
     rows: RowScales | None = None
-
-    @property
-    def scale_sigma(self) -> float:
-        """Standard deviation of the scale's logarithm."""
-        return float(np.sqrt(self.covariance[0, 0]))
 
     def models(self, frame: IntArray) -> EchoModels:
         """Echo models of pairs about frames of shape (e,): those of the nearest piece."""
@@ -211,8 +209,8 @@ def estimate_coherence(problem: MotionProblem, table: CorrelationTable, path: Fl
     """
     binning, centres = _bin_correlations(problem, table, path)
     patches = problem.patches
-    unknown = np.diag([PHANTOM_SIGMA, *LOOSE]) ** 2
-    as_measured = Coherence(np.zeros(1), *fully_developed(len(patches)), 1.0, unknown)
+    speckle = fully_developed(len(patches))
+    as_measured = Coherence(np.zeros(1), *speckle, 1.0, PHANTOM_SIGMA, np.array(LOOSE))
     # Scale, gain, share and power are four numbers.
     if (binning.weight > 0.0).sum(axis=1).max() < 4:
         return as_measured
@@ -233,9 +231,9 @@ def estimate_coherence(problem: MotionProblem, table: CorrelationTable, path: Fl
     by_patch = log_posterior.reshape(centres.size, -1, LOG_SCALES.size).sum(axis=0).T
     by_row = patches.rows_of(by_patch).sum(axis=2)
     log_scale = _peak(by_patch.sum(axis=1))
-    covariance = _covariance(problem, by_patch, log_scale)
+    scale_sigma, false_turn = _deviations(problem, by_patch, log_scale)
     if problem.curves.of_tissue:
-        return replace(as_measured, covariance=covariance)
+        return replace(as_measured, scale_sigma=scale_sigma, false_turn=false_turn)
     weight, gains = binning.log_likelihood(log_scale, 0.0, values)
     weight = softmax(weight + log_prior, axis=1)
     share, gain = (v.reshape(centres.size, -1) for v in (weight @ values, (weight * gains).sum(axis=1)))
@@ -244,8 +242,8 @@ def estimate_coherence(problem: MotionProblem, table: CorrelationTable, path: Fl
     row_gain = np.median(patches.rows_of(gain), axis=(0, 2)) + 0.0 * row_scale
     rows = RowScales(patches.row_depth_mm, row_scale - log_scale, row_gain)
     # To first order s^2 (1 - c (1 - a)) is observable, and a is open.
-    covariance[0, 0] += (0.5 * float(share.mean()) * POWERS.std()) ** 2
-    return Coherence(centres, share, gain, float(np.exp(log_scale)), covariance, rows)
+    scale_sigma = float(np.hypot(scale_sigma, 0.5 * share.mean() * POWERS.std()))
+    return Coherence(centres, share, gain, float(np.exp(log_scale)), scale_sigma, false_turn, rows)
 
 
 def _share_prior(by_share: FloatArray, share: FloatArray) -> FloatArray:
@@ -271,8 +269,8 @@ def _peak(log_posterior: FloatArray) -> float:
     return float(LOG_SCALES[at] + STEP * np.clip(steps, -1.0, 1.0))
 
 
-def _covariance(problem: MotionProblem, by_patch: FloatArray, log_scale: float) -> FloatArray:
-    """Covariance of the scale and of false yaw and tilt from the scatter of patches, shape (3, 3).
+def _deviations(problem: MotionProblem, by_patch: FloatArray, log_scale: float) -> tuple[float, FloatArray]:
+    """Standard deviations of the scale, and of false yaw and tilt per distance, from the scatter of patches.
 
     Structure lies in layers, and curves err by depth: the patches of a row err together. So do those of a
     column, below the same tissue, which feigns yaw where vectors are few or spread. The sum of both scatters
@@ -299,13 +297,11 @@ def _covariance(problem: MotionProblem, by_patch: FloatArray, log_scale: float) 
     # What turning explains is no scatter.
     error -= inverse @ (arm @ (error / variance)) @ arm
     pull = problem.patches.rows_of(arm * error / variance)
-    scatter = loose
-    for sums in (pull.sum(axis=2), pull.sum(axis=1)):
+    by_row, by_column = pull.sum(axis=2), pull.sum(axis=1)
+    for sums in (by_row, by_column):
         count = sums.shape[1]
         # A turn is a slope, and a level beside it, over the rows or the columns.
-        scatter = scatter + sums @ sums.T * (count / max(count - 2, 1))
-    covariance = inverse @ scatter @ inverse
+        loose = loose + sums @ sums.T * (count / max(count - 2, 1))
+    turn = np.sqrt(np.diagonal(inverse @ loose @ inverse)[1:])
     # The scale is that of turns as they are taken.
-    covariance[0] = covariance[:, 0] = 0.0
-    covariance[0, 0] = (np.linalg.norm(pull[0].sum(axis=1)) / (1.0 / variance).sum()) ** 2 + CURVES_SIGMA**2
-    return np.asarray(covariance)
+    return float(np.hypot(np.linalg.norm(by_row[0]) / (1.0 / variance).sum(), CURVES_SIGMA)), turn

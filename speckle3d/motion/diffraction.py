@@ -115,7 +115,7 @@ def tilt_pivot(
     depth_mm: FloatArray,
     frequency_hz: FloatArray,
     power: FloatArray,
-    speed_m_s: float = SPEED_M_S,
+    speed_m_s: float,
 ) -> FloatArray:
     """Pivot about which the speckle of each depth turns when the probe tilts, mm, shape (y,).
 

@@ -88,8 +88,7 @@ class Motion:
         """
         scale_sigma = float(np.hypot(self.coherence.scale_sigma, self.slopes.length_sigma))
         shared = SharedErrors(scale_sigma, curves_sigma, self.slopes.deviation_per_mm)
-        structure = float(self.coherence.share.mean())
-        centre_mm = self.problem.centre_mm
+        centre_mm, structure = self.problem.centre_mm, float(self.coherence.share.mean())
         return shared, claimed_covariance(self.poses, self.covariance, centre_mm, shared, structure)
 
     def mirrored(self) -> Motion:
@@ -131,16 +130,15 @@ def estimate_motion(problem: MotionProblem, table: CorrelationTable) -> Motion:
             coherence = estimate_coherence(problem, table, path)
             apart_mm = coherence.scale * np.abs(path[table.second, 0] - path[table.first, 0])
             rows = alike_pairs(problem, table, problem.typical_correlation(apart_mm))
-            models = coherence.models(table.first[rows])
-            pairs, _ = _signed_planes(problem, table, rows, models, apart_mm[rows])
-            slopes = weigh_slopes(pairs, coherence.covariance, problem.planes, path)
+            pairs, _ = _signed_planes(problem, table, rows, coherence.models(table.first[rows]))
+            slopes = weigh_slopes(pairs, coherence.false_turn, problem.planes, path)
             _, trajectory = solve_planes(problem, table, slopes.applied(pairs))
             path = elevation_of(trajectory.poses, problem.centre_mm)
         coherence = estimate_coherence(problem, table, path)
         if lens_round and sheet and coherence.rows:
             path = path * coherence.scale
             problem = replace(problem, curves=with_fitted_lens(problem.curves, coherence.rows, sheet))
-    slopes = weigh_slopes(pairs, coherence.covariance, problem.planes, path)
+    slopes = weigh_slopes(pairs, coherence.false_turn, problem.planes, path)
     pairs = pairs.scaled(coherence.scale)
     edges, trajectory = solve_planes(problem, table, slopes.applied(pairs))
     return Motion(problem, table, pairs, coherence, slopes, edges, trajectory.poses, trajectory.covariance)
@@ -173,10 +171,9 @@ def _signed_planes(
     table: CorrelationTable,
     rows: IntArray,
     models: EchoModels,
-    start_mm: FloatArray | None = None,
 ) -> tuple[PairPlanes, FloatArray]:
     """Planes of some pairs, with the signs of the likeliest path through them, and that path."""
-    planes, firm = pair_planes(problem, table, rows, models, start_mm)
+    planes, firm = pair_planes(problem, table, rows, models)
     planes = planes[firm]
     if not len(planes):
         raise InsufficientDataError(

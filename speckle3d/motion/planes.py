@@ -49,9 +49,6 @@ LEAST_SIGMA_MM = 1e-3
 UNEVENNESS = 0.4
 """Variation of the error of distances over the image against its mean; measured on simulated sweeps."""
 ROUNDS = 12
-NEAR_MM = 0.15
-"""Least distance at which fits start: correlation is flat at zero, and a fit from there takes distance for
-tilt."""
 
 
 class PlaneSettings(BaseModel):
@@ -211,7 +208,6 @@ def pair_planes(
     table: CorrelationTable,
     rows: IntArray,
     models: EchoModels,
-    start_mm: FloatArray | None = None,
     subset: BoolArray | bool = True,
     slopes: FloatArray | None = None,
     either_side: BoolArray | bool = True,
@@ -224,8 +220,6 @@ def pair_planes(
         Of the table.
     models : EchoModels
         How echoes depart from fully developed speckle, by pair or for all.
-    start_mm : ndarray, shape (e,), optional
-        About how far apart the frames are; by default as the pair's median correlation has it.
     subset : ndarray of bool, shape (e, p), optional
         Patches allowed to take part.
     slopes : ndarray, shape (e, 2), optional
@@ -245,10 +239,7 @@ def pair_planes(
     least = models.gain * (models.share + (1 - models.share) * end) ** 2
     members = np.isfinite(correlation) & ((end == 0.0) | (correlation > least)) & subset
     members &= (members.sum(axis=1) > 3)[:, None]
-    if start_mm is None:
-        start = problem.typical_distance(np.sqrt(np.maximum(table.median[rows], 0.0)))
-    else:
-        start = np.maximum(start_mm, NEAR_MM)
+    start = problem.typical_distance(np.sqrt(np.maximum(table.median[rows], 0.0)))
     from_sensor = slopes is not None
     start_slopes = np.zeros((rows.size, 2)) if slopes is None else np.ascontiguousarray(slopes)
     side = np.zeros(rows.size, dtype=bool) | either_side

@@ -180,12 +180,12 @@ def consistent_poses(motion: Motion, sweep: Sweep, settings: SensorSettings) -> 
     sign = np.where(pairs.offset_mm < 0, -1.0, 1.0)
     relative = (orientation[pairs.first].inv() * orientation[pairs.second]).as_matrix()[:, 2, :2]
     shift, slopes = table.inplane[pairs.row, :2], sign[:, None] * relative
-    farther, offset = raised(problem, shift, slopes), np.abs(pairs.offset_mm)
+    farther = raised(problem, shift, slopes)
     # Only frames that cross, or nearly, leave the side open.
-    open_side = offset < np.ptp(farther, axis=1)
+    open_side = np.abs(pairs.offset_mm) < np.ptp(farther, axis=1)
     distance, sigma = (scale * v for v in patch_distances(problem, correlation, models))
     agreement = consistent_subset(distance, sigma, farther, open_side, problem.planes.support_sigma)
-    planes, firm = pair_planes(problem, table, pairs.row, models, offset, agreement, slopes, open_side)
+    planes, firm = pair_planes(problem, table, pairs.row, models, agreement, slopes, open_side)
     # Slopes are the sensor's; distances have the scale of all patches.
     planes.coefficients[:] *= [scale, 1.0, 1.0] * sign[:, None]
     planes.covariance[:] *= scale**2
@@ -200,7 +200,7 @@ def consistent_subset(
     sigma_mm: FloatArray,
     raised_mm: FloatArray,
     either_side: BoolArray,
-    support_sigma: float = 1.0,
+    support_sigma: float,
 ) -> BoolArray:
     """Patches of each pair whose distances agree with one plane of the sensed orientation.
 

@@ -32,6 +32,9 @@ APART_SLOPE = 0.01
 """Frames that turn more than this against each other may differ although their centres meet. Such as turn
 less and do not resemble each other are a pair that disagrees altogether."""
 
+ORIGIN = np.zeros((1, 2))
+"""Position and slope of the first frame."""
+
 
 class Strangers(NamedTuple):
     """Pairs of uncorrelated frames, which therefore are not close together.
@@ -53,7 +56,7 @@ def likeliest_path(
     planes: PairPlanes,
     frames: int,
     strangers: Strangers,
-    known: FloatArray | None = None,
+    known: FloatArray = ORIGIN,
 ) -> FloatArray:
     """Follow the most likely paths: elevational position and slope along x of one frame after the other.
 
@@ -87,8 +90,7 @@ def likeliest_path(
         APART_SLOPE,
     )
     path, every = np.zeros((frames, 2)), np.arange(frames + 1)
-    if known is not None:
-        path[: len(known)] = known
+    path[: len(known)] = known
     follow_paths(
         np.searchsorted(planes.second, every),
         np.ascontiguousarray(planes.first),
@@ -98,7 +100,7 @@ def likeliest_path(
         np.ascontiguousarray(strangers.first),
         rules,
         path,
-        1 if known is None else len(known),
+        len(known),
     )
     return path
 

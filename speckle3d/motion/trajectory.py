@@ -58,8 +58,8 @@ class Trajectory:
             unit = np.zeros((6 * (frames - 1), 6))
             unit[rows] = np.eye(6)
             blocks.append(self.normal.solve(unit)[rows])
-        by_frame = make_interp_spline(np.append(0, frame_numbers), np.array(blocks), k=1)(np.arange(frames))
-        return np.asarray(by_frame + by_frame.transpose(0, 2, 1)) / 2
+        by_frame = make_interp_spline(np.append(0, frame_numbers), np.array(blocks), k=1)
+        return np.asarray(by_frame(np.arange(frames)))
 
 
 def solve_trajectory(

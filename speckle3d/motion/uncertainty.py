@@ -155,7 +155,7 @@ class SlopeWeights:
 
 
 def weigh_slopes(
-    planes: PairPlanes, covariance: FloatArray, settings: PlaneSettings, path: FloatArray
+    planes: PairPlanes, false_turn: FloatArray, settings: PlaneSettings, path: FloatArray
 ) -> SlopeWeights:
     """Weights of all pairs' slopes against false slopes from uneven errors of distances.
 
@@ -164,18 +164,17 @@ def weigh_slopes(
 
     Parameters
     ----------
-    covariance : ndarray, shape (3, 3)
-        Of scale, yaw and tilt per distance; see `Coherence`.
+    false_turn : ndarray, shape (2,)
+        Standard deviation of yaw and tilt per distance; see `Coherence`.
     path : ndarray, shape (n, 2) or (n, 3)
         Its first column is each frame's elevational position, mm.
     """
-    false = np.sqrt(np.diagonal(covariance)[1:])
     squares = np.maximum((planes.offset_mm**2).sum(), 1e-12)
     mean_slope = (planes.coefficients[:, 1:] * planes.coefficients[:, :1]).sum(axis=0) / squares
     way_mm = max(float(np.abs(np.diff(path[:, 0])).sum()), 1e-6)
     steady = way_mm / (way_mm + TURN_CHANGE_MM)
     usual = np.deg2rad(settings.turn_deg_per_mm) ** 2 / steady
-    expected = np.maximum(usual, mean_slope**2 - BEYOND_DOUBT**2 * false**2)
-    share = expected / (expected + false**2)
+    expected = np.maximum(usual, mean_slope**2 - (BEYOND_DOUBT * false_turn) ** 2)
+    share = expected / (expected + false_turn**2)
     information = np.linalg.inv(planes.covariance).sum(axis=0)
-    return SlopeWeights(share, np.sqrt(share * steady) * false, information[0, 1:] / information[0, 0])
+    return SlopeWeights(share, np.sqrt(share * steady) * false_turn, information[0, 1:] / information[0, 0])

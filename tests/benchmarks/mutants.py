@@ -55,8 +55,7 @@ def without_tissue(function, problem, *arguments):
     from speckle3d.motion.coherence import Coherence
     from speckle3d.motion.planes import fully_developed
 
-    covariance = np.diag([2e-3, 1e-4, 1e-4]) ** 2
-    return Coherence(np.zeros(1), *fully_developed(len(problem.patches)), 1.0, covariance)
+    return Coherence(np.zeros(1), *fully_developed(len(problem.patches)), 1.0, 2e-3, np.full(2, 1e-4))
 
 
 def bend_curves(function, sweep, curves, *arguments, **keywords):

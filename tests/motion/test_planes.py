@@ -154,13 +154,3 @@ def test_known_slopes_are_kept_and_tell_the_side(plane):
     assert np.abs(planes.offset_mm - plane[0]).max() < 0.01
     # The sensor is trusted to 5e-4, the images tell slopes of frames so near to 2 to 6e-4.
     assert np.abs(planes.coefficients[:, 1:] - plane[1:]).max() < 1.5e-3
-
-
-@pytest.mark.parametrize("start_mm", [0.0, 0.1, 0.6])
-def test_a_wrong_guess_of_the_distance_does_no_harm(start_mm):
-    """A path may have frames together that are apart: from nothing, a tilt would explain it, too."""
-    for plane in (*PLANES, *PARALLEL):
-        rho = draw(np.tile(correlations(plane), (5, 1)), np.random.default_rng(2))
-        free, from_guess = (fit_many(problem(), rho, start_mm=s)[0] for s in (None, np.full(5, start_mm)))
-        assert np.abs(free.offset_mm - from_guess.offset_mm).max() < 0.015 * plane[0] + 1e-3
-        assert not crossing(from_guess.coefficients).any()

@@ -34,8 +34,8 @@ def fit_planes(yaw_per_mm=0.0, short=0.0):
 
 
 def feigned(sigma):
-    """Covariance of scale, yaw and tilt per distance."""
-    return np.diag([sigma, sigma / LEVER_MM, sigma / AT[:, 1].std()]) ** 2
+    """Deviations of yaw and tilt per distance."""
+    return np.array([sigma / LEVER_MM, sigma / AT[:, 1].std()])
 
 
 def rates(planes):
