@@ -28,7 +28,8 @@ from speckle3d.core.relative import RelativePoses
 from speckle3d.core.sweep import BModeSettings, Sweep
 from speckle3d.core.threads import on_one_thread
 from speckle3d.matching.frames import FrameByFrame, ImageSink
-from speckle3d.matching.matcher import FrameMatcher, Overlay
+from speckle3d.matching.intensity import Echo
+from speckle3d.matching.matcher import FrameMatcher
 from speckle3d.matching.quality import FrameFeatures, FrameFlag, flag_frames
 from speckle3d.matching.schedule import PairSchedule
 from speckle3d.matching.table import CorrelationTable
@@ -121,7 +122,7 @@ class LiveTracker:
         matcher = FrameMatcher(example, c, curves)
         self.image_grid = matcher.grid
         self._example, self._matcher = example, matcher
-        self._overlay = Overlay()
+        self._echoes: list[Echo] = []
         self._matching = FrameByFrame(matcher, PairSchedule(self._config.trajectory))
         self._problem = MotionProblem(curves, matcher.patches, matcher.centre_mm, 1, c.planes, c.trajectory)
         self._texture = Texture(matcher)
@@ -191,8 +192,8 @@ class LiveTracker:
         if self.images:
             self.images(number, ready.echo.intensity)
         if number % EVERY == 0 and number < EVERY * FRAMES:
-            self._overlay.add(ready.echo)
-            self._matcher.leave_out(self._overlay)
+            self._echoes.append(ready.echo)
+            self._matcher.leave_out(self._echoes)
             if isinstance(self._example.signal, BModeSettings):
                 self._texture.keep(number, ready)
         table = self._matching.advance(number, ready.frame)

@@ -11,7 +11,7 @@ from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from speckle3d.core.sweep import Sweep, spread_frames
 from speckle3d.core.threads import ahead
 from speckle3d.kernels.inplane import Frame
-from speckle3d.matching.matcher import FrameMatcher, Overlay, compose, inverse
+from speckle3d.matching.matcher import FrameMatcher, compose, inverse
 from speckle3d.matching.quality import FrameFeatures, FrameFlag, flag_frames
 from speckle3d.matching.schedule import KnownSchedule, PairSchedule
 from speckle3d.matching.table import CorrelationTable
@@ -74,10 +74,7 @@ def match_sweep(
     """
     pairing = FrameByFrame(matcher, schedule)
     texture, texture_frames = Texture(matcher), spread_frames(len(sweep), FRAMES).tolist()
-    overlay = Overlay()
-    for number in texture_frames:
-        overlay.add(matcher.extractor.echo(sweep.frames[number]))
-    matcher.leave_out(overlay)
+    matcher.leave_out([matcher.extractor.echo(sweep.frames[number]) for number in texture_frames])
 
     features, tables = [], []
     frames = ahead(lambda number: matcher.ready(sweep.frames[number]), range(len(sweep)))

@@ -94,43 +94,18 @@ class ReadyFrame(NamedTuple):
     frame: Frame
 
 
-class Overlay:
-    """Detector of static structures in images: text, a ruler, ringing without contact.
+def standing_samples(echoes: Sequence[Echo]) -> BoolArray:
+    """Samples that stand still in frames far apart, by the echo's mean or by their level.
 
-    Its patches tell nothing of the motion. In the others' local mean it would be a pattern that stays, as if
-    the probe had moved less.
-
-    Attributes
-    ----------
-    power : ndarray, shape (vector, grid.samples)
-        Sum of the frames' intensities; zero before the first that is finite.
+    Text, a ruler, ringing without contact: they tell nothing of the motion. In the others' local mean they
+    would be a pattern that stays, as if the probe had moved less.
     """
-
-    def __init__(self) -> None:
-        self._count = 0
-        self.power: Any = np.float32(0.0)
-        self._total: Any = np.complex64(0.0)
-        self._darkest: Any = np.float32(np.inf)
-        self._brightest: Any = np.float32(0.0)
-
-    def add(self, echo: Echo) -> None:
-        """Look at one more frame."""
-        if not np.isfinite(echo.intensity.sum()):
-            return
-        self._count += 1
-        self.power = self.power + echo.intensity
-        if echo.analytic is not None:
-            self._total = self._total + echo.analytic
-        else:
-            self._darkest = np.minimum(self._darkest, echo.intensity)
-            self._brightest = np.maximum(self._brightest, echo.intensity)
-
-    @property
-    def standing(self) -> BoolArray:
-        """Mask of static samples, by the echo's mean or their level, shape (vector, grid.samples)."""
-        in_mean = np.abs(self._total) ** 2 > _STANDING * self._count * self.power
-        unchanged = (self._brightest <= _UNCHANGED * self._darkest) & (self._darkest > np.min(self._darkest))
-        return np.asarray(in_mean | unchanged)
+    intensities = np.stack([echo.intensity for echo in echoes])
+    analytic = [echo.analytic for echo in echoes if echo.analytic is not None]
+    if analytic:
+        return np.asarray(np.abs(np.mean(analytic, axis=0)) ** 2 > _STANDING * intensities.mean(axis=0))
+    darkest, brightest = intensities.min(axis=0), intensities.max(axis=0)
+    return np.asarray((brightest <= _UNCHANGED * darkest) & (darkest > np.min(darkest)))
 
 
 class FrameMatcher:
@@ -205,14 +180,14 @@ class FrameMatcher:
             self.patches = self.laid.between(curves.depth_mm)
         self.overlaid = np.zeros(len(self.patches), dtype=bool)
 
-    def leave_out(self, overlay: Overlay) -> None:
-        """Leave out patches with static structures, and these samples from other patches' local mean."""
-        if not overlay.power.any():
+    def leave_out(self, echoes: Sequence[Echo]) -> None:
+        """Leave out the patches on which something stands still in some frames, and that from local means."""
+        echoes = [echo for echo in echoes if np.isfinite(echo.intensity.sum()) and echo.intensity.any()]
+        if not echoes:
             return
-        standing, patches = overlay.standing, self.patches
-        still, power = (
-            patches.tiles(power).sum(axis=(1, 2)) for power in (standing * overlay.power, overlay.power)
-        )
+        standing, patches = standing_samples(echoes), self.patches
+        total = np.sum([echo.intensity for echo in echoes], axis=0)
+        still, power = (patches.tiles(part).sum(axis=(1, 2)) for part in (standing * total, total))
         share = still / np.maximum(power, np.finfo(np.float32).tiny)
         self.overlaid = share > max(_OVERLAID, _OVER_SPECKLE * float(np.median(share)))
         (wide, high), self._counted = patches.size, self.laid.region.copy()

@@ -96,11 +96,6 @@ def test_the_other_sign_of_q_is_doubted(middle_hz):
     assert (doubt.suspect, doubt.refuted) == ("sign of Q", False)
 
 
-def test_noise_and_grey_levels_tell_nothing_of_the_band(images):
-    assert doubt_band(texture_of(echoes(4e6, 8e6, noise=30.0))) is None
-    assert doubt_band(texture_of(grey_sweep(images))) is None
-
-
 # ---- standing echoes -------------------------------------------------------------------------------------
 
 FRESH = np.random.default_rng(0).standard_normal((5, 36, 900))
