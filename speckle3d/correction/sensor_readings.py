@@ -21,7 +21,7 @@ from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.geometry import skew
 from speckle3d.core.leastsquares import robust_sigma
 from speckle3d.core.sweep import OrientationSensor, Tracker
-from speckle3d.correction.image_path import ImagePath
+from speckle3d.correction.image_path import HAND_TURN_RAD, MOST_KNOTS, ImagePath
 from speckle3d.correction.settings import FusedSettings
 
 FEWEST_READINGS = 10
@@ -139,6 +139,10 @@ class SensorReadings:
             for values in readings.errors(path, np.zeros(readings.size))
         ]
         jitter = [robust_sigma(values, least) for values, least in zip(second, LEAST_JITTER, strict=True)]
+        # A random walk departs from the straight line between two knots by a sixth of its growth, on average.
+        knots = min(frame_time_s.size - 1, MOST_KNOTS)
+        unresolved = HAND_TURN_RAD * np.sqrt(np.ptp(frame_time_s) / knots / 6.0)
+        jitter[0] = float(np.hypot(jitter[0], unresolved))
         return replace(readings, jitter=np.array(jitter))
 
     @property
