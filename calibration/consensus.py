@@ -129,7 +129,7 @@ def find_consensus(points: ImagePoints, pixel_mm: FloatArray | None = None) -> C
     return Consensus(choice, away[choice], gate, float(10.0 ** min(log_alarms, 300.0)))
 
 
-def choose_by_frame(frame: IntArray, away_mm: FloatArray, near_mm: float = GATES_MM[-1]) -> IntArray:
+def choose_by_frame(frame: IntArray, away_mm: FloatArray, near_mm: float = GATES_MM[-2]) -> IntArray:
     """Choose the likeliest candidate of each frame that is near, or else the nearest; frames ascending.
 
     Along a wire that lies in the image there are several near ones. The nearest of them would repeat what the
