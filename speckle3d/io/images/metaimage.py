@@ -37,7 +37,7 @@ from speckle3d.io.plus.transforms import (
 from speckle3d.io.plus.write import own_values
 from speckle3d.io.pose_paths import timed_poses
 from speckle3d.io.readers import Reader
-from speckle3d.io.recordings import Facts, Recording, Value, differs
+from speckle3d.io.recordings import CONTRADICTION, Facts, Recording, Value, differs
 
 _DEVICE, _PIXELS = "the device set", ("column_pitch_mm", "row_spacing_mm")
 
@@ -102,6 +102,11 @@ def open_sequence(path: Path, settings: ImportSettings) -> Facts:
         if calibration.value is None and name in names_of(header):
             substitutes = dict.fromkeys(_PIXELS, "tracker_transform")
             remarks.append(f"no place of the image on the tool: --transform {name} takes the file's own")
+        elif has_mounting and name in names_of(header):
+            direct = tracked_poses(header, name, "none", device.names)
+            if direct and (off_mm := _misplacement_mm(header, poses, calibration, direct)):
+                words = f"{chain}, which is used: --transform {name} takes the other"
+                remarks.append(f"{name} places images up to {off_mm:.3g} mm away from {words}")
     elif names_of(header) and settings.tracker_transform is None:
         remarks.append(f"no tracker: the header's transforms are {lacking_poses(path)}")
     first_mm = settings.first_sample_depth_mm
@@ -124,6 +129,16 @@ def open_sequence(path: Path, settings: ImportSettings) -> Facts:
         assumptions=("parallel lines",) if layout.is_rf and not own else (),
         remarks=(*remarks, *_contradictions(header, device, layout, Value() if own else calibration)),
     )
+
+
+def _misplacement_mm(header: SequenceHeader, poses: Poses, calibration: Value, direct: Poses) -> float:
+    """Distance of an image's corners by the file's own transform from those by the chain; 0 where alike."""
+    corners = np.array([[0.0, 0.0, 0.0, 1.0], [*header.size[:2], 0.0, 1.0]]).T
+    used = poses.matrices @ calibration.value @ corners
+    other = direct.matrices @ (np.eye(4) if direct.pixels is None else direct.pixels) @ corners
+    is_valid = [not (a or b) for a, b in zip(poses.faults, direct.faults, strict=True)]
+    off_mm = float(np.linalg.norm(used - other, axis=1)[is_valid].max(initial=0.0))
+    return off_mm if off_mm > CONTRADICTION * np.linalg.norm(np.diff(used)[0]) else 0.0
 
 
 def _device_set(settings: ImportSettings) -> DeviceSet:
