@@ -57,11 +57,15 @@ _REPLACEMENTS = {
     ("reslice", "--state"): _ANY_VIEWER,
     ("reslice", "--origin"): "--points takes the origin, a point along the rows and one of the plane",
     ("reslice", "--outlines"): "`view` and the report of `compare` draw where frames are",
+    ("reslice", "--reach-mm"): "frames count within twice the sweep's longest steps",
+    ("reslice", "--straight"): "--curve takes a spline, which is straight through points on a line",
+    ("reslice", "--down"): "--curve runs into the depth, --points takes any plane",
     ("images", "--clock"): "`calibrate clock --by images` finds the offset, --time-offset-s takes it",
     ("images", "--scales"): "calipers tell pixel sizes better; --pixel-mm takes them",
     ("reconstruct", "inertial"): "`fused` takes any sensor there is, `crossed` a second sweep",
     ("export", "--frame"): "`convert` and `scene` write poses as 3D Slicer reads them",
     ("live", "--compression"): "`convert --compression gzip` compresses its recording",
+    ("play", "--loop"): "`while speckle3d play SWEEP; do :; done` begins again in a shell",
     ("simulate", "--reverse"): "--preset reversal comes back",
 }
 """Words of commands that older versions took, and what replaces them."""

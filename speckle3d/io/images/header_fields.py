@@ -62,7 +62,7 @@ def nrrd_fields(stream: BinaryIO) -> dict[str, Any]:
         name, sign, value = line.partition(":")
         if not value.startswith("="):
             # Fields of the format itself, unlike those of its users, may be in letters of any size.
-            name = re.sub("^(data|byte)(?=file|skip)", r"\1 ", name.strip().lower())
+            name = re.sub("^(data|byte|line)(?=file|skip)", r"\1 ", name.strip().lower())
         # Without a sign: names of files below "data file: LIST".
         lines += [f"{NRRD_NAMES.get(name, name)}{sign}{value}"] if sign else []
     fields: dict[str, Any] = {"sizes": (), "type": "", "encoding": ""}
@@ -86,14 +86,16 @@ def meta_fields(stream: BinaryIO) -> dict[str, Any]:
         return first(*names)[:1] in ("T", "t", "1")
 
     file, is_text = first("ElementDataFile"), "BinaryData" in fields and not is_set("BinaryData")
+    # Of a file that holds its pixels itself, a size is that of the header.
+    is_local, skip = file.upper() == "LOCAL", int(first("HeaderSize") or "0")
     words: dict[str, Any] = {
         "sizes": numbers(first("DimSize"), None, "DimSize"),
         "kinds": first("Kinds").split(),
         "type": first("ElementType"),
         "endian": "big" if is_set("BinaryDataByteOrderMSB", "ElementByteOrderMSB") else "little",
         "encoding": "gzip" if is_set("CompressedData") else "text" if is_text else "raw",
-        "data file": file if file.upper() != "LOCAL" else "",
-        "byte skip": int(first("HeaderSize") or "0"),
+        "data file": "" if is_local else file,
+        "byte skip": min(skip, 0) if is_local else skip,
         "channels": int(first("ElementNumberOfChannels") or "1"),
         "space units": [first("DistanceUnits")],
     }

@@ -232,6 +232,10 @@ def _header(path: Path, words: dict[str, Any], is_nrrd: bool, start: int) -> Seq
         raise InvalidInputError(f"encoding: expected raw, gzip, bzip2 or text, got {words['encoding']!r}")
     file, byte_skip = words.get("data file", ""), words.get("byte skip", 0)
     data, start = (_data_file(path, file), 0) if file else (path, start)
+    if lines := words.get("line skip", 0):
+        with open_regular(data) as stream:
+            stream.seek(start)
+            start += sum(len(stream.readline()) for _ in range(lines))
     return SequenceHeader(
         str(path), "NrrdImage" if is_nrrd else "MetaImage", fields, frames, size, spacing, sizes, frame_axis,
         len(sizes) == 3 and {*kinds} <= {"domain", "space"} and len(frames) < size[2],

@@ -23,14 +23,14 @@ def header_and_pixels(folder, name, suffix=".mhd"):
     return path, pixels
 
 
-@pytest.mark.parametrize(("start", "suffix"), [(0, ".mhd"), (7, ".mhd"), (-1, ".mhd"), (-1, ".nhdr")])
+@pytest.mark.parametrize(("start", "suffix"), [(7, ".mhd"), (-1, ".mhd"), (-1, ".nhdr"), (0, ".nhdr")])
 def test_pixels_behind_bytes_of_another_program(tmp_path, start, suffix):
     """Of -1, as MetaIO and NRRD have it, they are the file's last bytes."""
     path, pixels = header_and_pixels(tmp_path, "pixels.raw", suffix)
-    field = f"HeaderSize = {start}\nElementDataFile" if suffix == ".mhd" else f"byte skip: {start}\nData File"
-    text = path.read_bytes().decode()
-    path.write_text(text.replace("ElementDataFile" if suffix == ".mhd" else "Data File", field))
-    (tmp_path / "pixels.raw").write_bytes(bytes(7 if start else 0) + pixels)
+    field = f"HeaderSize = {start}\n" if suffix == ".mhd" else f"byte skip: {start}\nline skip: 1\n"
+    name = "ElementDataFile" if suffix == ".mhd" else "Data File"
+    path.write_text(path.read_text().replace(name, field + name))
+    (tmp_path / "pixels.raw").write_bytes(b"a line\n" + pixels)
     np.testing.assert_array_equal(read_header(path).images(), grey())
 
 
@@ -38,7 +38,7 @@ def test_pixels_behind_bytes_of_another_program(tmp_path, start, suffix):
 @pytest.mark.parametrize("big", [False, True])
 def test_numbers_of_either_byte_order_are_read(tmp_path, kind, big):
     values = np.random.default_rng(0).integers(0, 100, (3, 4, 5)).astype(kind)
-    path = write_mha(tmp_path / "a.mha", values, {"BinaryDataByteOrderMSB": str(big)})
+    path = write_mha(tmp_path / "a.mha", values, {"BinaryDataByteOrderMSB": str(big), "HeaderSize": "7"})
     if big:
         head, _, _ = path.read_bytes().partition(b"LOCAL\n")
         path.write_bytes(head + b"LOCAL\n" + values.byteswap().tobytes())
