@@ -2,28 +2,17 @@
 
 from __future__ import annotations
 
-import time
-from functools import partial
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
-
-import typer
-
-from speckle3d.cli.common import Port, note
-from speckle3d.core.errors import InvalidInputError
-from speckle3d.core.extras import require_extra
-from speckle3d.core.progress import progress_bar
-
-if TYPE_CHECKING:
-    from speckle3d.core.grid import ImageGrid
-    from speckle3d.core.sweep import Frames, Sweep
-
 import re
 import signal
 import sys
+import time
 import webbrowser
 from contextlib import ExitStack
-from typing import TYPE_CHECKING, Any
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
 
 from speckle3d.cli.commands import Fields
 from speckle3d.cli.common import (
@@ -33,15 +22,22 @@ from speckle3d.cli.common import (
     MaybeText,
     Out,
     Paths,
+    Port,
     load_settings,
+    note,
     status_line,
 )
 from speckle3d.cli.reconstruction import reconstruct
 from speckle3d.cli.signals import ENDS, handle_signals
+from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.extras import require_extra
+from speckle3d.core.progress import progress_bar
 
 if TYPE_CHECKING:
     from types import FrameType
 
+    from speckle3d.core.grid import ImageGrid
+    from speckle3d.core.sweep import Frames, Sweep
     from speckle3d.io.igtl.link import Connection, LinkState
     from speckle3d.live.progress import Progress
     from speckle3d.live.session import Session

@@ -187,7 +187,10 @@ def read_table(lines: Iterable[str]) -> TextTable:
                 names = below if len(below) == len(cells) else [""] * len(cells)
                 return _read_rows(chain([line], rows), header, names, separator)
         header.append(line.rstrip("\n"))
-    raise InvalidInputError("expected names of columns above lines of as many cells with numbers, got none")
+    raise InvalidInputError(
+        "expected messages of a sensor, or names of columns above lines of as many cells with numbers, got "
+        "neither"
+    )
 
 
 def number(cell: str) -> float:

@@ -2,24 +2,18 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
-
-from speckle3d.cli.common import MaybeNumber, MaybePath, MaybeText, Out
-from speckle3d.core.errors import InvalidInputError
-from speckle3d.core.progress import progress_bar
-
-if TYPE_CHECKING:
-    from speckle3d.core.arrays import FloatArray
-    from speckle3d.study.posed import SweepModes
-
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import BaseModel
 
 from speckle3d.cli.commands import Fields
 from speckle3d.cli.common import (
+    MaybeNumber,
+    MaybePath,
+    MaybeText,
+    Out,
     Result,
     WritablePath,
     clip_of,
@@ -27,12 +21,15 @@ from speckle3d.cli.common import (
     note,
     notes,
 )
+from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.progress import progress_bar
 
 if TYPE_CHECKING:
+    from speckle3d.core.arrays import FloatArray
     from speckle3d.core.grid import Region
     from speckle3d.imaging.voxels.settings import CompoundingSettings
     from speckle3d.io.import_settings import ImportSettings
-    from speckle3d.study.posed import PosedSweep
+    from speckle3d.study.posed import PosedSweep, SweepModes
 
 _IMPORTED = (
     "plus_config",
