@@ -15,9 +15,8 @@ from speckle3d.core.relative import HELD, SCALE_CHANGE_MM, SHARED, STRUCTURE, TU
 from speckle3d.correction.curves import AXES, CorrectedChain
 from speckle3d.correction.scale import ScaleEvidence
 
-MOST_KNOTS = 40
-"""Corrections change from knot to knot, of a short sweep from frame to frame: the images' own detail is finer
-than any sensor's between them."""
+FRAMES_PER_KNOT, MOST_KNOTS = 4, 40
+"""Corrections change from knot to knot: the images' own detail is finer than any sensor's between them."""
 SIDEWAYS, SIDEWAYS_BY_SHARE = 0.005, (0.5, 0.1)
 """Standard deviation of motion along x and y that images see for each mm along z where structure runs across:
 least, and its growth with the share of echoes that stay. Of simulated phantoms and tissue."""
@@ -29,6 +28,11 @@ of it. Three freehand sweeps of the PLUS library turn by 0.4 to 1.6 degrees in a
 LEAST_SCALE_CHANGE = 0.1
 """The scale changes along a sweep by at least this share of what it may be wrong by."""
 Z = AXES.index("z")
+
+
+def knot_intervals(frames: int) -> int:
+    """Number of intervals between knots of a sweep of so many frames."""
+    return int(np.clip((frames - 1) // FRAMES_PER_KNOT, 1, MOST_KNOTS))
 
 
 @dataclass(frozen=True)
@@ -75,7 +79,7 @@ class ImagePath:
         """
         n = len(path)
         step = np.concatenate([[0.0], (path[:-1].inv() * path[1:]).translation[:, Z]])
-        knots = np.linspace(0, n - 1, min(n - 1, MOST_KNOTS) + 1).astype(int)
+        knots = np.linspace(0, n - 1, knot_intervals(n) + 1).astype(int)
         interval = np.searchsorted(knots, np.arange(1, n), "left") - 1
         length = np.maximum(np.abs(step[1:]), LEAST_STEP_MM)
         travel = np.bincount(interval, length)

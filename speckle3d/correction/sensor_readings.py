@@ -21,7 +21,7 @@ from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.geometry import skew
 from speckle3d.core.leastsquares import robust_sigma
 from speckle3d.core.sweep import OrientationSensor, Tracker
-from speckle3d.correction.image_path import HAND_TURN_RAD, MOST_KNOTS, ImagePath
+from speckle3d.correction.image_path import HAND_TURN_RAD, ImagePath, knot_intervals
 from speckle3d.correction.settings import FusedSettings
 
 FEWEST_READINGS = 10
@@ -140,9 +140,9 @@ class SensorReadings:
         ]
         jitter = [robust_sigma(values, least) for values, least in zip(second, LEAST_JITTER, strict=True)]
         # A random walk departs from the straight line between two knots by a sixth of its growth, on average.
-        knots = min(frame_time_s.size - 1, MOST_KNOTS)
-        unresolved = HAND_TURN_RAD * np.sqrt(np.ptp(frame_time_s) / knots / 6.0)
-        jitter[0] = float(np.hypot(jitter[0], unresolved))
+        interval_s = np.ptp(frame_time_s) / knot_intervals(frame_time_s.size)
+        unresolved = HAND_TURN_RAD * np.sqrt(interval_s / 6.0)
+        jitter[0] = max(jitter[0], float(unresolved))
         return replace(readings, jitter=np.array(jitter))
 
     @property

@@ -153,7 +153,7 @@ def solve_planes(
 
 
 def alike_pairs(problem: MotionProblem, table: CorrelationTable, correlation: FloatArray) -> IntArray:
-    """Rows of correlated pairs; for frames without any, of their best pair, if it tells a little.
+    """Rows of correlated pairs; for frames without any, of their best pair. All tell a little.
 
     Parameters
     ----------
@@ -163,7 +163,7 @@ def alike_pairs(problem: MotionProblem, table: CorrelationTable, correlation: Fl
     _, begin, count = np.unique(table.second, return_index=True, return_counts=True)
     is_best = correlation >= np.repeat(np.fmax.reduceat(correlation, begin), count)
     alike = correlation >= problem.trajectory.least_correlation
-    return np.flatnonzero(alike | (is_best & (table.median >= LEAST_CORRELATION)))
+    return np.flatnonzero((alike | is_best) & (table.median >= LEAST_CORRELATION))
 
 
 def _signed_planes(
