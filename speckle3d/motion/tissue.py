@@ -89,7 +89,7 @@ def structure_openness(texture: Texture) -> float:
     Structure only stays alike for longer: the curves' width lies between once and twice this above speckle's.
     """
     dark, bright = texture.grey_spread_db()
-    return float(np.log(max(1.0, STRUCTURE_BALANCE * bright / max(dark, LEAST_BALANCE * bright))))
+    return float(np.log(max(1.0, STRUCTURE_BALANCE * bright / max(dark, LEAST_BALANCE * bright, 1e-9))))
 
 
 def grey_error(signal: RFSettings | BModeSettings, texture: Texture) -> float:

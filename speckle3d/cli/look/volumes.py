@@ -202,6 +202,10 @@ def scene(
     from speckle3d.study.scenes.scene import FILES, write_scene
 
     require_own(out, FILES)
+    if not {(out / name).resolve() for name in FILES.names}.isdisjoint(
+        path.resolve() for path in (input_file, choice.sweep_file) if path
+    ):
+        raise InvalidInputError(f"{out}: expected a folder without the input, which would be replaced")
     compounding = compounding_settings(config_file, settings)
     modes = list(dict.fromkeys(mode)) if mode else [None]
     sweeps, part = open_sweep_at(modes, input_file, recording, choice)
