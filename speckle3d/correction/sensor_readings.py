@@ -142,8 +142,9 @@ class SensorReadings:
         # A random walk departs from the straight line between two knots by a sixth of its growth, on average.
         interval_s = np.ptp(frame_time_s) / knot_intervals(frame_time_s.size)
         unresolved = HAND_TURN_RAD * np.sqrt(interval_s / 6.0)
-        jitter[0] = max(jitter[0], float(unresolved))
-        return replace(readings, jitter=np.array(jitter))
+        lever_mm = np.linalg.norm(readings.centre_from_sensor.translation)
+        jitter = np.hypot(jitter, unresolved * np.array([1.0, lever_mm]))
+        return replace(readings, jitter=jitter)
 
     @property
     def knots_s(self) -> FloatArray:

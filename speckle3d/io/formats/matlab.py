@@ -66,6 +66,8 @@ def open_matlab(path: Path, settings: ImportSettings) -> Facts:
     rows = [(name, _size(node), _kind(node)) for name, node in largest]
     yield from ((f"array {name}", size, kind) for name, size, kind in rows)
     arrays, where = settings.arrays, f"{path}: arrays"
+    if unknown := sorted({*arrays} - {*_ROLES, *_POSITIONS, *ImportSettings.model_fields, "axes"}):
+        raise InvalidInputError(f"{where}: expected {', '.join(sorted(_ROLES))}, axes, got {unknown[0]}")
     data = next((data for data in _DATA if {*data} == _ROLES & {*arrays}), None)
     if data is None:
         listing = ", ".join(map(" ".join, rows))
