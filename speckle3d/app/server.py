@@ -15,6 +15,7 @@ from tornado.httpserver import HTTPServer
 from tornado.ioloop import IOLoop, PeriodicCallback
 from tornado.netutil import bind_sockets
 from tornado.web import HTTPError, RequestHandler
+from tornado.websocket import WebSocketClosedError
 
 from speckle3d.app.look import Page, shell
 from speckle3d.core.errors import FileError
@@ -87,7 +88,8 @@ class AppServer:
     def run(self) -> None:
         """Serve until nobody has looked for a while, or the process is told to end."""
         # A viewer may leave at any moment.
-        logging.getLogger("bokeh.server.views.ws").addFilter(_is_no_farewell)
+        for name in ("asyncio", "bokeh.server.views.ws"):
+            logging.getLogger(name).addFilter(_is_no_farewell)
         self._server.start()
         looking = PeriodicCallback(self._look, 1000.0 * _LOOK_S)
         looking.start()
@@ -125,4 +127,5 @@ class _Once(RequestHandler):
 
 
 def _is_no_farewell(record: logging.LogRecord) -> bool:
-    return "connection was closed" not in record.getMessage()
+    is_closed = record.exc_info is not None and isinstance(record.exc_info[1], WebSocketClosedError)
+    return not is_closed and "connection was closed" not in record.getMessage()
