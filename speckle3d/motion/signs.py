@@ -56,7 +56,7 @@ def likeliest_path(
     planes: PairPlanes,
     frames: int,
     strangers: Strangers,
-    known: FloatArray = ORIGIN,
+    start: FloatArray = ORIGIN,
 ) -> FloatArray:
     """Follow the most likely paths: elevational position and slope along x of one frame after the other.
 
@@ -70,7 +70,7 @@ def likeliest_path(
     frames : int
         Of the sweep.
     strangers : Strangers
-    known : ndarray, shape (m, 2), optional
+    start : ndarray, shape (m, 2), optional
         Position and slope of the first m frames, which stay.
 
     Returns
@@ -90,7 +90,7 @@ def likeliest_path(
         APART_SLOPE,
     )
     path, every = np.zeros((frames, 2)), np.arange(frames + 1)
-    path[: len(known)] = known
+    path[: len(start)] = start
     follow_paths(
         np.searchsorted(planes.second, every),
         np.ascontiguousarray(planes.first),
@@ -100,7 +100,7 @@ def likeliest_path(
         np.ascontiguousarray(strangers.first),
         rules,
         path,
-        len(known),
+        len(start),
     )
     return path
 

@@ -66,13 +66,15 @@ def by_vqf(stretch: Samples, claims: Estimate, offline: bool, magnetic: bool) ->
         first = Rotation.from_quat(claims.xyzw[0]) * Rotation.from_quat(xyzw[0]).inv()
         north_rad = 2.0 * float(np.arctan2(*first.as_quat()[2:]))
     xyzw = turn_about_up(north_rad, xyzw)
-    apart = Rotation.from_quat(xyzw) * Rotation.from_quat(claims.xyzw).inv()
+    difference = Rotation.from_quat(xyzw) * Rotation.from_quat(claims.xyzw).inv()
     at = np.minimum(np.rint(place).astype(np.int64), len(grid) - 1)
     disturbance = estimate["magDistDetected"][at] if magnetic else np.zeros(len(stretch), dtype=bool)
     return replace(
         claims,
         xyzw=xyzw,
-        standard_deviation_rad=np.minimum(np.hypot(claims.standard_deviation_rad, apart.as_rotvec()), np.pi),
+        standard_deviation_rad=np.minimum(
+            np.hypot(claims.standard_deviation_rad, difference.as_rotvec()), np.pi
+        ),
         gyro_bias_rad_s=estimate["bias"][at],
         disturbed=disturbance,
         resting=estimate["restDetected"][at],
