@@ -35,8 +35,8 @@ field."""
 WANDER_TIMES = (0.1, 0.3, 1.0, 3.0)
 """Times in which it changes, over the sweep's: shorter ones look like jitter, longer ones like a line."""
 STEADY = 0.5
-"""Probability, before anything is read, that it does not wander, as in calibrations: nothing says more. Half of
-it moves lengths of 56 parts of sweeps by at most 0.3 %, their claims by at most 6 %."""
+"""Probability, before anything is read, that it does not wander, as in calibrations: nothing says more.
+Half of it moves lengths of 56 parts of sweeps by at most 0.3 %, their claims by at most 6 %."""
 LEAST_JITTER = np.array([2e-5, 2e-3])
 """Of a turn, rad, and a place, mm: the last digits of sensors; simulated ones may have no noise."""
 TICK = 1e-6
