@@ -186,9 +186,14 @@ def consistent_poses(motion: Motion, sweep: Sweep, settings: SensorSettings) -> 
     distance, sigma = (scale * v for v in patch_distances(problem, correlation, models))
     agreement = consistent_subset(distance, sigma, farther, open_side, problem.planes.support_sigma)
     planes, firm = pair_planes(problem, table, pairs.row, models, agreement, slopes, open_side)
-    # Slopes are the sensor's; distances have the scale of all patches.
-    planes.coefficients[:] *= [scale, 1.0, 1.0] * sign[:, None]
-    planes.covariance[:] *= scale**2
+    every, every_firm = pair_planes(problem, table, pairs.row, models, True, slopes, open_side)
+    # The patches that most agree are those of the commonest distance, which is short of the mean where echoes
+    # differ: the subset says which way frames turn, all patches how far apart they are.
+    near, far = (p.offset_mm[firm & every_firm] for p in (planes, every))
+    factor = scale * (near @ far) / (near @ near) if near.any() else scale
+    # Slopes are the sensor's.
+    planes.coefficients[:] *= [factor, 1.0, 1.0] * sign[:, None]
+    planes.covariance[:] *= factor**2
     for name in ("coefficients", "covariance", "used"):
         getattr(planes, name)[~firm] = getattr(pairs, name)[~firm]
     rejected_share = 1.0 - float(planes.used[pairs.used].mean())
