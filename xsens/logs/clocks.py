@@ -33,8 +33,6 @@ _LONGER, _MUCH_LONGER = 1.6, 10.0
 _SHORTER = 0.6
 """A loss makes no step shorter than the period, rounding to 10 ms at 64 Hz none below this share of it."""
 
-_MOST_PERIODS = 2.0**53
-
 LATE = 64
 """A sample that comes at most so many samples late was overtaken, whatever follows."""
 
@@ -96,34 +94,11 @@ def unwrap(values: Any, span: int) -> Any:
     return values[0] + _running_sums(steps)
 
 
-def spread(stamps: Stamps, readings: Sequence[FloatArray | None]) -> tuple[Stamps, tuple[str, ...]]:
-    """Spread samples that came together, stamped on arrival, over the time since those before; a note on it.
-
-    Rows of readings that repeat the one before are the same sample, sent twice.
-    """
-    if stamps.time_s is None or stamps.time_s.size < 2:
-        return stamps, ()
-    steps = np.diff(stamps.time_s)
-    together = (steps >= 0.0) & (steps < SHORTEST_S)
-    differ = np.any([(rows[1:] != rows[:-1]).any(axis=1) for rows in readings if rows is not None], axis=0)
-    if together.all() or 2 * (together & differ).sum() <= steps.size:
-        return stamps, ()
-    last = np.flatnonzero(np.append(~together, True))
-    counts, arrival_s = np.diff(last, prepend=-1), stamps.time_s[last]
-    spans = np.diff(arrival_s) / counts[1:]
-    usual = np.median(spans)
-    period_s = np.append(usual, np.minimum(spans, _LONGER * usual))
-    time_s = np.repeat(arrival_s - last * period_s, counts) + np.arange(steps.size + 1) * np.repeat(
-        period_s, counts
-    )
-    note = f"{counts.size} stamps for {time_s.size} samples: spread evenly between stamps"
-    return replace(stamps, time_s=time_s), (note,)
-
-
-def timeline(stamps: Stamps) -> Timeline:
+def timeline(stamps: Stamps, readings: Sequence[FloatArray] = ()) -> Timeline:
     """Rebuild the times of samples from their stamps.
 
-    Samples out of order are sorted; of several with the same stamps, the first is kept.
+    Samples out of order are sorted; of several with the same stamps, the first is kept. Those that came
+    together, stamped on arrival, are spread over the time since those before, if their readings differ.
 
     Raises
     ------
@@ -131,17 +106,21 @@ def timeline(stamps: Stamps) -> Timeline:
         If there is neither a clock nor a counter with a known and possible period, or the times contradict
         the period.
     """
-    numbers, values = None, stamps.time_s
+    numbers, values, notes = None, stamps.time_s, list[str]()
     if stamps.counter is not None:
         numbers = _sample_numbers(stamps.counter, stamps.extras)
     if values is None:
         if numbers is None or not stamps.period_s > 0.0:
             evidence = "neither" if numbers is None else "a counter, but no rate"
             raise InvalidInputError(
-                f"expected samples with a clock, or with a sampling rate, got {evidence}: give --rate-hz"
+                "expected samples with a clock, as a column time_s, or with a sampling rate, got "
+                f"{evidence}: give --rate-hz"
             )
         values = (numbers - numbers[0]) * stamps.period_s
-    anew, notes = _new_starts(values, stamps), list[str]()
+    elif (stamps_s := _spread(values, readings)) is not values:
+        notes.append(f"several samples to a stamp, {len(values)} in all: spread evenly between stamps")
+        values = stamps_s
+    anew = _new_starts(values, stamps)
     if anew.any():
         steps = np.where(anew[1:], 0.0, np.diff(values))
         pauses = _pauses(stamps.computer_s, anew, _running_sums(steps))
@@ -164,6 +143,25 @@ def timeline(stamps: Stamps) -> Timeline:
     line = Timeline(rows, values[rows], counter, notes=tuple(notes))
     numbers = None if numbers is None else numbers[rows]
     return _with_gaps(line, numbers, np.diff(np.cumsum(anew)[rows]) > 0, stamps.period_s)
+
+
+def _spread(values: FloatArray, readings: Sequence[FloatArray]) -> FloatArray:
+    """Times of samples that came together, stamped on arrival, spread over the time since those before.
+
+    Rows of readings that repeat the one before are the same sample, sent twice.
+    """
+    steps = np.diff(values)
+    together = (steps >= 0.0) & (steps < SHORTEST_S)
+    differ = np.any([(rows[1:] != rows[:-1]).any(axis=1) for rows in readings], axis=0)
+    if together.all() or 2 * (together & differ).sum() <= steps.size:
+        return values
+    last = np.flatnonzero(np.append(~together, True))
+    counts, arrival_s = np.diff(last, prepend=-1), values[last]
+    spans = np.diff(arrival_s) / counts[1:]
+    usual = np.median(spans)
+    period_s = np.append(usual, np.minimum(spans, _LONGER * usual))
+    places = np.arange(values.size) - np.repeat(last, counts)
+    return np.asarray(np.repeat(arrival_s, counts) + places * np.repeat(period_s, counts))
 
 
 def _with_gaps(line: Timeline, numbers: FloatArray | None, anew: BoolArray, stated_s: float) -> Timeline:
@@ -190,7 +188,7 @@ def _with_gaps(line: Timeline, numbers: FloatArray | None, anew: BoolArray, stat
         if counter is not None:
             raise InvalidInputError(contradiction)
         notes += (f"{contradiction}, which holds",)
-    missing = np.where(anew | (periods <= longest), 0.0, np.round(np.minimum(periods, _MOST_PERIODS)) - 1.0)
+    missing = np.where(anew | (periods <= longest), 0.0, np.round(periods) - 1.0)
     at = np.flatnonzero((missing > 0.0) | anew | (seconds > longest * usual_s))
     gaps = tuple(Gap(int(i), int(missing[i]), float(seconds[i])) for i in at)
     return replace(line, counter=counter, gaps=gaps, notes=notes)

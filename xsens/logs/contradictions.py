@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from speckle3d.core.arrays import BoolArray, FloatArray
-from xsens.logs.samples import ImuLog, finite_rows, median_norm, row_norms, selection
+from xsens.logs.samples import ImuLog, finite_rows, median_norm, row_norms
 
 FORCE_M_S2 = (4.0, 25.0)
 """Limits of the median of the accelerometer's norm if it is in m/s^2."""
@@ -115,23 +115,21 @@ def _turns(
     ndarray of bool, shape (3, n)
         Whether an axis of the gyroscope reads the same as before, while others do not.
     """
-    part = selection(finite_rows(rate) & finite_rows(direction))
-    time_s = time_s[part]
-    if len(time_s) <= _FEWEST:
+    rows = np.column_stack([time_s, rate, direction])[finite_rows(rate) & finite_rows(direction)]
+    if len(rows) <= _FEWEST:
         return None
-    width = max(1, round(_COMPARED_S / float(np.median(np.diff(time_s)))))
-    first = np.arange(0, len(time_s) - width + 1, width)
-    end, readings = len(first) * width, (time_s, rate[part], direction[part])
-    time_s, rates, means = (np.add.reduceat(values[:end], first) / width for values in readings)
-    step_s, rate, norm = np.diff(time_s), 0.5 * (rates[1:] + rates[:-1]), row_norms(means)
+    width = max(1, round(_COMPARED_S / float(np.median(np.diff(rows[:, 0])))))
+    count = len(rows) // width
+    rows = rows[: count * width].reshape(count, width, 7).mean(axis=1)
+    step_s, rates, norm = np.diff(rows[:, 0]), rows[:, 1:4], row_norms(rows[:, 4:])
     calm = np.abs(norm / np.median(norm) - 1.0) < _CALM
     calm = calm[1:] & calm[:-1] & (step_s < 2.0 * np.median(step_s))
     if calm.sum() < _FEWEST:
         return None
-    u = means / np.maximum(norm, 1e-9)[:, None]
+    u = rows[:, 4:] / np.maximum(norm, 1e-9)[:, None]
     change = (np.diff(u, axis=0) / step_s[:, None])[calm]
     arms = np.cross(0.5 * (u[1:] + u[:-1])[calm], np.eye(3)[:, None])
-    turns = arms * rate[calm].T[:, :, None]
+    turns = arms * (0.5 * (rates[1:] + rates[:-1])[calm]).T[:, :, None]
     if max(_rms(turns.sum(axis=0)), _rms(change)) < _MOVING_RAD_S:
         return None
     same = np.diff(rates, axis=0)[calm].T == 0.0

@@ -109,23 +109,20 @@ def _digit(steps: FloatArray) -> float:
 def _bad(name: str, rows: FloatArray, force: FloatArray, rate: FloatArray) -> dict[str, BoolArray]:
     """Rows that are no measurement of one sensor, by reason."""
     limits, size = LIMITS[name], row_norms(rows)
-    zero, unit, repeats = size < 1e-12, 1.0, np.zeros(len(rows), dtype=bool)
+    zero, unit = size < 1e-12, 1.0
     if name == VECTORS[1]:  # at rest zero is a reading
         zero &= ~(row_norms(force) > 0.0)
     valid = ~(np.isnan(size) | zero)
     if name == VECTORS[2] and valid.any():
         unit = float(np.median(size[valid]))
-    largest = limits.largest * unit
-    beyond = size > largest
-    beyond[beyond] = np.abs(rows[beyond]).max(axis=1) > largest
+    beyond = size > limits.largest * unit
     if beyond.sum() > _FEW * (size >= 0.0).sum():  # another unit, which whoever uses the log refuses
         beyond = size >= _ABSURD
     valid &= ~beyond
-    if valid.any():
-        part = selection(valid)
-        repeats[part] = _repeats(name, limits.change * unit, rows[part], force[part], rate[part])
-    if not (valid := valid & ~repeats).all():
-        rows = np.where(valid[:, None], rows, np.nan)
+    part, repeats = selection(valid), np.zeros_like(valid)
+    repeats[part] = _repeats(name, limits.change * unit, rows[part], force[part], rate[part])
+    valid &= ~repeats
+    rows = np.where(valid[:, None], rows, np.nan)
     return {
         "readings of zero": zero,
         "out of range": beyond,
@@ -157,7 +154,7 @@ def _repeats(name: str, change: float, rows: FloatArray, force: FloatArray, rate
     One in ten of a sensor's samples may last longer: its rate is another than that of the log.
     Where readings before and after change by many of their last digits, none is repeated by chance.
     """
-    start = np.flatnonzero(np.append(True, np.logical_or.reduce([axis[1:] != axis[:-1] for axis in rows.T])))
+    start = np.flatnonzero(np.append(True, (rows[1:] != rows[:-1]).any(axis=1)))
     length = np.diff(np.append(start, len(rows)))
     middle, high = np.percentile(length, [50, 90]) if len(length) > 1 else (1, 1)
     usual = int(min(3.0 * middle, high))
@@ -200,36 +197,28 @@ def stuck_axes(rows: FloatArray, least: float = 0.0) -> BoolArray:
     alone = same & ~repeats[:, None]
     longest = _STUCK * len(rows) / (len(rows) - repeats.sum())
     for k in np.flatnonzero(alone.any(axis=0)).tolist():
-        axis, others = rows[:, k].astype(float), np.append(0, np.cumsum(alone[:, k]))
+        axis = rows[:, k].astype(float)
         first = np.flatnonzero(np.append(True, ~same[:, k]))
-        value, end = axis[first], np.append(first[1:], len(rows))
-        length = end - first
-        at_end = (value == np.fmax.reduce(axis)) | (value == np.fmin.reduce(axis))
-        run = (others[end - 1] - others[first] > 1) & (np.abs(value) >= least) & (at_end | (length > longest))
-        if not run.any():
-            continue
-        first, end, zero = first[run], end[run], value[run] == 0.0
+        length = np.diff(np.append(first, len(rows)))
+        end, value = first + length, axis[first]
         steps = np.abs(np.pad(np.diff(axis), 2, constant_values=np.nan))
         usual = usual_step(steps, np.inf)
+        at_end = (value == np.fmax.reduce(axis)) | (value == np.fmin.reduce(axis))
         steep = np.fmin(steps[first], steps[end + 2]) > 3.0 * _digit(steps)
         dead = np.fmax(steps[first + 1], steps[end + 1]) > _NOISY * usual
-        dead |= (end == len(rows)) & ~zero & (usual < np.inf)
-        stuck = (at_end[run] & steep & ~zero) | (dead & (end - first > longest))
-        for i, j in zip(first[stuck], end[stuck], strict=True):
-            bad[i:j] = True
+        dead |= (end == len(rows)) & (value != 0.0) & (usual < np.inf)
+        stuck = (at_end & steep & (value != 0.0)) | (dead & (length > longest))
+        stuck &= (np.abs(value) >= least) & (np.add.reduceat(np.append(alone[:, k], 0), first) > 1)
+        bad |= np.repeat(stuck, length)
     return bad
 
 
 def _spikes(rows: FloatArray, height: float) -> BoolArray:
     """Single rows far from both neighbours, which are near each other."""
-    bad = np.zeros(len(rows), dtype=bool)
-    if len(rows) > 2:
-        step = row_norms(np.diff(rows, axis=0))
-        at = np.flatnonzero(np.append(step[0], step) > 0.9 * height)
-        before, after = rows[np.abs(at - 1)], rows[np.where(at + 1 < len(rows), at + 1, at - 1)]
-        away = row_norms(rows[at] - 0.5 * (before + after))
-        bad[at] = (away > height) & (row_norms(after - before) < 0.2 * away)
-    return bad
+    neighbours = np.pad(rows, ((1, 1), (0, 0)), mode="reflect")
+    before, after = neighbours[:-2], neighbours[2:]
+    away = row_norms(rows - 0.5 * (before + after))
+    return np.asarray((away > height) & (row_norms(after - before) < 0.2 * away))
 
 
 def _require_one_sensor(readings: dict[str, FloatArray]) -> None:

@@ -6,13 +6,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
-from xsens.logs.clocks import Stamps, spread, timeline
+from xsens.logs.clocks import Stamps, timeline
 from xsens.logs.faults import without_faults
 from xsens.logs.samples import VECTORS, ImuLog
-from xsens.logs.worlds import Claim, nwu_from, own_rotations
+from xsens.logs.worlds import Claim, nwu_from, to_nwu
 
 
 @dataclass(frozen=True)
@@ -56,7 +57,7 @@ class Parts:
     vectors : tuple of ndarray, shape (m, 3), or None
         Readings of accelerometer, gyroscope and magnetometer.
     notations : mapping of str to ndarray, shape (m, 4)
-        The sensor's own orientation, as `own_rotations` has it.
+        The sensor's own orientation, as `to_nwu` has it.
     claim : Claim, optional
         Its world; None for one that has nothing to do with north and up.
     increments : tuple of ndarray, shapes (m, 3) and (m, 3) or (m, 4), or None
@@ -95,26 +96,30 @@ def assemble_log(parts: Parts, hints: Hints, source: str) -> ImuLog:
         samples = next(len(part) for part in (stamps.starts, *readings) if part is not None)
         stamps = replace(stamps, counter=np.arange(samples))
         notes.append("samples have no counter: losses cannot be found")
-    rotations, oriented = None, np.zeros(0, dtype=bool)
-    if parts.notations:
-        claim = parts.claim if hints.world is None else Claim(hints.world, "as given", final=True)
-        force, _, field_au = vectors
-        rotations, oriented, more = own_rotations(parts.notations, claim, force, field_au, hints.as_stated)
-        notes += more
-    stamps, burst_notes = spread(stamps, readings)
-    line = timeline(stamps)
+    line = timeline(stamps, readings)
+    notations = {meaning: wxyz[line.rows] for meaning, wxyz in parts.notations.items()}
+    wxyz = next(iter(notations.values()), np.zeros((0, 4)))
+    oriented = np.isfinite(wxyz).all(axis=1)
+    if missing := int((~oriented).sum()):
+        notes.append(f"{missing} samples lack the sensor's own orientation")
+    rotations = Rotation.from_quat(np.where(oriented[:, None], wxyz, 0.5), scalar_first=True)
     force, rate, field_au = (None if part is None else part[line.rows] for part in vectors)
     log = ImuLog(
         line.time_s,
         force,
         rate,
         field_au,
-        rotations[line.rows] if rotations is not None and oriented.any() else None,
+        Rotation.from_quat(np.where(oriented[:, None], wxyz, 0.5), scalar_first=True)
+        if oriented.any()
+        else None,
         line.counter if has_counter else None,
         line.gaps,
-        (*notes, *burst_notes, *line.notes),
+        (*notes, *line.notes),
         source,
-        oriented[line.rows] if oriented.any() else oriented[:0],
+        oriented,
     )
-    log = replace(log, **{name: getattr(log, name) * log.rate_hz for name in scaled})
-    return without_faults(log)
+    log = without_faults(replace(log, **{name: getattr(log, name) * log.rate_hz for name in scaled}))
+    if log.world_from_sensor is None:
+        return log
+    claim = parts.claim if hints.world is None else Claim(hints.world, "as given", final=True)
+    return to_nwu(log, notations, claim, hints.as_stated)

@@ -143,7 +143,7 @@ class ImuLog:
         if not steps.size:
             return float("nan")
         regular = steps < _PAUSE * np.median(steps)
-        regular[[gap.after_index for gap in self.gaps if gap.after_index < steps.size]] = False
+        regular[[gap.after_index for gap in self.gaps]] = False
         return float(1.0 / (steps[regular].mean() if regular.any() else np.median(steps)))
 
     @property

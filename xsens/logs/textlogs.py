@@ -10,7 +10,6 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterable, Iterator
-from dataclasses import replace
 from io import StringIO
 from pathlib import Path
 
@@ -25,7 +24,6 @@ from xsens.logs.samples import VECTORS, ImuLog, median_norm
 from xsens.logs.texttables import (
     STAMPS,
     TIMES,
-    Names,
     TextTable,
     column_of,
     describe_unknown,
@@ -95,45 +93,38 @@ def parse_text(text: str | Iterable[str], hints: Hints | None = None, source: st
     """
     with naming(source):
         table = read_table(StringIO(text, newline=None) if isinstance(text, str) else text)
-        table = table if table.names else _mt9_export(table)
         hints = hints or Hints()
-        parts = _samples(table, hints.rate_hz)
-        return assemble_log(replace(parts, notes=(*table.notes, *parts.notes)), hints, source)
-
-
-def _mt9_export(table: TextTable) -> TextTable:
-    """Name the columns of an export of the MT9 software; its kind is told by their number."""
-    columns = list(table.columns.values())
-    quantities: tuple[str, ...] = () if len(columns) not in (10, 11) else ("acc", "gyr", "mag")
-    quantities, notes = ("euler",) if len(columns) == 4 else quantities, table.notes
-    if len(columns) == 10 and np.mean(are_rotations(np.stack(columns[1:], axis=1)[:_ENOUGH])) > 0.5:
-        quantities, notes = ("mat",), (*notes, "matrices are taken row by row")
-    if not quantities:
-        raise InvalidInputError(
-            f"expected columns with names, or the 4, 10 or 11 of an MT9 export without, got {len(columns)} "
-            "without"
-        )
-    keys = ["time", *(f"{quantity}_{axis}" for quantity in quantities for axis in _AXES[quantity])]
-    with_unit = frozenset(("time", "euler_roll"))
-    return replace(table, columns=dict(zip(keys, columns, strict=False)), with_unit=with_unit, notes=notes)
+        return assemble_log(_samples(table, hints.rate_hz), hints, source)
 
 
 def _samples(table: TextTable, rate_hz: float | None) -> Parts:
     """Samples of a table whose columns are known, at a rate that the header may name."""
-    notes = list[str]()
+    notes = list(table.notes)
     columns, stamps, dot = _stamps(table, rate_hz, notes)
     readings = {}
     for quantity, axes in _AXES.items():
-        parts = [columns[key] for axis in axes if (key := f"{quantity}_{axis}") in columns]
-        if len(parts) == len(axes):
-            readings[quantity] = np.stack(parts, axis=1)
-    if dot and "gyr" in readings and "gyr_x" not in table.with_unit:
+        keys = [f"{quantity}_{axis}" for axis in axes]
+        if columns.keys() >= set(keys):
+            readings[quantity] = np.column_stack([columns[key] for key in keys])
+    if not table.names and "mag" in readings:
+        numbers = np.hstack([*readings.values()])
+        if np.mean(are_rotations(numbers[:_ENOUGH])) > 0.5:
+            readings = {"mat": numbers}
+            notes.append("matrices are taken row by row")
+    if dot and "gyr" in readings and table.scales["gyr_x"] is None:
         readings["gyr"] = np.deg2rad(readings["gyr"])
-    if "acc" not in readings and any(key.startswith("free_") for key in columns):
-        if median_norm(readings.get("free", np.zeros((1, 3)))) >= _GRAVITY_M_S2:
-            readings["acc"] = readings["free"]
+    free = readings.pop("free", None)
+    if "acc" not in readings and free is not None:
+        if median_norm(free) >= _GRAVITY_M_S2:
+            readings["acc"] = free
         else:
             notes.append("acceleration without gravity is no accelerometer's reading and was left out")
+    odd = _unknown_columns(table)
+    if not readings:
+        text = "; ".join(odd) or describe_unknown(table.names)
+        raise InvalidInputError(
+            f"expected columns of acceleration, rate of turn, field or orientation, {text}"
+        )
     notation = next(filter(readings.__contains__, _ORIENTATIONS), "")
     claim: Claim | None = _claim(table, dot)
     notations = {"": quaternions_of(readings[notation])} if notation else {}
@@ -142,20 +133,14 @@ def _samples(table: TextTable, rate_hz: float | None) -> Parts:
         notes.append("orientation: by cameras, in a world of their own: x and z need not be north and up")
     elif notation == "quat":
         notations["the scalar is the last number"] = np.roll(notations[""], 1, axis=1)
-    elif notation == "euler" and "time" in table.columns and "euler_roll" not in table.with_unit:
+    elif notation == "euler" and "time" in table.columns and table.scales["euler_roll"] is None:
         angles = readings["euler"]
         if np.nanmax(np.abs(angles), initial=0.0) < _HALF_TURN:
             notations["angles are in radians"] = quaternions_of(np.degrees(angles))
         if len(notations) > 1 and "acc" not in readings:
             raise InvalidInputError("expected angles with their unit, as roll_deg, got small ones without")
-    odd = _unknown_columns(table)
-    if not readings.keys() - {"free"}:
-        columns_text = "; ".join(odd) or describe_unknown(table.names)
-        raise InvalidInputError(
-            f"expected columns of acceleration, rate of turn, field or orientation, {columns_text}"
-        )
-    vectors = readings.get("acc"), readings.get("gyr"), readings.get("mag")
     turns = rotation_vectors(readings["dq"]) if "dq" in readings else None
+    vectors = readings.get("acc"), readings.get("gyr"), readings.get("mag")
     return Parts(stamps, vectors, notations, claim, (*odd, *notes), (readings.get("dv"), turns))
 
 
@@ -171,7 +156,7 @@ def _stamps(
         if key in columns and columns[key].size > 1 and not (columns[key] != columns[key][0]).any():
             notes.append(f"{key}: the same in every line, left out")
             del columns[key]
-    if "time" in columns and "time" not in table.with_unit:
+    if "time" in columns and table.scales["time"] is None:
         columns |= _unnamed_time(columns.pop("time"), np.isfinite(period_s), notes)
     dot = any("devicetag" in line.lower() for line in table.header)
     if "ticks" in columns and "time" not in columns:
@@ -183,15 +168,8 @@ def _stamps(
         hour, minute, nano = (columns.get(f"utc_{part}", 0.0) for part in ("hour", "minute", "nano"))
         seconds = 3600.0 * hour + 60.0 * minute + columns["utc_s"] + 1e-9 * nano
         columns["time"] = unwrap_column(np.asarray(seconds))
-    if np.isnan(period_s) and not columns.keys() & {"time", "counter"}:
-        unknown = [name[:40] for name in table.names if column_of(name) is None]
-        raise InvalidInputError(
-            f"expected a column of time with its unit, as time_s, got {', '.join(unknown[:9]) or 'none'}: "
-            "name it so, or give --rate-hz"
-        )
-    timely = np.all(
-        [np.abs(columns[key]) < _LARGEST for key in ("time", "counter") if key in columns], axis=0
-    )
+    clocks = [np.abs(columns[key]) < _LARGEST for key in ("time", "counter") if key in columns]
+    timely = np.all(clocks, axis=0)
     if not timely.any():
         raise InvalidInputError("expected lines with a time, got none")
     if not timely.all():
@@ -234,7 +212,7 @@ def _claim(table: TextTable, dot: bool) -> Claim:
     return Claim("ENU", "as the sensor's are" if dot else "the program's default", by_default=True)
 
 
-def _unknown_columns(table: TextTable) -> Names:
+def _unknown_columns(table: TextTable) -> tuple[str, ...]:
     """Note on unknown columns, and on those of a quantity some of whose axes are missing.
 
     A program's exports hold many other columns: of theirs, only those that look like a sensor's are listed.

@@ -23,14 +23,11 @@ from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
 from xsens.logs.clocks import COUNTS, LATE, TICKS, unwrap, usual_step
 
-Names = tuple[str, ...]
-Header = list[str]
-
 _SEPARATORS = ("\t", ";", "|", ",", None)
 """In order of trust: a tab only separates, a comma may be a decimal point, blanks (None) may be padding."""
 
-_LONGEST_HEADER = 128
-"""Lines among which the first numbers must be."""
+_LONGEST_HEADER = 10_000
+"""Lines among which the first numbers must be: to look at as many takes a second or two."""
 
 _DATE_DIGIT, _MILLISECONDS = re.compile(r"\b(\d)\b"), re.compile(r":(\d{3})$")
 """In dates and times: a number without its leading zero, and thousandths after a colon."""
@@ -102,6 +99,14 @@ _SPELLINGS = (
 
 STAMPS = ("time", "counter", "ticks")
 
+_VECTOR_AXES = [f"{quantity}_{axis}" for quantity in ("acc", "gyr", "mag") for axis in "xyz"]
+_MT9_EXPORTS = {
+    4: ["time_s", "roll_deg", "pitch_deg", "yaw_deg"],
+    10: ["time_s", *_VECTOR_AXES],  # or a matrix
+    11: ["time_s", *_VECTOR_AXES, "temperature"],
+}
+"""Columns of the MT9 software's exports, which name none, by their number."""
+
 _SPANS = (60, 1 << 8, 1 << 10, 3600, 1 << 12, COUNTS, 86400, TICKS)
 """At which counters and clocks wrap round: words of so many bits, minutes, hours and days."""
 
@@ -148,15 +153,16 @@ def describe_unknown(names: Iterable[str]) -> str:
 class TextTable:
     """A table of numbers: the lines before it, names in lower case, and the columns that are understood.
 
-    `columns` are in SI units by key, without blank ones, those of `with_unit` by a unit in their name; where
-    none has a name, all by number. `notes` count lines of another length than the first or without a digit.
+    `columns` are in SI units by key, without blank ones; `scales` what their names' units make of them, None
+    of a name without unit. An MT9 export has no `names`. `notes` count lines of another length than the first
+    or without a digit.
     """
 
-    header: Header
-    names: Names
+    header: list[str]
+    names: tuple[str, ...]
     columns: dict[str, FloatArray]
-    with_unit: frozenset[str]
-    notes: Names = ()
+    scales: dict[str, float | None]
+    notes: tuple[str, ...]
 
 
 def read_table(lines: Iterable[str]) -> TextTable:
@@ -184,8 +190,8 @@ def read_table(lines: Iterable[str]) -> TextTable:
                 if fits and sum(column_of(name) is not None for name in names) >= 3:
                     return _read_rows(chain([line], rows), header, names, separator)
             if len(cells) >= 4 and all(numbers):
-                names = below if len(below) == len(cells) else [""] * len(cells)
-                return _read_rows(chain([line], rows), header, names, separator)
+                names = below if any(below) and len(below) == len(cells) else []
+                return _read_rows(chain([line], rows), header, names, separator, len(cells))
         header.append(line.rstrip("\n"))
     raise InvalidInputError(
         "expected messages of a sensor, or names of columns above lines of as many cells with numbers, got "
@@ -232,54 +238,59 @@ def _join(above: list[str], below: list[str]) -> list[str]:
     return names
 
 
-def _read_rows(lines: Iterable[str], header: Header, names: list[str], separator: str | None) -> TextTable:
-    """Read the columns that are understood, all where none has a name."""
-    columns: dict[str, tuple[int, float | None]] = {}
-    for i, name in enumerate(names):
-        key, scale = column_of(name) or ("", None)
-        if key in columns and key not in ("", "counter", "time"):
+def _read_rows(
+    lines: Iterable[str], header: list[str], names: list[str], separator: str | None, width: int = 0
+) -> TextTable:
+    """Read the columns that are understood; without names, those of an MT9 export of that width."""
+    titles = names or _MT9_EXPORTS.get(width)
+    if titles is None:
+        raise InvalidInputError(
+            f"expected columns with names, or the 4, 10 or 11 of an MT9 export without, got {width} without"
+        )
+    places, scales = dict[str, int](), dict[str, float | None]()
+    for i, title in enumerate(titles):
+        if (column := column_of(title)) is None:
+            continue
+        key, scale = column
+        if key in places and key not in ("counter", "time"):
             raise InvalidInputError(
-                f"expected the columns of one sensor, got two of {key}: {names[columns[key][0]]}, {name}"
+                f"expected the columns of one sensor, got two of {key}: {titles[places[key]]}, {title}"
             )
         # Of several times, the first with its unit, else the first.
-        if key not in columns or (columns[key][1] is None and scale is not None):
-            columns[key] = i, scale
-    columns.pop("", None)
-    if not any(names):
-        columns = {str(i): (i, None) for i in range(len(names))}
-    if not columns:
-        raise InvalidInputError(describe_unknown(names))
-    indices = [i for i, _ in columns.values()]
-    sensors = {i: dict[str, None]() for i, name in enumerate(names) if _WHOSE.match(name)}
+        if key not in places or (scales[key] is None and scale is not None):
+            places[key], scales[key] = i, scale
+    if not places:
+        raise InvalidInputError(describe_unknown(titles))
+    owners, whose = dict[int, str](), [i for i, title in enumerate(titles) if _WHOSE.match(title)]
     values, left_out = array("d"), 0
     for line in lines:
         cells = _split(line if separator == "," else line.replace(",", "."), separator)
-        while len(cells) > len(names) and not cells[-1].strip():
+        while len(cells) > len(titles) and not cells[-1].strip():
             cells.pop()
-        if len(cells) != len(names) or not _DIGIT.search(line):
+        if len(cells) != len(titles) or not _DIGIT.search(line):
             left_out += 1
             continue
-        for i, ids in sensors.items():
-            ids[cells[i].strip()] = None
+        for i in whose:
+            if (owner := cells[i].strip()) != owners.setdefault(i, owner):
+                raise InvalidInputError(
+                    f"column {titles[i]}: expected rows of one sensor, got {owners[i]}, {owner}: "
+                    "split the table"
+                )
         try:
-            values.extend([float(cells[i]) for i in indices])
+            values.extend([float(cells[i]) for i in places.values()])
         except ValueError:  # quoted, blank, a time, or a word
-            values.extend([number(cells[i]) for i in indices])
-    for i, ids in sensors.items():
-        if len(ids) > 1:
-            examples = ", ".join([*ids][:4])
-            raise InvalidInputError(
-                f"column {names[i]}: expected rows of one sensor, got {len(ids)} ({examples}): "
-                "split the table"
-            )
-    notes = [f"{left_out} lines of another length or without a digit were left out"] if left_out else []
-    rows, quantities = np.frombuffer(values).reshape(-1, len(indices)), {}
-    for (key, (_, scale)), column in zip(columns.items(), rows.T, strict=True):
-        if not any(names) or np.isfinite(column).any():
+            values.extend([number(cells[i]) for i in places.values()])
+    rows, columns = np.frombuffer(values).reshape(-1, len(places)), {}
+    if left_out > len(rows):
+        raise InvalidInputError(
+            f"expected lines of {len(titles)} cells, got {len(rows)} of {left_out + len(rows)}"
+        )
+    notes = (f"{left_out} lines of another length or without a digit were left out",) if left_out else ()
+    for key, column in zip(places, rows.T, strict=True):
+        if np.isfinite(column).any():
             with np.errstate(over="ignore"):  # damage, which is left out as no measurement
-                quantities[key] = (unwrap_column(column) if key in STAMPS else column) * (scale or 1.0)
-    with_unit = frozenset(key for key, (_, scale) in columns.items() if scale is not None)
-    return TextTable(header, tuple(filter(None, names)), quantities, with_unit, tuple(notes))
+                columns[key] = (unwrap_column(column) if key in STAMPS else column) * (scales[key] or 1.0)
+    return TextTable(header, tuple(filter(None, names)), columns, scales, notes)
 
 
 def unwrap_column(column: FloatArray) -> FloatArray:

@@ -8,14 +8,14 @@ may disturb some samples. The dip of the field has no part in it: it points up i
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.errors import InvalidInputError
-from xsens.logs.samples import row_norms
+from xsens.logs.samples import ImuLog, row_norms
 
 WORLDS = {
     "NWU": Rotation.identity(),
@@ -100,8 +100,7 @@ def quaternions_of(numbers: FloatArray) -> FloatArray:
 
 def are_rotations(numbers: FloatArray) -> BoolArray:
     """Mark the matrices, shape (m, 9), that have orthonormal rows and are right-handed."""
-    finite = np.where(np.abs(numbers).max(axis=1, initial=0.0)[:, None] < 2.0, numbers, 0.0)
-    matrices = finite.reshape(-1, 3, 3)
+    matrices = np.where(np.abs(numbers) < 2.0, numbers, 0.0).reshape(-1, 3, 3)
     off = np.abs(matrices @ matrices.swapaxes(1, 2) - np.eye(3)).max(axis=(1, 2), initial=0.0)
     return np.asarray((off < _WORST_NORM) & (np.linalg.det(matrices) > 0.0))
 
@@ -116,22 +115,19 @@ def rotation_vectors(wxyz: FloatArray) -> FloatArray:
 # -- worlds
 
 
-def own_rotations(
-    notations: Mapping[str, FloatArray],
-    claim: Claim | None,
-    acceleration: FloatArray | None,
-    field: FloatArray | None,
-    as_stated: bool = False,
-) -> tuple[Rotation, BoolArray, list[str]]:
-    """The sensor's own orientation in NWU, where it has one, and notes on it.
+def to_nwu(
+    log: ImuLog, notations: Mapping[str, FloatArray], claim: Claim | None, as_stated: bool = False
+) -> ImuLog:
+    """The log with the sensor's own orientation in NWU, and notes on it.
 
     Parameters
     ----------
+    log : ImuLog
+        Without what is no measurement; `oriented` where it has an orientation.
     notations : mapping of str to ndarray, shape (m, 4)
-        Orientations of the same samples, scalar first, by what their numbers may mean; the usual first.
+        Orientations of its samples, scalar first, by what their numbers may mean; the usual first.
     claim : Claim, optional
         Their world; None for one that has nothing to do with north and up.
-    acceleration, field : ndarray, shape (m, 3), or None
     as_stated : bool
         Take the world that is claimed, whatever the readings show.
 
@@ -140,69 +136,53 @@ def own_rotations(
     InvalidInputError
         If acceleration and orientation contradict each other, unless the claim is final.
     """
-    meaning = likelier(notations, acceleration)
-    wxyz = notations[meaning]
+    ups = {meaning: _up(log, wxyz) for meaning, wxyz in notations.items()}
+    meaning = _likelier(ups)
+    wxyz = np.where(log.oriented[:, None], notations[meaning], 0.5)
     notes = [f"orientation: {meaning}, by its own accelerometer"] if meaning else []
-    oriented = np.asarray(np.isfinite(wxyz).all(axis=1))
     world = "NWU" if claim is None else claim.world
-    if claim is not None and not as_stated and oriented.any():
-        world, world_notes = world_of(claim, wxyz, acceleration, field)
-        notes += world_notes
-    if not oriented.all():
-        notes.append(f"{int((~oriented).sum())} samples lack the sensor's own orientation")
-    turns = Rotation.from_quat(np.where(oriented[:, None], wxyz, 0.5), scalar_first=True)
-    return nwu_from(world) * turns, oriented, notes
+    if claim is not None and not as_stated:
+        world, note = _world_of(claim, ups[meaning], _north_deg(_in_world(log, wxyz, log.magnetometer_au)))
+        notes += filter(None, [note])
+    rotations = nwu_from(world) * Rotation.from_quat(wxyz, scalar_first=True)
+    return replace(log, world_from_sensor=rotations, notes=(*log.notes, *notes))
 
 
-def likelier(notations: Mapping[str, FloatArray], acceleration: FloatArray | None) -> str:
+def _likelier(ups: Mapping[str, FloatArray]) -> str:
     """Notation in which the acceleration at rest is vertical; the first unless another surely is."""
-    tilts_deg = {}
-    for meaning, wxyz in notations.items():
-        vectors = _in_world(wxyz, acceleration)
-        upright = [0.0] if vectors is None else np.abs(_at_rest(vectors)[:, 2])
-        tilts_deg[meaning] = np.degrees(np.arccos(min(np.percentile(upright, 10), 1.0)))
-    first, best = next(iter(tilts_deg)), min(tilts_deg, key=tilts_deg.__getitem__)
-    sure = np.hypot(tilts_deg[first], _SURE_DEG) > _BETTER * np.hypot(tilts_deg[best], _SURE_DEG)
-    return best if sure else first
+    first = next(iter(ups))
+    if not ups[first].size:
+        return first
+    tilts_deg = {
+        meaning: np.hypot(np.degrees(np.arccos(min(np.percentile(np.abs(up), 10), 1.0))), _SURE_DEG)
+        for meaning, up in ups.items()
+    }
+    best = min(tilts_deg, key=tilts_deg.__getitem__)
+    return best if tilts_deg[first] > _BETTER * tilts_deg[best] else first
 
 
-def _at_rest(vectors: FloatArray) -> FloatArray:
-    """Directions of the accelerations whose length is the usual, of all if these are few, shape (n, 3)."""
+def _up(log: ImuLog, wxyz: FloatArray) -> FloatArray:
+    """Vertical parts of the accelerations' directions at rest, in the orientations' world, shape (n,)."""
+    vectors = _in_world(log, wxyz, log.accelerometer_m_s2)
     length = row_norms(vectors)
-    calm = np.abs(length - np.median(length)) < _AT_REST * np.median(length)
+    calm = np.abs(length - np.median(length)) < _AT_REST * np.median(length) if length.size else length > 0.0
     calm |= calm.sum() < _FEWEST
-    return np.asarray(vectors[calm] / length[calm, None])
+    return np.asarray(vectors[calm, 2] / length[calm])
 
 
-def world_of(
-    claim: Claim, wxyz: FloatArray, acceleration: FloatArray | None, field: FloatArray | None
-) -> tuple[str, tuple[str, ...]]:
-    """World of the orientations by what the readings say of it, and notes on it.
-
-    Parameters
-    ----------
-    claim : Claim
-    wxyz : ndarray, shape (m, 4)
-        Orientations in the world in question, scalar first; NaN where missing.
-    acceleration, field : ndarray, shape (m, 3), or None
-
-    Raises
-    ------
-    InvalidInputError
-        If acceleration and orientation contradict each other, unless the claim is final.
-    """
-    world, vectors = claim.world.upper(), _in_world(wxyz, acceleration)
-    if vectors is None:
+def _world_of(claim: Claim, ups: FloatArray, north_deg: float) -> tuple[str, str]:
+    """World of the orientations by what the readings say of it, and a note on it, perhaps empty."""
+    world = claim.world.upper()
+    if not ups.size:
         note = f"orientation: taken as {world}, {claim.by}: no accelerometer's reading tells"
-        return world, ((note,) if claim.by_default else ())
-    up = float(np.median(_at_rest(vectors)[:, 2]))
+        return world, note if claim.by_default else ""
+    up = float(np.median(ups))
     if abs(up) < _UPRIGHT:
         tilt = np.degrees(np.arccos(up))
         off = f"the orientation turns the accelerometer's reading {tilt:.0f} degrees from the vertical"
         if claim.final:
-            return world, (f"orientation: {world}, {claim.by}, although {off}",)
+            return world, f"orientation: {world}, {claim.by}, although {off}"
         raise InvalidInputError(f"expected an orientation in ENU, NWU or NED, but {off}: give --world")
-    north_deg = _north_deg(wxyz, field)
     likely = [name for name in (world, *WORLDS) if _EVIDENCE[name][0] * up > 0.0]
     by_north = [name for name in likely if abs(north_deg - _EVIDENCE[name][1]) <= _NORTH_DEG]
     evident, sensors = (by_north or likely)[0], "its own accelerometer alone"
@@ -211,32 +191,26 @@ def world_of(
     elif np.isfinite(north_deg):
         sensors = f"its own accelerometer, while the magnetometer has north {north_deg:.0f} degrees from x"
     chosen = world if claim.final else evident
-    note = f"orientation: {chosen} ({claim.by}: {world}; by {sensors}: {evident}); --world decides"
-    needs_note = world != evident or (not by_north and (claim.by_default or np.isfinite(north_deg)))
-    return chosen, ((note,) if needs_note else ())
+    if world == evident and (by_north or not (claim.by_default or np.isfinite(north_deg))):
+        return chosen, ""
+    return chosen, f"orientation: {chosen} ({claim.by}: {world}; by {sensors}: {evident}); --world decides"
 
 
-def _north_deg(wxyz: FloatArray, field: FloatArray | None) -> float:
-    """Direction of the field's horizontal part from x towards y; NaN if it has none."""
-    vectors = _in_world(wxyz, field)
-    if vectors is None:
-        return float("nan")
-    along = vectors[:, :2] / np.maximum(row_norms(vectors[:, :2]), 1e-12)[:, None]
-    if np.hypot(*along.mean(axis=0)) < _STEADY:
+def _north_deg(fields: FloatArray) -> float:
+    """Direction from x towards y of the horizontal part of fields in the world; NaN if they have none."""
+    along = fields[:, :2] / np.maximum(row_norms(fields[:, :2]), 1e-12)[:, None]
+    if not along.size or np.hypot(*along.mean(axis=0)) < _STEADY:
         return float("nan")
     x, y = np.median(along, axis=0)
     return float(np.degrees(np.arctan2(y, x)))
 
 
-def _in_world(wxyz: FloatArray, vectors: FloatArray | None) -> FloatArray | None:
-    """Readings turned into the world, shape (n, 3), of some thousand samples; None if there are too few."""
-    if vectors is None:
-        return None
-    indices = np.flatnonzero(np.isfinite(wxyz[:, 0]))
-    sample = indices[:: len(indices) // _MOST + 1]
-    wxyz, vectors = wxyz[sample], vectors[sample]
-    norms = row_norms(vectors)
-    valid = (norms > 0.0) & (norms < 1e6)
-    if valid.sum() < _FEWEST:
-        return None
-    return Rotation.from_quat(wxyz[valid], scalar_first=True).apply(vectors[valid])
+def _in_world(log: ImuLog, wxyz: FloatArray, vectors: FloatArray | None) -> FloatArray:
+    """Readings turned into the world, shape (n, 3), of some thousand samples; none if they are too few."""
+    oriented = np.flatnonzero(log.oriented)
+    part = oriented[:: len(oriented) // _MOST + 1]
+    if vectors is not None:
+        part = part[row_norms(vectors[part]) > 0.0]
+    if vectors is None or len(part) < _FEWEST:
+        return np.empty((0, 3))
+    return Rotation.from_quat(wxyz[part], scalar_first=True).apply(vectors[part])

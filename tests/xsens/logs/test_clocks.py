@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from xsens.logs.clocks import COUNTS, Stamps, spread, timeline, unwrap
+from xsens.logs.clocks import COUNTS, Stamps, timeline, unwrap
 from xsens.logs.samples import ImuLog
 
 PERIOD_S = 1 / 256
@@ -68,7 +68,7 @@ def test_a_clock_that_trembles_much_is_irregular_and_has_lost_nothing():
 def test_samples_that_came_together_are_spread_over_the_time_since_those_before():
     taken_s = 0.01 * np.arange(400)
     deliveries = Stamps(time_s=np.ceil(np.arange(1, 401) / 5) * 0.05)
-    stamps, _ = spread(deliveries, [np.random.default_rng(3).standard_normal((400, 3))])
-    np.testing.assert_allclose(stamps.time_s, taken_s + 0.01, atol=1e-9)
+    line = timeline(deliveries, [np.random.default_rng(3).standard_normal((400, 3))])
+    np.testing.assert_allclose(line.time_s, taken_s + 0.01, atol=1e-9)
     sent_again = [np.repeat(np.arange(80.0), 5)[:, None]]
-    assert timeline(spread(deliveries, sent_again)[0]).time_s.size == 80
+    assert timeline(deliveries, sent_again).time_s.size == 80
