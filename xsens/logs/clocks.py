@@ -106,16 +106,18 @@ def timeline(stamps: Stamps, readings: Sequence[FloatArray] = ()) -> Timeline:
         If there is neither a clock nor a counter with a known and possible period, or the times contradict
         the period.
     """
-    numbers, values, notes = None, stamps.time_s, list[str]()
-    if stamps.counter is not None:
-        numbers = _sample_numbers(stamps.counter, stamps.extras)
+    values, notes = stamps.time_s, list[str]()
+    numbers: Any = None if stamps.counter is None else _sample_numbers(stamps.counter, stamps.extras)
     if values is None:
-        if numbers is None or not stamps.period_s > 0.0:
+        if not stamps.period_s > 0.0:
             evidence = "neither" if numbers is None else "a counter, but no rate"
             raise InvalidInputError(
                 "expected samples with a clock, as a column time_s, or with a sampling rate, got "
                 f"{evidence}: give --rate-hz"
             )
+        if numbers is None:
+            notes.append("samples have no counter: losses cannot be found")
+            numbers = np.arange(len(next(part for part in (stamps.starts, *readings) if part is not None)))
         values = (numbers - numbers[0]) * stamps.period_s
     elif (stamps_s := _spread(values, readings)) is not values:
         notes.append(f"several samples to a stamp, {len(values)} in all: spread evenly between stamps")

@@ -50,16 +50,16 @@ def _parts(
     )
     time_s = None if ticks is None else ticks * TICK_S
     notations = [quaternions_of(values[name]) for name in _NOTATIONS if name in values]
+    increments = {VECTORS[0]: values["delta_v_m_s"]} if "delta_v_m_s" in values else {}
+    if "delta_q_wxyz" in values:
+        increments[VECTORS[1]] = rotation_vectors(values["delta_q_wxyz"])
     return Parts(
         replace(_stretches(frames, indices), counter=counter, time_s=time_s, **changes),
-        tuple(map(values.get, VECTORS)),
+        {name: values[name] for name in VECTORS if name in values},
         {"": notations[0]} if notations else {},
         claim,
         tuple(notes),
-        (
-            values.get("delta_v_m_s"),
-            rotation_vectors(values["delta_q_wxyz"]) if "delta_q_wxyz" in values else None,
-        ),
+        increments,
     )
 
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -12,7 +13,7 @@ from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
 from xsens.logs.clocks import Stamps, timeline
 from xsens.logs.faults import without_faults
-from xsens.logs.samples import VECTORS, ImuLog
+from xsens.logs.samples import ImuLog
 from xsens.logs.worlds import Claim, nwu_from, to_nwu
 
 
@@ -54,22 +55,22 @@ class Parts:
     Attributes
     ----------
     stamps : Stamps
-    vectors : tuple of ndarray, shape (m, 3), or None
-        Readings of accelerometer, gyroscope and magnetometer.
+    vectors : mapping of str to ndarray, shape (m, 3)
+        Readings by the names in `VECTORS`.
     notations : mapping of str to ndarray, shape (m, 4)
         The sensor's own orientation, as `to_nwu` has it.
     claim : Claim, optional
         Its world; None for one that has nothing to do with north and up.
-    increments : tuple of ndarray, shapes (m, 3) and (m, 3) or (m, 4), or None
-        Of velocity, and rotation vectors, over each sampling period.
+    increments : mapping of str to ndarray, shape (m, 3)
+        Of velocity, and rotation vectors, over each sampling period, by the names of their rates.
     """
 
     stamps: Stamps
-    vectors: tuple[FloatArray | None, ...] = (None, None, None)
-    notations: Mapping[str, FloatArray] = field(default_factory=dict)
-    claim: Claim | None = None
-    notes: tuple[str, ...] = ()
-    increments: tuple[FloatArray | None, FloatArray | None] = (None, None)
+    vectors: Mapping[str, FloatArray]
+    notations: Mapping[str, FloatArray]
+    claim: Claim | None
+    notes: tuple[str, ...]
+    increments: Mapping[str, FloatArray]
 
 
 def assemble_log(parts: Parts, hints: Hints, source: str) -> ImuLog:
@@ -81,44 +82,30 @@ def assemble_log(parts: Parts, hints: Hints, source: str) -> ImuLog:
         If they have neither a clock, nor a rate; if orientation and acceleration contradict each other; or if
         they are of several sensors.
     """
-    stamps, notes, vectors = parts.stamps, list(parts.notes), list(parts.vectors)
+    stamps, vectors = parts.stamps, {**parts.increments, **parts.vectors}
     if hints.rate_hz is not None:
         stamps = replace(stamps, period_s=1.0 / hints.rate_hz)
-    scaled = []
-    for i, part in enumerate(parts.increments):
-        if part is not None and vectors[i] is None:
-            vectors[i] = part
-            scaled.append(VECTORS[i])
-            notes.append(f"{VECTORS[i].split('_')[0]}: increments over the sampling period")
-    readings = [part for part in (*vectors, *parts.notations.values()) if part is not None]
-    has_counter = stamps.counter is not None
-    if not has_counter and stamps.time_s is None and stamps.period_s > 0.0:
-        samples = next(len(part) for part in (stamps.starts, *readings) if part is not None)
-        stamps = replace(stamps, counter=np.arange(samples))
-        notes.append("samples have no counter: losses cannot be found")
-    line = timeline(stamps, readings)
+    scaled = [name for name in parts.increments if name not in parts.vectors]
+    notes = [*parts.notes, *(f"{name.split('_')[0]}: increments over the sampling period" for name in scaled)]
+    line = timeline(stamps, [*vectors.values(), *parts.notations.values()])
     notations = {meaning: wxyz[line.rows] for meaning, wxyz in parts.notations.items()}
     wxyz = next(iter(notations.values()), np.zeros((0, 4)))
-    oriented = np.isfinite(wxyz).all(axis=1)
+    oriented = np.isfinite(wxyz[:, 0])
     if missing := int((~oriented).sum()):
         notes.append(f"{missing} samples lack the sensor's own orientation")
     rotations = Rotation.from_quat(np.where(oriented[:, None], wxyz, 0.5), scalar_first=True)
-    force, rate, field_au = (None if part is None else part[line.rows] for part in vectors)
+    columns: dict[str, Any] = {name: part[line.rows] for name, part in vectors.items()}
     log = ImuLog(
         line.time_s,
-        force,
-        rate,
-        field_au,
-        Rotation.from_quat(np.where(oriented[:, None], wxyz, 0.5), scalar_first=True)
-        if oriented.any()
-        else None,
-        line.counter if has_counter else None,
-        line.gaps,
-        (*notes, *line.notes),
-        source,
-        oriented,
+        **columns,
+        world_from_sensor=rotations if oriented.any() else None,
+        counter=line.counter,
+        gaps=line.gaps,
+        notes=(*notes, *line.notes),
+        source=source,
+        oriented=oriented,
     )
-    log = without_faults(replace(log, **{name: getattr(log, name) * log.rate_hz for name in scaled}))
+    log = without_faults(replace(log, **{name: columns[name] * log.rate_hz for name in scaled}))
     if log.world_from_sensor is None:
         return log
     claim = parts.claim if hints.world is None else Claim(hints.world, "as given", final=True)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from io import StringIO
 from pathlib import Path
 
@@ -139,9 +139,17 @@ def _samples(table: TextTable, rate_hz: float | None) -> Parts:
             notations["angles are in radians"] = quaternions_of(np.degrees(angles))
         if len(notations) > 1 and "acc" not in readings:
             raise InvalidInputError("expected angles with their unit, as roll_deg, got small ones without")
-    turns = rotation_vectors(readings["dq"]) if "dq" in readings else None
-    vectors = readings.get("acc"), readings.get("gyr"), readings.get("mag")
-    return Parts(stamps, vectors, notations, claim, (*odd, *notes), (readings.get("dv"), turns))
+    if "dq" in readings:
+        readings["dq"] = rotation_vectors(readings["dq"])
+    vectors, increments = (
+        {
+            name: readings[quantity]
+            for name, quantity in zip(VECTORS, quantities, strict=False)
+            if quantity in readings
+        }
+        for quantities in (("acc", "gyr", "mag"), ("dv", "dq"))
+    )
+    return Parts(stamps, vectors, notations, claim, (*odd, *notes), increments)
 
 
 def _stamps(
@@ -217,13 +225,13 @@ def _unknown_columns(table: TextTable) -> tuple[str, ...]:
 
     A program's exports hold many other columns: of theirs, only those that look like a sensor's are listed.
     """
-    keys = {name: column[0] for name in table.names if (column := column_of(name))}
+    keys = {name: (column_of(name) or ("",))[0] for name in table.names}
     plain = "time" in keys.values()
-    odd = [name for name in table.names if name not in keys and (plain or _SENSOR_LIKE.match(name))]
+    odd = [name for name, key in keys.items() if not key and (plain or _SENSOR_LIKE.match(name))]
     for quantity in ("acc", "gyr", "mag", "quat"):
         columns = [name for name, key in keys.items() if key.startswith(f"{quantity}_")]
         odd += columns if len(columns) < len(_AXES[quantity]) else []
-    return (describe_unknown(filter(None, odd)),) if any(odd) else ()
+    return (describe_unknown(odd),) if odd else ()
 
 
 # -- writing
@@ -256,29 +264,24 @@ def write_csv(path: str | os.PathLike[str], log: ImuLog) -> None:
     ...     xsens.read_log(path).rate_hz
     100.0
     """
-    names, columns = zip(*_csv_columns(log), strict=True)
-    cells = [["" if number != number else repr(number) for number in values.tolist()] for values in columns]
-    lines = (*_comments(log), ",".join(names), *map(",".join, zip(*cells, strict=True)), "")
-    with whole_file(Path(path)) as part:
-        part.write_text("\n".join(lines), encoding="utf-8", newline="\n")
-
-
-def _csv_columns(log: ImuLog) -> Iterator[tuple[str, FloatArray | IntArray]]:
-    yield "time_s", log.time_s
+    columns: dict[str, FloatArray | IntArray] = {"time_s": log.time_s}
     if log.counter is not None:
-        yield "counter", log.counter
+        columns["counter"] = log.counter
     for vectors in VECTORS:
         if (values := getattr(log, vectors)) is not None:
             sensor, _, unit = vectors.partition("_")
-            yield from zip([f"{sensor}_{axis}_{unit}" for axis in "xyz"], values.T, strict=True)
+            columns |= {f"{sensor}_{axis}_{unit}": values[:, i] for i, axis in enumerate("xyz")}
+    comments = [f"source: {log.source}", *(f"note: {note}" for note in log.notes)]
     if log.world_from_sensor is not None:
         quaternions = log.world_from_sensor.as_quat(scalar_first=True)
         quaternions[~log.oriented] = np.nan
-        yield from zip([f"quaternion_{axis}" for axis in "wxyz"], quaternions.T, strict=True)
-
-
-def _comments(log: ImuLog) -> Iterator[str]:
-    for note in (f"source: {log.source}", *(f"note: {note}" for note in log.notes)):
-        yield "# " + " ".join(note.split())
-    if log.world_from_sensor is not None:
-        yield "# world: NWU (x magnetic north, y west, z up)"
+        columns |= {f"quaternion_{axis}": quaternions[:, i] for i, axis in enumerate("wxyz")}
+        comments.append("world: NWU (x magnetic north, y west, z up)")
+    cells = [
+        ["" if number != number else repr(number) for number in values.tolist()]
+        for values in columns.values()
+    ]
+    head = (*("# " + " ".join(comment.split()) for comment in comments), ",".join(columns))
+    with whole_file(Path(path)) as part:
+        text = "\n".join((*head, *map(",".join, zip(*cells, strict=True)), ""))
+        part.write_text(text, encoding="utf-8", newline="\n")

@@ -249,9 +249,9 @@ def _read_rows(
         )
     places, scales = dict[str, int](), dict[str, float | None]()
     for i, title in enumerate(titles):
-        if (column := column_of(title)) is None:
+        if (kind := column_of(title)) is None:
             continue
-        key, scale = column
+        key, scale = kind
         if key in places and key not in ("counter", "time"):
             raise InvalidInputError(
                 f"expected the columns of one sensor, got two of {key}: {titles[places[key]]}, {title}"
