@@ -98,7 +98,7 @@ class Filter:
         if self._settings.use_magnetometer:
             sd[:, 2] = north[:, 1]
         xyzw = turn_about_up(north[step_of_sample, 0], xyzw)
-        return _at_samples(samples, xyzw, sd, steps["bias"], steps, north, step_of_sample)
+        return _at_samples(samples, xyzw, sd, steps, north, step_of_sample)
 
 
 def smooth(samples: Samples, settings: FusionSettings) -> Estimate:
@@ -108,11 +108,11 @@ def smooth(samples: Samples, settings: FusionSettings) -> Estimate:
     nodes, biases = np.empty((n + 1, 4)), np.empty((n + 1, 3))  # at the start, and the end of each step
     smooth_steps(rows, covariance, transition, first, nodes, biases)
     variance = np.diagonal(covariance, axis1=1, axis2=2)[np.maximum(np.arange(n), first), :6]
-    deviations, north = np.sqrt(np.maximum(variance, 0.0)), np.tile(UNKNOWN, (n, 1))
-    sd = deviations[:, :3].copy()
+    rows["sd"] = np.sqrt(np.maximum(variance, 0.0))
+    rows["start"], rows["bias"] = nodes[:-1], biases[1:]
+    sd, north = rows["sd"][:, :3].copy(), np.tile(UNKNOWN, (n, 1))
     if settings.use_magnetometer and np.isfinite(rows["field"][:, 0]).any():
-        bins = averaged_bins(rows, nodes[:-1], biases[1:], deviations, settings)
-        of_bins = HeadingFilter(settings, online=False).smooth(bins)
+        of_bins = HeadingFilter(settings, online=False).smooth(averaged_bins(rows, settings))
         time_s = np.append(0.0, np.cumsum(rows["duration_s"]))
         ends_s = time_s[1:][lasts_of_bins(n, settings)]
         nodes = turn_about_up(np.interp(time_s, ends_s, np.unwrap(of_bins[:, 0])), nodes)
@@ -123,23 +123,17 @@ def smooth(samples: Samples, settings: FusionSettings) -> Estimate:
     xyzw, rates = np.empty((len(samples), 4)), np.ascontiguousarray(samples.rate_rad_s)
     orient_samples(samples.step_s, rates, rows, nodes, biases, xyzw)
     of_step = np.repeat(np.arange(n), np.diff(rows["last"], prepend=0))
-    return _at_samples(samples, xyzw, sd, biases[1:], rows, north, of_step)
+    return _at_samples(samples, xyzw, sd, rows, north, of_step)
 
 
 def _at_samples(
-    samples: Samples,
-    xyzw: FloatArray,
-    sd_rad: FloatArray,
-    bias_rad_s: FloatArray,
-    steps: Any,
-    north: FloatArray,
-    of_sample: IntArray,
+    samples: Samples, xyzw: FloatArray, sd_rad: FloatArray, steps: Any, north: FloatArray, of_sample: IntArray
 ) -> Estimate:
     """Estimate of each sample by the step that it belongs to.
 
     When in its interval a gyroscope's reading is taken is not known: half of it is claimed as well.
     """
-    bias_rad_s = bias_rad_s[of_sample]
+    bias_rad_s = steps["bias"][of_sample]
     rates = Rotation.from_quat(xyzw).apply(samples.rate_rad_s - bias_rad_s)
     late_rad = 0.5 * float(np.median(samples.step_s)) * rates
     _, _, distrust, stray, iron = north[of_sample].T

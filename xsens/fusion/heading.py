@@ -78,52 +78,34 @@ _FIRST_BINS = round(1.0 / BIN_S)
 """Readings whose mean is north where the sensor was at first."""
 
 
-def steps_per_bin(settings: FusionSettings) -> int:
-    """Steps of the filter in a bin."""
-    return max(1, round(BIN_S / settings.block_s))
-
-
 def lasts_of_bins(steps: int, settings: FusionSettings) -> IntArray:
     """Last step of each bin; the last bin may be shorter."""
     per_bin = steps_per_bin(settings)
     return np.minimum(np.arange(per_bin, steps + per_bin, per_bin), steps) - 1
 
 
-def averaged_bins(
-    rows: Any, levels: FloatArray, bias_rad_s: FloatArray, sd: FloatArray, settings: FusionSettings
-) -> Any:
-    """Average the steps of each bin.
+def steps_per_bin(settings: FusionSettings) -> int:
+    """Steps of the filter in a bin."""
+    return max(1, round(BIN_S / settings.block_s))
 
-    Parameters
-    ----------
-    rows : structured ndarray, shape (n,), of `speckle3d.kernels.orientation.inclination.STEP`
-    levels : ndarray, shape (n, 4)
-        Level axes from the sensor's at the start of each step.
-    bias_rad_s : ndarray, shape (n, 3)
-        After each step.
-    sd : ndarray, shape (n, 6)
-        Deviation of the level axes about the world's, rad, of which the third is not used, and of the bias.
-    settings : FusionSettings
 
-    Returns
-    -------
-    structured ndarray, shape (bins,), of `kernel.BIN`
-    """
+def averaged_bins(rows: Any, settings: FusionSettings) -> Any:
+    """Average steps, structured of `speckle3d.kernels.orientation.inclination.STEP`, to bins of `kernel.BIN`."""
     lasts = lasts_of_bins(len(rows), settings)
     firsts, counts = np.append(0, lasts[:-1] + 1), np.diff(lasts, prepend=-1)
     bins = np.zeros(len(lasts), kernel.BIN)
     bins["span_s"] = np.add.reduceat(rows["duration_s"], firsts)
     bins["resting"] = np.logical_and.reduceat(rows["resting"], firsts)
     bins["slip_rad2"] = np.add.reduceat(rows["noise"][:, 2], firsts)
-    bins["bias"] = bias_rad_s[lasts]
-    bins["bias_variance"] = (sd[lasts, 3:] ** 2).mean(axis=1) + settings.moving_bias_rad_s**2
-    bins["tilt_rad2"] = np.add.reduceat((sd[:, :2] ** 2).mean(axis=1), firsts) / counts
+    bins["bias"] = rows["bias"][lasts]
+    bins["bias_variance"] = (rows["sd"][lasts, 3:] ** 2).mean(axis=1) + settings.moving_bias_rad_s**2
+    bins["tilt_rad2"] = np.add.reduceat((rows["sd"][:, :2] ** 2).mean(axis=1), firsts) / counts
     readable = finite_rows(rows["field"])
     readings = np.add.reduceat(readable.astype(float), firsts)[:, None]
     bins["seen"] = readings[:, 0] > 0.0
-    field, level = np.where(readable[:, None], rows["field"], 0.0), Rotation.from_quat(levels)
+    field, level = np.where(readable[:, None], rows["field"], 0.0), Rotation.from_quat(rows["start"])
     bins["level"] = np.add.reduceat(level.as_matrix(), firsts) / counts[:, None, None]
-    turning = np.cross(rows["rate"] - bias_rad_s, field)
+    turning = np.cross(rows["rate"] - rows["bias"], field)
     for name, vectors in (("field", field), ("field_rate", turning)):
         bins[name] = np.add.reduceat(level.apply(vectors), firsts) / np.maximum(readings, 1.0)
     return bins
@@ -174,8 +156,7 @@ class HeadingFilter:
         whole = len(rows) if to_end else len(rows) // per_bin * per_bin
         self._rows = rows[whole:]
         if whole:
-            rows = rows[:whole]
-            bins = averaged_bins(rows, rows["start"], rows["bias"], rows["sd"], self._settings)
+            bins = averaged_bins(rows[:whole], self._settings)
             estimates = self._run(bins)
             weights, best = self._weights(estimates)
             # A walk at random: its variance grows with time, by the mean of the minutes so far.
