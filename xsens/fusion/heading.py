@@ -90,7 +90,7 @@ def steps_per_bin(settings: FusionSettings) -> int:
 
 
 def averaged_bins(rows: Any, settings: FusionSettings) -> Any:
-    """Average steps, structured of `speckle3d.kernels.orientation.inclination.STEP`, to bins of `kernel.BIN`."""
+    """Average steps, rows of `speckle3d.kernels.orientation.inclination.STEP`, to rows of `kernel.BIN`."""
     lasts = lasts_of_bins(len(rows), settings)
     firsts, counts = np.append(0, lasts[:-1] + 1), np.diff(lasts, prepend=-1)
     bins = np.zeros(len(lasts), kernel.BIN)

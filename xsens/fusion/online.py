@@ -83,7 +83,7 @@ class OnlineFilter:
         self._pending: list[tuple[Any, ...]] = []  # since the filter ran: once in an increment is enough
         self._rate: FloatArray | None = None
         self._force = np.full(3, np.nan)
-        self._skipped_s = self._forceless_s = 0.0
+        self._skipped_s, self._forceless_s = 0.0, math.inf
         self._usual_s = math.nan
 
     def push(
@@ -118,18 +118,32 @@ class OnlineFilter:
             step_s, gyroscope_rad_s, accelerometer_m_s2, magnetometer_au
         )
         for step_s, rate, force, field in zip(map(float, steps), rates, forces, fields, strict=True):
-            reading = self._reading(step_s, rate, force, field)
-            if reading is None:
-                continue
-            if reading[0] > PAUSE_S:
-                self._run()
-                # The turn in a pause is not known, nor is the first sample's own step.
-                self._filter.begin(0.0 if self._rate is None else reading[0])
-                reading = (self._settings.block_s, *reading[1:])
-            self._rate = reading[1]
-            self._pending.append(reading)
+            self._skipped_s += step_s
+            self._forceless_s += step_s
+            if np.isfinite(force).all():
+                self._force, self._forceless_s = force, 0.0
+            if np.isfinite(rate).all() and self._forceless_s <= PAUSE_S:
+                self._add(self._skipped_s, rate, field)
+                self._skipped_s = 0.0
         if sum(step_s for step_s, *_ in self._pending) >= self._settings.block_s:
             self._run()
+
+    def _add(self, step_s: float, rate: FloatArray, field: FloatArray) -> None:
+        """Add a sample, so long after the last one, with the last force."""
+        lost_rad2, first = 0.0, self._rate is None
+        if self._rate is None:
+            self._usual_s = min(step_s, PAUSE_S)
+        elif step_s > LOST * self._usual_s:
+            steps, rates = np.array([0.0, step_s]), np.array([self._rate, rate])
+            lost_rad2 = float(lost_variance(steps, rates, self._usual_s)[0])
+        self._usual_s += _FOLLOWS * (min(step_s, LOST * self._usual_s) - self._usual_s)
+        if step_s > PAUSE_S:
+            self._run()
+            # The turn in a pause is not known, nor is the first sample's own step.
+            self._filter.begin(0.0 if first else step_s)
+            step_s = self._settings.block_s
+        self._rate = rate
+        self._pending.append((step_s, rate, self._force, field, lost_rad2))
 
     def _run(self) -> None:
         """Filter what is pending."""
@@ -149,26 +163,6 @@ class OnlineFilter:
         """Estimate after the last sample; None before the first whole increment."""
         self._run()
         return self._state
-
-    def _reading(
-        self, step_s: float, rate: FloatArray, force: FloatArray, field: FloatArray
-    ) -> tuple[Any, ...] | None:
-        """A sample as `Samples` has it, its step from the last one; None of what is no measurement."""
-        self._forceless_s += step_s
-        self._skipped_s += step_s
-        if np.isfinite(force).all():
-            self._force, self._forceless_s = force, 0.0
-        if not (np.isfinite(rate).all() and self._forceless_s <= PAUSE_S and np.isfinite(self._force).all()):
-            return None
-        step_s, self._skipped_s = self._skipped_s, 0.0
-        lost_rad2 = 0.0
-        if self._rate is None:
-            self._usual_s = min(step_s, PAUSE_S)
-        elif step_s > LOST * self._usual_s:
-            steps, rates = np.array([0.0, step_s]), np.array([self._rate, rate])
-            lost_rad2 = float(lost_variance(steps, rates, self._usual_s)[0])
-        self._usual_s += _FOLLOWS * (min(step_s, LOST * self._usual_s) - self._usual_s)
-        return step_s, rate, self._force, field, lost_rad2
 
 
 def _require_readings(step_s: npt.ArrayLike, *vectors: npt.ArrayLike | None) -> list[FloatArray]:

@@ -13,7 +13,7 @@ from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.shown import shown
 from speckle3d.core.streams import TimedRotations
 from xsens.fusion.readings import PAUSE_S, Estimate, Samples, usable_samples
-from xsens.fusion.settings import DEFAULT_METHOD, FusionSettings, Method, method_of
+from xsens.fusion.settings import DEFAULT_METHOD, FusionSettings, Method
 from xsens.logs.samples import ImuLog, finite_rows
 
 _FORESEEN = 3
@@ -121,7 +121,7 @@ def orient(
     """
     if not isinstance(log, ImuLog):
         raise InvalidInputError(f"expected an ImuLog, as read_log(path) gives, got {type(log).__name__}")
-    settings, method = settings or FusionSettings(), method_of(method)
+    settings, method = settings or FusionSettings(), Method(method)
     rows, samples, notes = usable_samples(log)
     if settings.use_magnetometer and not finite_rows(samples.field_au).any():
         notes.append("no magnetometer: the heading is relative to the start")

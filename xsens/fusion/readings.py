@@ -12,7 +12,7 @@ from xsens.fusion.settings import BRIDGED_S, LOST
 from xsens.logs.clocks import SHORTEST_S
 from xsens.logs.contradictions import contradictions
 from xsens.logs.faults import without_faults
-from xsens.logs.samples import ImuLog, finite_rows, row_norms, selection
+from xsens.logs.samples import ImuLog, finite_rows, row_norms
 
 PAUSE_S = 1.25 * BRIDGED_S
 """A longer step is a pause. Steps of a clock of 10 Hz vary by rounding, and by jitter."""
@@ -94,8 +94,7 @@ def usable_samples(log: ImuLog) -> tuple[IntArray, Samples, list[str]]:
     InvalidInputError
         If times, accelerometer or gyroscope are in other units.
     """
-    source = log.source or "log"
-    before, log = len(log.notes), without_faults(log)
+    source, before, log = log.source or "log", len(log.notes), without_faults(log)
     notes, rate, force = list(log.notes[before:]), log.gyroscope_rad_s, log.accelerometer_m_s2
     turns, pulls = (np.zeros(len(log), bool) if part is None else finite_rows(part) for part in (rate, force))
     rows = _near(log.time_s, turns) & _near(log.time_s, pulls)
@@ -126,22 +125,22 @@ def usable_samples(log: ImuLog) -> tuple[IntArray, Samples, list[str]]:
     if against.get("magnetometer"):
         field = None
         notes.append("the magnetometer is left out")
-    part, indices = selection(rows), np.flatnonzero(rows)
-    if left_out := len(log) - indices.size:
+    if left_out := int((~rows).sum()):
         notes.append(f"{left_out} samples without gyroscope or accelerometer left out")
-    rate, force, turns, pulls, time_s = rate[part], force[part], turns[part], pulls[part], log.time_s[part]
-    for name, valid in (("gyroscope", turns), ("accelerometer", pulls)):
+    time_s, usual_s = log.time_s[rows], float(np.median(np.diff(log.time_s[rows])))
+    step_s, lost_rad2 = np.diff(time_s, prepend=time_s[0] - usual_s), np.zeros_like(time_s)
+    means = list[FloatArray]()
+    for name, readings, valid in (
+        ("gyroscope", rate[rows], turns[rows]),
+        ("accelerometer", force[rows], pulls[rows]),
+    ):
         if count := int((~valid).sum()):
             notes.append(f"{count} {name} readings missing: interpolated")
-    field = np.full_like(force, np.nan) if field is None else field[part]
-    usual_s = float(np.median(np.diff(time_s)))
-    step_s, lost_rad2 = np.diff(time_s, prepend=time_s[0] - usual_s), np.zeros_like(time_s)
-    valid = selection(turns)
-    lost_rad2[np.flatnonzero(turns)[1:]] = lost_variance(time_s[valid], rate[valid], usual_s)
-    rate, force = (
-        _interpolated_means(time_s, step_s, usual_s, *part) for part in ((rate, turns), (force, pulls))
-    )
-    return indices, Samples(step_s, rate, force, field, lost_rad2), notes
+        means.append(_interpolated_means(time_s, step_s, usual_s, readings, valid))
+    valid = turns[rows]
+    lost_rad2[np.flatnonzero(valid)[1:]] = lost_variance(time_s[valid], rate[rows & turns], usual_s)
+    field = np.full_like(means[0], np.nan) if field is None else field[rows]
+    return np.flatnonzero(rows), Samples(step_s, means[0], means[1], field, lost_rad2), notes
 
 
 def lost_variance(time_s: FloatArray, rate_rad_s: FloatArray, usual_s: float) -> FloatArray:
@@ -161,20 +160,14 @@ def _interpolated_means(
 
     A reading tells the last usual step alone; before that it is taken for the mean of the two.
     """
-    if not valid.all():
-        readings = np.column_stack([np.interp(time_s, time_s[valid], axis[valid]) for axis in readings.T])
-    late = np.flatnonzero((step_s > LOST * usual_s) & (step_s <= PAUSE_S))
-    if not late.size:
-        return readings
+    readings = np.column_stack([np.interp(time_s, time_s[valid], axis[valid]) for axis in readings.T])
+    late, means = np.flatnonzero((step_s > LOST * usual_s) & (step_s <= PAUSE_S)), readings.copy()
     share = (usual_s / step_s[late])[:, None]
-    means = readings.copy()
     means[late] = 0.5 * ((1.0 + share) * readings[late] + (1.0 - share) * readings[late - 1])
     return means
 
 
 def _near(time_s: FloatArray, valid: BoolArray) -> BoolArray:
     """Where a reading is valid, or one before and one after it at most a bridged pause apart."""
-    if valid.all():
-        return valid
     valid_s, before = np.concatenate([[-np.inf], time_s[valid], [np.inf]]), np.cumsum(valid)
     return np.asarray(valid_s[before + ~valid] - valid_s[before] <= PAUSE_S)

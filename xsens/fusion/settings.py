@@ -104,6 +104,10 @@ class Method(StrEnum):
     vqf = "vqf"
     vqf_online = "vqf-online"
 
+    @classmethod
+    def _missing_(cls, value: object) -> None:
+        raise InvalidInputError(f"method: expected {', '.join(cls)}, got {value!r}")
+
     @property
     def offline(self) -> bool:
         """Whether readings after a sample tell of its orientation."""
@@ -117,11 +121,3 @@ class Method(StrEnum):
 
 DEFAULT_METHOD = Method.smoother
 """The engine of those who name none."""
-
-
-def method_of(name: Method | str) -> Method:
-    """Return the method by name; raise `InvalidInputError` if there is none of that name."""
-    try:
-        return Method(name)
-    except ValueError:
-        raise InvalidInputError(f"method: expected {', '.join(Method)}, got {name!r}") from None

@@ -45,7 +45,7 @@ def by_vqf(stretch: Samples, claims: Estimate, offline: bool, magnetic: bool) ->
         ) from error
     magnetic = magnetic and bool(np.isfinite(stretch.field_au[:, 0]).any())
     time_s = np.cumsum(stretch.step_s)
-    mean_s = float(stretch.step_s[1:].mean()) if len(stretch) > 1 else float(time_s[0])
+    mean_s = float(stretch.step_s.mean())
     # Losses make the mean step longer than the median, bursts shorter: at most two for one.
     step_s = float(np.clip(np.median(stretch.step_s), 0.5 * mean_s, mean_s))
     place = (time_s - time_s[0]) / step_s
@@ -54,9 +54,8 @@ def by_vqf(stretch: Samples, claims: Estimate, offline: bool, magnetic: bool) ->
     angle = np.cumsum(stretch.rate_rad_s * np.diff(place, prepend=0.0)[:, None], axis=0)
     rate = np.diff(_at(grid, place, angle), axis=0, prepend=0.0)
     rate[0] = stretch.rate_rad_s[0]
-    force, field = _at(grid, place, stretch.force_m_s2), None
-    if magnetic:
-        field = _at(grid, place, stretch.field_au)
+    force = _at(grid, place, stretch.force_m_s2)
+    field = _at(grid, place, stretch.field_au) if magnetic else None
     find = vqf.offlineVQF if offline else vqf.VQF(step_s).updateBatch
     estimate = find(rate, force, field, *([step_s] if offline else []))
     rotations = Rotation.from_quat(estimate["quat9D" if magnetic else "quat6D"], scalar_first=True)

@@ -57,7 +57,11 @@ def contradictions(log: ImuLog) -> dict[str, str]:
     """
     rate, force, field = log.gyroscope_rad_s, log.accelerometer_m_s2, log.magnetometer_au
     directions = {"accelerometer": force, "magnetometer": field, "own orientation": log.own_direction}
-    sentences = {"gyroscope": "" if rate is None else _not_in_radians(rate)}
+    sentences = {"gyroscope": ""}
+    if rate is not None and (fast := float(np.nanpercentile(row_norms(rate), 99.0))) > FASTEST_RAD_S:
+        sentences["gyroscope"] = (
+            f"expected a gyroscope in rad/s, got one in a hundred over {fast:.3g}: in deg/s?"
+        )
     for name, direction in directions.items():
         if rate is None or direction is None or not (turns := _turns(log.time_s, rate, direction)):
             continue
@@ -69,7 +73,14 @@ def contradictions(log: ImuLog) -> dict[str, str]:
                 sentences[name] = _against_gyroscope(name, *freed[:2])
     if force is not None:
         sentences["gravity"] = not_in_metres(force)
-        sentences["dip"] = "" if field is None else _upward_field(force, field)
+    if force is not None and field is not None:
+        up = np.einsum("ij,ij->i", force, field) / np.maximum(row_norms(force) * row_norms(field), 1e-12)
+        up = up[np.isfinite(up)]
+        if up.size and np.median(up) > _UPWARD:
+            sentences["dip"] = (
+                "the field points up, as south of the magnetic equator: if this is north of it, magnetometer "
+                "or accelerometer are negated, and the heading is off by half a turn"
+            )
     return sentences
 
 
@@ -80,23 +91,6 @@ def not_in_metres(force: FloatArray) -> str:
         return ""
     unit = ": in g, without saying so?" if 0.9 < median < 1.1 else ""
     return f"expected an accelerometer in m/s^2, with norm near 9.8, got a median of {median:.3g}{unit}"
-
-
-def _not_in_radians(rate: FloatArray) -> str:
-    fast = float(np.nanpercentile(row_norms(rate), 99.0))
-    sentence = f"expected a gyroscope in rad/s, got one in a hundred over {fast:.3g}: in deg/s?"
-    return sentence if fast > FASTEST_RAD_S else ""
-
-
-def _upward_field(force: FloatArray, field: FloatArray) -> str:
-    up = np.einsum("ij,ij->i", force, field) / np.maximum(row_norms(force) * row_norms(field), 1e-12)
-    up = up[np.isfinite(up)]
-    if not up.size or np.median(up) < _UPWARD:
-        return ""
-    return (
-        "the field points up, as south of the magnetic equator: if this is north of it, magnetometer or "
-        "accelerometer are negated, and the heading is off by half a turn"
-    )
 
 
 def _turns(

@@ -14,7 +14,7 @@ import numpy as np
 from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.errors import InvalidInputError
 from xsens.logs.clocks import usual_step
-from xsens.logs.samples import VECTORS, ImuLog, finite_rows, median_norm, row_norms, selection
+from xsens.logs.samples import VECTORS, ImuLog, finite_rows, median_norm, row_norms
 
 
 class _Limits(NamedTuple):
@@ -119,8 +119,8 @@ def _bad(name: str, rows: FloatArray, force: FloatArray, rate: FloatArray) -> di
     if beyond.sum() > _FEW * (size >= 0.0).sum():  # another unit, which whoever uses the log refuses
         beyond = size >= _ABSURD
     valid &= ~beyond
-    part, repeats = selection(valid), np.zeros_like(valid)
-    repeats[part] = _repeats(name, limits.change * unit, rows[part], force[part], rate[part])
+    repeats = np.zeros_like(valid)
+    repeats[valid] = _repeats(name, limits.change * unit, rows[valid], force[valid], rate[valid])
     valid &= ~repeats
     rows = np.where(valid[:, None], rows, np.nan)
     return {

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -42,11 +41,6 @@ def median_norm(rows: FloatArray) -> float:
     norms = row_norms(rows)
     norms = norms[np.isfinite(norms)]
     return float(np.median(norms)) if norms.size else float("nan")
-
-
-def selection(rows: BoolArray) -> Any:
-    """Index of the marked rows; all of them are a view, not a copy."""
-    return slice(None) if rows.all() else rows
 
 
 @dataclass(frozen=True)
