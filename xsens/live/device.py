@@ -9,7 +9,7 @@ from __future__ import annotations
 import struct
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -164,29 +164,28 @@ def connect(port_name: str, baud: int | None = None) -> Device:
         If the port cannot be opened, no sensor answers at `baud` (by default, at any of the common rates), or
         pyserial is not installed.
     """
+    serial = extra_module("serial", "live", "a live sensor")
     rates = COMMON_BAUD if baud is None else (baud,)
     for rate in rates:
-        device = Device(_open_port(port_name, rate))
-        with ExitStack() as undo, suppress(DeviceError):
-            undo.callback(device.close)
+        try:  # for this process alone: 8 data bits, no parity, 2 stop bits
+            port = serial.Serial(
+                port_name,
+                rate,
+                stopbits=serial.STOPBITS_TWO,
+                timeout=_POLL_S,
+                write_timeout=ANSWER_S,
+                exclusive=True,
+            )
+        except (OSError, ValueError) as error:
+            raise DeviceError(f"{port_name}: cannot be opened as a serial port: {error}") from error
+        device = Device(port)
+        try:
             device.request(MessageId.GO_TO_CONFIG, tries=2 if baud is None else _TRIES)
-            undo.pop_all()
             return device
-    rates_text = ", ".join(str(rate) for rate in rates)
+        except DeviceError:
+            device.close()
+    rates_text = ", ".join(map(str, rates))
     raise DeviceError(f"{port_name}: expected a sensor, got no answer at {rates_text} baud")
-
-
-def _open_port(port_name: str, baud: int) -> Serial:
-    """Open a serial port for this process alone: 8 data bits, no parity, 2 stop bits."""
-    serial = extra_module("serial", "live", "a live sensor")
-    stop = serial.STOPBITS_TWO
-    try:
-        port: Serial = serial.Serial(
-            port_name, baud, stopbits=stop, timeout=_POLL_S, write_timeout=ANSWER_S, exclusive=True
-        )
-        return port
-    except (OSError, ValueError) as error:
-        raise DeviceError(f"{port_name}: cannot be opened as a serial port: {error}") from error
 
 
 def prepare(device: Device, settings: DeviceSettings) -> DeviceInfo:
@@ -201,27 +200,21 @@ def prepare(device: Device, settings: DeviceSettings) -> DeviceInfo:
     """
     number = int.from_bytes(device.request(MessageId.REQ_DID).payload[:4], "big")
     outputs = device.ask(MessageId.OUTPUT_CONFIGURATION)
+    mode, items = _CONTENTS[settings.content]
     if outputs is None:
-        _set_legacy(device, settings)
-    elif settings.content != "as set":
+        configuration = device.ask(MessageId.REQ_CONFIGURATION)
+        units = () if configuration is None else Configuration.from_message(configuration).units
+        mt9 = not units or units[0].output_mode & OutputMode.MT9  # which sends raw counts always
+        if not mt9 and settings.content != "as set":
+            device.request(MessageId.OUTPUT_MODE, mode.to_bytes(2, "big"))
+            device.request(MessageId.OUTPUT_SETTINGS, OutputSettings.COUNTER.to_bytes(4, "big"))
+            device.request(MessageId.SKIP_FACTOR, bytes(2))
+        if settings.rate_hz is not None:
+            device.request(MessageId.PERIOD, round(BASE_RATE_HZ / settings.rate_hz).to_bytes(2, "big"))
+    elif items:
         rate = round(settings.rate_hz or 100.0)
-        items = [(item, rate) for item in _CONTENTS[settings.content][1]]
-        items = [(_COUNTER, _EVERY), (_TIME, _EVERY), *items, (_STATUS, _EVERY)]
-        request = b"".join(struct.pack(">HH", *item) for item in items)
-        outputs = device.request(MessageId.OUTPUT_CONFIGURATION, request)
+        requests = [(_COUNTER, _EVERY), (_TIME, _EVERY), *((item, rate) for item in items), (_STATUS, _EVERY)]
+        payload = b"".join(struct.pack(">HH", *request) for request in requests)
+        outputs = device.request(MessageId.OUTPUT_CONFIGURATION, payload)
     answers = (device.ask(MessageId.REQ_CONFIGURATION), device.ask(MessageId.REQ_EMTS), outputs)
-    return DeviceInfo(number, tuple(message for message in answers if message is not None))
-
-
-def _set_legacy(device: Device, settings: DeviceSettings) -> None:
-    """Set the rate, and the content unless it is an MT9-B, which has none."""
-    configuration = device.ask(MessageId.REQ_CONFIGURATION)
-    units = () if configuration is None else Configuration.from_message(configuration).units
-    mt9 = not units or units[0].output_mode & OutputMode.MT9
-    if not mt9 and settings.content != "as set":
-        mode = _CONTENTS[settings.content][0]
-        device.request(MessageId.OUTPUT_MODE, mode.to_bytes(2, "big"))
-        device.request(MessageId.OUTPUT_SETTINGS, OutputSettings.COUNTER.to_bytes(4, "big"))
-        device.request(MessageId.SKIP_FACTOR, bytes(2))
-    if settings.rate_hz is not None:
-        device.request(MessageId.PERIOD, round(BASE_RATE_HZ / settings.rate_hz).to_bytes(2, "big"))
+    return DeviceInfo(number, tuple(filter(None, answers)))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections import deque
 from dataclasses import dataclass, replace
 from threading import Lock
 from typing import TYPE_CHECKING, Any
@@ -26,10 +25,6 @@ if TYPE_CHECKING:
 
 _MOST_PENDING = 1 << 14
 """Messages kept until the state is asked for, as many as eight seconds bring at most."""
-_RATE_STATES = 9
-"""States over which the rate is taken: two seconds if they come four times a second, long against the 16 ms
-between two deliveries of an adapter."""
-
 _NAN = float("nan")
 _DATA = (MessageId.MT_DATA, MessageId.MT_DATA2)
 
@@ -49,7 +44,7 @@ class LiveState:
     interruptions : int
         How often the connection was lost.
     rate_hz : float
-        Samples received per second over the last eight states, or since measuring began.
+        Samples received per second since the sensor was last connected.
     world_from_sensor : Rotation, optional
         The sensor's own orientation, or the on-line filter's.
     field : float
@@ -115,7 +110,7 @@ class Monitor:
     def _begin(self, header: tuple[Message, ...]) -> None:
         self._header = b"".join(map(encode, header))
         self._framer, self._pending = Framer(), list[Message]()
-        self._seen = deque([(time.monotonic(), self._now.samples)], maxlen=_RATE_STATES)
+        self._begun_s, self._before = time.monotonic(), self._now.samples
         self._counter: int | None = None
         self._filter: OnlineFilter | None = None
         self._step_s = _NAN
@@ -151,10 +146,7 @@ class Monitor:
         with self._lock:
             self._digest()
             now_s = time.monotonic()
-            self._seen.append((now_s, self._now.samples))
-            first_s, first = self._seen[0]
-            span_s = now_s - first_s
-            rate_hz = (self._now.samples - first) / span_s if self._now.connected and span_s > 0 else 0.0
+            rate_hz = self._now.connected * (self._now.samples - self._before) / (now_s - self._begun_s or 1.0)
             return replace(self._now, elapsed_s=now_s - self._since_s, rate_hz=rate_hz)
 
     def _digest(self) -> None:
