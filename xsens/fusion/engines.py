@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.kernels.orientation import inclination as kernel
 from speckle3d.kernels.orientation.smoothing import orient_samples, smooth_steps
-from xsens.fusion.heading import UNKNOWN, HeadingFilter, averaged_bins, lasts_of_bins, steps_per_bin
+from xsens.fusion.heading import UNKNOWN, HeadingFilter, averaged_bins, steps_per_bin
 from xsens.fusion.readings import Estimate, Samples, turn_about_up
 from xsens.fusion.settings import FusionSettings
 
@@ -111,15 +111,15 @@ def smooth(samples: Samples, settings: FusionSettings) -> Estimate:
     rows["sd"] = np.sqrt(np.maximum(variance, 0.0))
     rows["start"], rows["bias"] = nodes[:-1], biases[1:]
     sd, north = rows["sd"][:, :3].copy(), np.tile(UNKNOWN, (n, 1))
-    if settings.use_magnetometer and np.isfinite(rows["field"][:, 0]).any():
-        of_bins = HeadingFilter(settings, online=False).smooth(averaged_bins(rows, settings))
-        time_s = np.append(0.0, np.cumsum(rows["duration_s"]))
-        ends_s = time_s[1:][lasts_of_bins(n, settings)]
-        nodes = turn_about_up(np.interp(time_s, ends_s, np.unwrap(of_bins[:, 0])), nodes)
-        sd[:, 2] = np.interp(time_s[1:], ends_s, of_bins[:, 1])
-        north = of_bins[np.arange(n) // steps_per_bin(settings)]
-    elif settings.use_magnetometer:
-        sd[:, 2] = np.pi
+    if settings.use_magnetometer:
+        bins = averaged_bins(rows, settings)
+        if bins["seen"].any():
+            of_bins = HeadingFilter(settings, online=False).smooth(bins)
+            ends_s, time_s = np.cumsum(bins["span_s"]), np.append(0.0, np.cumsum(rows["duration_s"]))
+            nodes = turn_about_up(np.interp(time_s, ends_s, np.unwrap(of_bins[:, 0])), nodes)
+            north = of_bins[np.arange(n) // steps_per_bin(settings)]
+            north[:, 1] = np.interp(time_s[1:], ends_s, of_bins[:, 1])
+        sd[:, 2] = north[:, 1]
     xyzw, rates = np.empty((len(samples), 4)), np.ascontiguousarray(samples.rate_rad_s)
     orient_samples(samples.step_s, rates, rows, nodes, biases, xyzw)
     of_step = np.repeat(np.arange(n), np.diff(rows["last"], prepend=0))

@@ -31,6 +31,7 @@ from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
+from scipy.special import softmax
 
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.kernels.orientation import heading as kernel
@@ -78,12 +79,6 @@ _FIRST_BINS = round(1.0 / BIN_S)
 """Readings whose mean is north where the sensor was at first."""
 
 
-def lasts_of_bins(steps: int, settings: FusionSettings) -> IntArray:
-    """Last step of each bin; the last bin may be shorter."""
-    per_bin = steps_per_bin(settings)
-    return np.minimum(np.arange(per_bin, steps + per_bin, per_bin), steps) - 1
-
-
 def steps_per_bin(settings: FusionSettings) -> int:
     """Steps of the filter in a bin."""
     return max(1, round(BIN_S / settings.block_s))
@@ -91,9 +86,9 @@ def steps_per_bin(settings: FusionSettings) -> int:
 
 def averaged_bins(rows: Any, settings: FusionSettings) -> Any:
     """Average steps, rows of `speckle3d.kernels.orientation.inclination.STEP`, to rows of `kernel.BIN`."""
-    lasts = lasts_of_bins(len(rows), settings)
-    firsts, counts = np.append(0, lasts[:-1] + 1), np.diff(lasts, prepend=-1)
-    bins = np.zeros(len(lasts), kernel.BIN)
+    firsts = np.arange(0, len(rows), steps_per_bin(settings))
+    ends = np.append(firsts[1:], len(rows))
+    lasts, counts, bins = ends - 1, ends - firsts, np.zeros(len(firsts), kernel.BIN)
     bins["span_s"] = np.add.reduceat(rows["duration_s"], firsts)
     bins["resting"] = np.logical_and.reduceat(rows["resting"], firsts)
     bins["slip_rad2"] = np.add.reduceat(rows["noise"][:, 2], firsts)
@@ -123,15 +118,21 @@ class HeadingFilter:
 
     def __init__(self, settings: FusionSettings, online: bool = True) -> None:
         self._settings = settings
-        self._models = np.zeros(_FILTERS, kernel.MODEL)
-        self._models["iron"] = 0.002  # what a calibration leaves
-        self._models["iron"][_IRON], self._models["iron_put_on"][_IRON] = 0.7, 0.15
-        self._models["first_place"], self._models["first_place"][_BESIDE] = settings.field_first_place, 0.3
-        self._models["beside_iron"][_BESIDE] = True
-        self._models["place"] = settings.field_place
-        self._models["white_sqrt_s"] = settings.field_noise_sqrt_s
-        self._models["lag_s"] = settings.magnetometer_lag_s
-        self._models["first_stray"] = _FIRST_STRAY if online else 1.0
+        first_place, others = (
+            settings.field_first_place,
+            (
+                settings.field_place,
+                settings.field_noise_sqrt_s,
+                settings.magnetometer_lag_s,
+                _FIRST_STRAY if online else 1.0,
+            ),
+        )
+        models = [  # a calibration leaves 0.002 of iron
+            (0.002, 0.0, first_place, False, *common),
+            (0.002, 0.0, 0.3, True, *common),
+            (0.7, 0.15, first_place, False, *common),
+        ]
+        self._models = np.array(models, kernel.MODEL)
         self._begin(_STRAY)
         self.resume()
 
@@ -205,9 +206,8 @@ class HeadingFilter:
         beside = _BESIDE_ODDS + rows["doubt"][:, _BESIDE] - rows["doubt"][:, _FIRST]
         iron = _IRON_ODDS - proof.min(axis=1) + np.minimum(beside, 0.0)
         against = np.column_stack([np.zeros(len(rows)), beside, iron])
-        likely = np.exp(against.min(axis=1, keepdims=True) - against)
         best = np.where(total.min(axis=1) > _PLAIN, _IRON, np.where(beside < 0.0, _BESIDE, _FIRST))
-        return likely / likely.sum(axis=1, keepdims=True), best
+        return softmax(-against, axis=1), best
 
     def _unsteady(self, rows: Any, best: IntArray, bins: Any) -> FloatArray:
         """Square of what the best filter's north has moved against the gyroscope, beyond its error.

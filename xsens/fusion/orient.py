@@ -149,8 +149,6 @@ def _estimate(samples: Samples, breaks: IntArray, settings: FusionSettings, meth
     online = Filter(settings)
     step_s = float(np.median(samples.step_s))
     for first, last in pairwise([0, *breaks.tolist(), len(samples)]):
-        if first == last:
-            continue
         stretch = samples[first:last]
         if first:
             online.begin(float(stretch.step_s[0]))
@@ -161,4 +159,4 @@ def _estimate(samples: Samples, breaks: IntArray, settings: FusionSettings, meth
             by_vqf(stretch, estimate, offline, settings.use_magnetometer) if method.is_vqf else estimate
         )
     columns = zip(*(vars(estimate).values() for estimate in estimates), strict=True)
-    return Estimate(*map(np.concatenate, columns)) if len(estimates) > 1 else estimates[0]
+    return Estimate(*map(np.concatenate, columns))

@@ -146,7 +146,9 @@ class Monitor:
         with self._lock:
             self._digest()
             now_s = time.monotonic()
-            rate_hz = self._now.connected * (self._now.samples - self._before) / (now_s - self._begun_s or 1.0)
+            rate_hz = (
+                self._now.connected * (self._now.samples - self._before) / (now_s - self._begun_s or 1.0)
+            )
             return replace(self._now, elapsed_s=now_s - self._since_s, rate_hz=rate_hz)
 
     def _digest(self) -> None:
