@@ -11,10 +11,9 @@ from imu_messages import (
 )
 from scipy.spatial.transform import Rotation
 
-from xsens.messages.control import MessageId
+from xsens.messages.control import MessageId, RawCalibration
 from xsens.messages.framing import Message, encode
 from xsens.messages.mtdata import DataLayout, OutputMode
-from xsens.messages.rawcounts import RawCalibration
 
 G = 9.80665
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from xsens.messages.control import MessageId
 from xsens.messages.framing import Message
-from xsens.messages.mtdata2 import kind_of
+from xsens.messages.mtdata import kind_of
 
 
 def bytes_from_numbers(values, form):

@@ -118,15 +118,9 @@ class HeadingFilter:
 
     def __init__(self, settings: FusionSettings, online: bool = True) -> None:
         self._settings = settings
-        first_place, others = (
-            settings.field_first_place,
-            (
-                settings.field_place,
-                settings.field_noise_sqrt_s,
-                settings.magnetometer_lag_s,
-                _FIRST_STRAY if online else 1.0,
-            ),
-        )
+        first_place, place = settings.field_first_place, settings.field_place
+        noise, lag_s = settings.field_noise_sqrt_s, settings.magnetometer_lag_s
+        common = place, noise, lag_s, _FIRST_STRAY if online else 1.0
         models = [  # a calibration leaves 0.002 of iron
             (0.002, 0.0, first_place, False, *common),
             (0.002, 0.0, 0.3, True, *common),

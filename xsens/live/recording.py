@@ -88,11 +88,11 @@ class Recorder:
     ) -> None:
         self._port, self._settings = port, settings or DeviceSettings()
         self._baud, self._info = self._settings.baud, DeviceInfo(-1, ())
+        warm_up()
         device = self._prepare()
         try:
-            warm_up()
             self._file = RawFile(path, append)
-        except BaseException:
+        except FileError:
             device.close()
             raise
         self._monitor = Monitor()
@@ -137,41 +137,22 @@ class Recorder:
     def _record(self, device: Device | None) -> None:
         """Run in the thread: measure, and find the sensor again when it is lost, until told to stop."""
         try:
-            while device is not None:
+            while not self._stop.is_set():
                 try:
-                    with closing(device):
+                    with closing(device or self._prepare()) as device:
                         self._measure(device)
-                    break
-                except DeviceError as error:
+                except (DeviceError, InvalidInputError) as error:  # and no others: a full disk stays full
                     self._monitor.interrupt(str(error))
-                    device = self._reconnect()
+                    device = None
+                    self._stop.wait(RETRY_S)
         except Speckle3DError as error:
             self._failure = error
-
-    def _reconnect(self) -> Device | None:
-        """The sensor, ready to measure; None if told to stop before it is found."""
-        while not self._stop.is_set():
-            try:
-                return self._prepare()
-            except (DeviceError, InvalidInputError) as error:  # and no others: a full disk stays full
-                self._monitor.interrupt(str(error))
-                self._stop.wait(RETRY_S)
-        return None
 
     def _measure(self, device: Device) -> None:
         self._file.append(b"".join(map(encode, (*self._info.header, utc_message()))))
         self._monitor.begin(self._info.header)
         device.tap = self._take
         device.request(MessageId.GO_TO_MEASUREMENT)
-        self._listen(device)
-        with suppress(DeviceError):  # what it sends until it stops is recorded as well
-            device.request(MessageId.GO_TO_CONFIG)
-
-    def _take(self, data: bytes) -> None:
-        self._file.append(data)
-        self._monitor.take(data)
-
-    def _listen(self, device: Device) -> None:
         heard = time.monotonic()
         while not self._stop.is_set():
             now = time.monotonic()  # before reading: to wait for other threads is no silence
@@ -182,6 +163,12 @@ class Recorder:
                 raise DeviceError(f"{self._port}: the sensor had no power for a moment")
             if now - heard > SILENCE_S:
                 raise DeviceError(f"{self._port}: the sensor has been silent for {SILENCE_S:g} s")
+        with suppress(DeviceError):  # what it sends until it stops is recorded as well
+            device.request(MessageId.GO_TO_CONFIG)
+
+    def _take(self, data: bytes) -> None:
+        self._file.append(data)
+        self._monitor.take(data)
 
 
 def record(

@@ -7,7 +7,7 @@ both anew: the length of that pause is known only from the computer's clock, if 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
@@ -80,9 +80,9 @@ class Timeline:
 
     rows: IntArray | slice
     time_s: FloatArray
-    counter: IntArray | None = None
-    gaps: tuple[Gap, ...] = ()
-    notes: tuple[str, ...] = ()
+    counter: IntArray | None
+    gaps: tuple[Gap, ...]
+    notes: tuple[str, ...]
 
 
 def unwrap(values: Any, span: int) -> Any:
@@ -141,10 +141,10 @@ def timeline(stamps: Stamps, readings: Sequence[FloatArray] = ()) -> Timeline:
     if left_out := int((~distinct).sum()):
         notes.append(f"{left_out} samples at the time of another were left out")
     rows = rows[distinct] if late or left_out else slice(None)
-    counter = None if stamps.counter is None else stamps.counter[rows]
-    line = Timeline(rows, values[rows], counter, notes=tuple(notes))
-    numbers = None if numbers is None else numbers[rows]
-    return _with_gaps(line, numbers, np.diff(np.cumsum(anew)[rows]) > 0, stamps.period_s)
+    time_s, anew = values[rows], np.diff(np.cumsum(anew)[rows]) > 0
+    counter, numbers = (None if part is None else part[rows] for part in (stamps.counter, numbers))
+    counter, gaps, more = _gaps(time_s, counter, numbers, anew, stamps.period_s)
+    return Timeline(rows, time_s, counter, gaps, (*notes, *more))
 
 
 def _spread(values: FloatArray, readings: Sequence[FloatArray]) -> FloatArray:
@@ -166,34 +166,36 @@ def _spread(values: FloatArray, readings: Sequence[FloatArray]) -> FloatArray:
     return np.asarray(np.repeat(arrival_s, counts) + places * np.repeat(period_s, counts))
 
 
-def _with_gaps(line: Timeline, numbers: FloatArray | None, anew: BoolArray, stated_s: float) -> Timeline:
-    """Find the gaps between samples in order, by their numbers or else by the clock, and a wrong rate."""
-    seconds, counter, notes = np.diff(line.time_s), line.counter, line.notes
+def _gaps(
+    time_s: FloatArray, counter: Any, numbers: Any, anew: BoolArray, stated_s: float
+) -> tuple[IntArray | None, tuple[Gap, ...], list[str]]:
+    """A rising counter, gaps between samples by it or else by the clock, and notes on their rate."""
+    seconds, notes = np.diff(time_s), list[str]()
     running = seconds[~anew]
     usual_s, longest = usual_step(running), _LONGER
     regular = running[running < 2.5 * usual_s]
     period_s = float(regular.sum() / max(regular.size, 1)) or 1.0
     periods = seconds / period_s
     rates_hz = [1.0 / running]
-    if counter is not None and numbers is not None:
+    if counter is not None:
         counts, periods = np.diff(counter), np.diff(numbers)
         counter = counter[0] + _running_sums(np.maximum(counts, 1))
         rates_hz.append(counts[~anew] / running)
     elif (running < _SHORTER * period_s).sum() > _RARE * running.size:
         longest = _MUCH_LONGER
         span = f"{1e3 * seconds.min():.3g} to {1e3 * seconds.max():.3g} ms"
-        notes += (f"irregular clock, steps of {span}: single losses cannot be told",)
+        notes.append(f"irregular clock, steps of {span}: single losses cannot be told")
     medians_hz = [float(np.median(rates)) for rates in rates_hz if running.size and stated_s > 0.0]
     if medians_hz and not any(1.0 / _AGREES < hz * stated_s < _AGREES for hz in medians_hz):
         rates = f"{1.0 / stated_s:g} Hz, got {medians_hz[0]:.4g} Hz"
         contradiction = f"expected times at the stated rate, {rates} by their clock"
         if counter is not None:
             raise InvalidInputError(contradiction)
-        notes += (f"{contradiction}, which holds",)
+        notes.append(f"{contradiction}, which holds")
     missing = np.where(anew | (periods <= longest), 0.0, np.round(periods) - 1.0)
     at = np.flatnonzero((missing > 0.0) | anew | (seconds > longest * usual_s))
     gaps = tuple(Gap(int(i), int(missing[i]), float(seconds[i])) for i in at)
-    return replace(line, counter=counter, gaps=gaps, notes=notes)
+    return counter, gaps, notes
 
 
 def _running_sums(steps: Any) -> Any:

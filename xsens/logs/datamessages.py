@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -16,45 +15,45 @@ from xsens.logs.faults import stuck_axes
 from xsens.logs.parts import Parts
 from xsens.logs.samples import VECTORS
 from xsens.logs.worlds import Claim, quaternions_of, rotation_vectors
-from xsens.messages.control import Configuration, MessageId, utc_time_s
+from xsens.messages.control import (
+    BLOCK_SIZE,
+    COMPENSATION_NOTE,
+    Configuration,
+    MessageId,
+    RawCalibration,
+    utc_time_s,
+)
 from xsens.messages.framing import Frames, Message
-from xsens.messages.mtdata import DataLayout, OutputMode, Values, as_floats
-from xsens.messages.mtdata2 import read_items
-from xsens.messages.rawcounts import BLOCK_SIZE, COMPENSATION_NOTE, RawCalibration
+from xsens.messages.mtdata import DataLayout, OutputMode, Values, as_floats, read_items
 
 _STARTS = (MessageId.WAKE_UP, MessageId.GO_TO_MEASUREMENT_ACK, MessageId.UTC_TIME)
 """Messages after which the sensor's counter may have begun anew."""
-
-
-def _stretches(frames: Frames, indices: IntArray) -> Stamps:
-    """Mark the data messages before which the sensor was started anew, with the computer's clock then."""
-    starts, computer_s = np.zeros(indices.size, dtype=bool), np.full(indices.size, np.nan)
-    for i in np.flatnonzero(np.isin(frames.mid, _STARTS)).tolist():
-        after = slice(place := int(np.searchsorted(indices, i)), place + 1)
-        starts[after] = True
-        if frames.mid[i] == MessageId.UTC_TIME:
-            computer_s[after] = utc_time_s(frames.message(i))
-    return Stamps(starts=starts, computer_s=computer_s)
 
 
 _NOTATIONS = ("quaternion_wxyz", "matrix", "euler_deg")
 
 
 def _parts(
-    frames: Frames, indices: IntArray, values: Values, claim: Claim, notes: list[str], **changes: Any
+    frames: Frames, indices: IntArray, values: Values, claim: Claim, notes: list[str], **stamps: Any
 ) -> Parts:
-    """Samples of the messages at `indices` by the values that they hold, with changes of their stamps."""
+    """Samples of the messages at `indices` by the values that they hold, and what else their stamps are."""
     counter, ticks = (
         unwrap(values[name][:, 0].astype(np.int64), span) if name in values else None
         for name, span in (("counter", COUNTS), ("ticks", TICKS))
     )
     time_s = None if ticks is None else ticks * TICK_S
+    starts, computer_s = np.zeros(indices.size, dtype=bool), np.full(indices.size, np.nan)
+    for i in np.flatnonzero(np.isin(frames.mid, _STARTS)).tolist():
+        after = slice(place := int(np.searchsorted(indices, i)), place + 1)
+        starts[after] = True
+        if frames.mid[i] == MessageId.UTC_TIME:
+            computer_s[after] = utc_time_s(frames.message(i))
     notations = [quaternions_of(values[name]) for name in _NOTATIONS if name in values]
     increments = {VECTORS[0]: values["delta_v_m_s"]} if "delta_v_m_s" in values else {}
     if "delta_q_wxyz" in values:
         increments[VECTORS[1]] = rotation_vectors(values["delta_q_wxyz"])
     return Parts(
-        replace(_stretches(frames, indices), counter=counter, time_s=time_s, **changes),
+        Stamps(counter, time_s, starts=starts, computer_s=computer_s, **stamps),
         {name: values[name] for name in VECTORS if name in values},
         {"": notations[0]} if notations else {},
         claim,
@@ -87,8 +86,7 @@ def legacy_samples(frames: Frames, indices: IntArray) -> Parts:
     if not fits.all():
         notes.append(f"{(~fits).sum()} data messages were not as long as configured: left out")
         indices = indices[fits]
-    rates = [source.rate_hz for source in (configuration, calibration) if source is not None]
-    rate_hz = next((rate for rate in rates if rate > 0.0), float("nan"))
+    rates = [source.rate_hz for source in (configuration, calibration) if source and source.rate_hz > 0.0]
     data = frames[indices]
     values = {f.name: as_floats(layout.decode(data, f.name)) for f in layout.fields if f.name in _READ_FIELDS}
     if layout.mode & (OutputMode.RAW | OutputMode.MT9):
@@ -104,9 +102,8 @@ def legacy_samples(frames: Frames, indices: IntArray) -> Parts:
                 notes.append(
                     f"{name.split('_')[0]}: {ends.sum()} with an axis that stands still: taken as missing"
                 )
-    return _parts(
-        frames, indices, values, Claim(layout.frame, "as configured"), notes, period_s=1.0 / rate_hz
-    )
+    period_s = 1.0 / rates[0] if rates else float("nan")
+    return _parts(frames, indices, values, Claim(layout.frame, "as configured"), notes, period_s=period_s)
 
 
 def _last(frames: Frames, indices: BoolArray, read: Callable[[Message], Any]) -> Any:

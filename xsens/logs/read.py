@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
 from dataclasses import replace
 from io import TextIOWrapper
 
 import numpy as np
 
-from speckle3d.core.arrays import ByteArray, IntArray
+from speckle3d.core.arrays import ByteArray
 from speckle3d.core.errors import FileError, InvalidInputError, naming
 from speckle3d.core.files import PathLike, open_regular
 from xsens.logs.datamessages import legacy_samples, mtdata2_samples
@@ -17,7 +16,7 @@ from xsens.logs.parts import Hints, assemble_log
 from xsens.logs.samples import ImuLog
 from xsens.logs.textlogs import parse_text
 from xsens.messages.control import MessageId
-from xsens.messages.framing import Frames, find_frames
+from xsens.messages.framing import find_frames
 
 MOST_BYTES = 1 << 27
 """Of a log: five hours of raw counts at 256 Hz. Reading takes 2 times the memory of text, 4 to 10 times that
@@ -70,17 +69,12 @@ def read_log(path: PathLike, hints: Hints | None = None) -> ImuLog:
             raise FileError(f"{path}: expected at most {MOST_BYTES} bytes, got {size}")
         if not size:
             raise InvalidInputError(f"{path}: expected a log of the sensor, got an empty file")
-        if _is_text(head):
-            encoding = "utf-16" if head.startswith(_WIDE) else "utf-8-sig"
+        wide = head.startswith(_WIDE)
+        if (wide or 100 * head.count(0) <= len(head)) and not len(find_frames(head)):
+            encoding = "utf-16" if wide else "utf-8-sig"
             with TextIOWrapper(file, encoding, errors="replace") as text:
                 return parse_text(text, hints, str(path))
         return parse_stream(file.read(), hints, str(path))  # which alone holds the bytes
-
-
-def _is_text(first: bytes) -> bool:
-    """Whether the bytes hold no message of the sensor and hardly any zero."""
-    readable = first.startswith(_WIDE) or 100 * first.count(0) <= len(first)
-    return readable and not len(find_frames(first))
 
 
 # -- the sensor's own bytes
@@ -108,31 +102,23 @@ def parse_stream(data: bytes | ByteArray, hints: Hints | None = None, source: st
         If they hold no data message, or lack what is needed to understand one.
     """
     with naming(source):
-        frames = find_frames(data)
-        indices = _of_one_kind(frames)
+        frames, notes = find_frames(data), list[str]()
+        data_mask = np.isin(frames.mid, _DATA)
+        if not data_mask.any():
+            content = f"{len(frames)} others in {frames.data.size} bytes"
+            raise InvalidInputError(
+                f"expected messages with data, got {content if frames.data.any() else 'nothing but zeros'}"
+            )
+        kinds = frames.mid.astype(np.uint16) * 256 + frames.bid
+        indices = np.flatnonzero(data_mask & (kinds == np.bincount(kinds[data_mask]).argmax()))
+        if runs := frames.gaps():
+            size = sum(length for _, length in runs)
+            places = f"{len(runs)} places, first at byte {runs[0][0]}"
+            notes.append(f"{size} bytes in {places}, belong to no message")
+        if left_out := int(data_mask.sum()) - indices.size:
+            notes.append(f"{left_out} data messages of another kind or unit were left out")
         read = legacy_samples if frames.mid[indices[0]] == MessageId.MT_DATA else mtdata2_samples
         parts = read(frames, indices)
-        parts = replace(parts, notes=(*_passed_over(frames, indices), *parts.notes))
+        parts = replace(parts, notes=(*notes, *parts.notes))
         del data, frames, indices  # as large as the samples
         return assemble_log(parts, hints or Hints(), source)
-
-
-def _of_one_kind(frames: Frames) -> IntArray:
-    """Indices of the data messages of the most common kind and bus id."""
-    data = np.flatnonzero(np.isin(frames.mid, _DATA))
-    if not data.size:
-        content = f"{len(frames)} others in {frames.data.size} bytes"
-        raise InvalidInputError(
-            f"expected messages with data, got {content if frames.data.any() else 'nothing but zeros'}"
-        )
-    kinds = frames.mid[data].astype(np.uint16) * 256 + frames.bid[data]
-    return np.asarray(data[kinds == np.bincount(kinds).argmax()])
-
-
-def _passed_over(frames: Frames, indices: IntArray) -> Iterator[str]:
-    """Notes on bytes and messages that hold no samples of the log."""
-    if runs := frames.gaps():
-        size = sum(length for _, length in runs)
-        yield f"{size} bytes in {len(runs)} places, first at byte {runs[0][0]}, belong to no message"
-    if omitted_count := int(np.isin(frames.mid, _DATA).sum()) - indices.size:
-        yield f"{omitted_count} data messages of another kind or unit were left out"

@@ -67,10 +67,10 @@ _GRAVITY_M_S2 = 4.0
 """Median length of accelerations from which they hold gravity: a hand's own are less."""
 
 _AXES = {
-    **dict.fromkeys(("acc", "gyr", "mag", "free", "dv"), tuple("xyz")),
-    **dict.fromkeys(("dq", "optical", "quat"), tuple("wxyz")),
-    "mat": tuple(f"{row}_{column}" for row in "123" for column in "123"),
-    "euler": ("roll", "pitch", "yaw"),
+    **dict.fromkeys(("acc", "gyr", "mag", "free", "dv"), "xyz"),
+    **dict.fromkeys(("dq", "optical", "quat"), "wxyz"),
+    "mat": [f"{row}_{column}" for row in "123" for column in "123"],
+    "euler": "xyz",
 }
 _ORIENTATIONS = ("optical", "quat", "mat", "euler")
 
@@ -133,7 +133,7 @@ def _samples(table: TextTable, rate_hz: float | None) -> Parts:
         notes.append("orientation: by cameras, in a world of their own: x and z need not be north and up")
     elif notation == "quat":
         notations["the scalar is the last number"] = np.roll(notations[""], 1, axis=1)
-    elif notation == "euler" and "time" in table.columns and table.scales["euler_roll"] is None:
+    elif notation == "euler" and "time" in table.columns and table.scales["euler_x"] is None:
         angles = readings["euler"]
         if np.nanmax(np.abs(angles), initial=0.0) < _HALF_TURN:
             notations["angles are in radians"] = quaternions_of(np.degrees(angles))

@@ -44,57 +44,65 @@ _FIELDS = dict.fromkeys(
     ("au", "a_u", "ut", "µt", "nt", "mt", "t", "gauss", "g", "mgauss", "mg", "local_flux"), 1.0
 )
 _ANGLES = {"deg": 1.0, "°": 1.0, "rad": 1.0 / _DEG}
-_NUMBERED = {"0": "w", "1": "x", "2": "y", "3": "z", "scalar": "w"}
-_ROLLING = {"x": "roll", "y": "pitch", "z": "yaw"}
+_AXES = {
+    "0": "w",
+    "1": "x",
+    "2": "y",
+    "3": "z",
+    "scalar": "w",
+    "roll": "x",
+    "pitch": "y",
+    "yaw": "z",
+    "ns": "nano",
+}
+"""Axes by their other names."""
 
-_COLUMNS: tuple[tuple[str, str, str, Mapping[str, float], Mapping[str, str]], ...] = (
-    ("acc", "acc(?:el(?:eration|erometers?)?)?|a", "[xyz]", _FORCES, {}),
-    ("acc", "accelerometer_?acceleration", "[xyz]", {"g": -g}, {}),  # as iOS has it: gravity, not the force
-    ("free", "(?:free|lin(?:ear)?|user)_?(?:acc(?:el(?:eration)?)?)?", "[xyzenu]", _FORCES, {}),
-    ("dv", "dv|delta_?v|vel(?:ocity)?_?inc(?:rement)?", "[xyz1-3]", {}, _NUMBERED),
-    ("gyr", "gyro?(?:scopes?)?(?:_?rotation)?|angular_(?:velocity|rate)|as|[gw]", "[xyz]", _RATES, {}),
-    ("dq", "(?:dq|delta_?q|ori(?:entation)?_?inc(?:rement)?)(?:_?q)?", "[wxyz0-3]", {}, _NUMBERED),
-    ("mag", "mag(?:n|neto|netometers?|netic)?(?:_field)?|[mh]", "[xyz]", _FIELDS, {}),
-    ("quat", "quat(?:ernion)?(?:_?q)?|q|orientation", "[wxyz0-3]|scalar", {}, _NUMBERED),
-    ("euler", "(?:euler)?", "roll|pitch|yaw|(?<=euler_)[xyz]", _ANGLES, _ROLLING),
-    ("euler", "angle", "[xyz]", _ANGLES, _ROLLING),
-    ("mat", "mat", "[1-3]_[1-3]", {}, {}),
-    ("optical", "vicon_orientation", "[wxyz]", {}, {}),
+_COLUMNS: tuple[tuple[str, str, str, Mapping[str, float]], ...] = (
+    ("acc", "acc(?:el(?:eration|erometers?)?)?|a", "[xyz]", _FORCES),
+    ("acc", "accelerometer_?acceleration", "[xyz]", {"g": -g}),  # as iOS has it: gravity, not the force
+    ("free", "(?:free|lin(?:ear)?|user)_?(?:acc(?:el(?:eration)?)?)?", "[xyzenu]", _FORCES),
+    ("dv", "dv|delta_?v|vel(?:ocity)?_?inc(?:rement)?", "[xyz1-3]", {}),
+    ("gyr", "gyro?(?:scopes?)?(?:_?rotation)?|angular_(?:velocity|rate)|as|[gw]", "[xyz]", _RATES),
+    ("dq", "(?:dq|delta_?q|ori(?:entation)?_?inc(?:rement)?)(?:_?q)?", "[wxyz0-3]", {}),
+    ("mag", "mag(?:n|neto|netometers?|netic)?(?:_field)?|[mh]", "[xyz]", _FIELDS),
+    ("quat", "quat(?:ernion)?(?:_?q)?|q|orientation", "[wxyz0-3]|scalar", {}),
+    ("euler", "(?:euler)?", "roll|pitch|yaw|(?<=euler_)[xyz]", _ANGLES),
+    ("euler", "angle", "[xyz]", _ANGLES),
+    ("mat", "mat", "[1-3]_[1-3]", {}),
+    ("optical", "vicon_orientation", "[wxyz]", {}),
     (
         "time",
         "(?:[a-z]+_?)?(?:and_)?time(?:_?stamp)?(?:_?startup|_since_?[a-z0-9]+)?|ts?|epoch|(?:s_)?elapsed",
         "",
         TIMES,
-        {},
     ),
     (
         "counter",
         "(?:packet|sample)?_?(?:counter|number|index)|(?:frame|sample)_?(?:number|no)?|seq",
         "",
         {},
-        {},
     ),
-    ("ticks", "sampletimefine", "", {}, {}),
-    ("utc", "utc|(?:header_)?stamp", "year|month|day|hour|minute|s|nano|ns", {}, {"ns": "nano"}),
+    ("ticks", "sampletimefine", "", {}),
+    ("utc", "utc|(?:header_)?stamp", "year|month|day|hour|minute|s|nano|ns", {}),
 )
 """Quantity; its names with other characters than letters and digits as underscores, and those of its axes;
-factors from its units to SI, angles to degrees, while fields stay in theirs; axes by their other names."""
+factors from its units to SI, angles to degrees, while fields stay in theirs."""
 
 _PREFIX = "(?:(?:imu|field|sensor|data|shimmer(?:_[0-9a-f]{4})?)_|uncomp)*"
 _SUFFIX = "(?:_rs_s|_ln|_wr|_unix|_startup)?"
 _PATTERNS = [
-    (quantity, re.compile(rf"{_PREFIX}(?:{names}){_SUFFIX}_?({axes})(?:_cal)?(?:_(.+))?$"), units, letters)
-    for quantity, names, axes, units, letters in _COLUMNS
+    (quantity, re.compile(rf"{_PREFIX}(?:{names}){_SUFFIX}_?({axes})(?:_cal)?(?:_(.+))?$"), units)
+    for quantity, names, axes, units in _COLUMNS
 ]
 
-_SPELLINGS = (
-    ("s", "(?:per_)?sec(?:ond)?s?|s_1"),
-    ("ms", "m(?:illi)?sec(?:ond)?s?|millis"),
-    ("us", "(?:u|micro)sec(?:ond)?s?|micros"),
-    ("ns", "n(?:ano)?sec(?:ond)?s?|nanos"),
-    ("deg", "degrees?"),
-    ("rad", "radians?"),
-)
+_SPELLINGS = {
+    "s": "(?:per_)?sec(?:ond)?s?|s_1",
+    "ms": "m(?:illi)?sec(?:ond)?s?|millis",
+    "us": "(?:u|micro)sec(?:ond)?s?|micros",
+    "ns": "n(?:ano)?sec(?:ond)?s?|nanos",
+    "deg": "degrees?",
+    "rad": "radians?",
+}
 """Units, and how they may be spelt out."""
 
 STAMPS = ("time", "counter", "ticks")
@@ -124,17 +132,17 @@ def column_of(name: str) -> tuple[str, float | None] | None:
     With it comes what turns its numbers to SI units, None if the name states no unit.
     """
     words = stated = re.sub(r"[^a-z0-9°µ]+", "_", name.replace("²", "2")).strip("_")
-    for short, spelling in _SPELLINGS:
+    for short, spelling in _SPELLINGS.items():
         words = re.sub(rf"(?<![^_])(?:{spelling})(?![^_])", short, words)
     if words in TIMES:  # as millis; s alone may be anything
         return ("time", TIMES[words]) if words != stated else None
-    for quantity, pattern, units, letters in _PATTERNS:
+    for quantity, pattern, units in _PATTERNS:
         if match := pattern.match(words):
             axis, unit = match.groups()
             scale = units.get(unit)
             if unit and scale is None:
                 return None
-            return f"{quantity}_{letters.get(axis, axis)}".strip("_"), scale
+            return f"{quantity}_{_AXES.get(axis, axis)}".strip("_"), scale
     return None
 
 

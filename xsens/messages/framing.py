@@ -160,7 +160,7 @@ def find_frames(data: bytes | ByteArray) -> Frames:
     """Find every message in `data`, which may hold other bytes before, between and after them."""
     array = data if isinstance(data, np.ndarray) else np.frombuffer(data, dtype=np.uint8)
     array = np.ascontiguousarray(array)
-    start, end, _ = _scan(array, True)
+    start, end, _ = _scan(array)
     return Frames(array, start, end)
 
 
@@ -184,16 +184,13 @@ class Framer:
         """Messages that `data` completes; the bytes of an unfinished one are kept for the next call."""
         data = self._rest + data
         array = np.frombuffer(data, dtype=np.uint8)
-        start, end, stop = _scan(array, False)
+        start, end, stop = _scan(array)
         self._rest = data[stop:]
-        return list(Frames(array, start, end).messages())
+        return list(Frames(array, start, end)[start < stop].messages())
 
 
-def _scan(data: ByteArray, final: bool) -> tuple[IntArray, IntArray, int]:
-    """First and end bytes of messages in `data`, and how many bytes need not be scanned again.
-
-    Unless `final`, a possible message that later bytes may complete, and all after it, is left for later.
-    """
+def _scan(data: ByteArray) -> tuple[IntArray, IntArray, int]:
+    """First and end bytes of messages in `data`, and where a message may begin that later bytes complete."""
     start = np.flatnonzero(data == PREAMBLE)
     tail = np.append(data, np.zeros(5, dtype=np.uint8))
     size, high, low = (tail[start + k].astype(np.int64) for k in (3, 4, 5))
@@ -207,13 +204,9 @@ def _scan(data: ByteArray, final: bool) -> tuple[IntArray, IntArray, int]:
     sums = np.cumsum(data, dtype=np.uint8)
     valid = sums[end - 1] == sums[start]
     start, end = _without_overlaps(start[valid], end[valid])
-    if final or not partial.size:
-        return start, end, data.size
     before = np.append(0, end)[np.searchsorted(start, partial)]
     waiting = partial[before <= partial]  # not inside an accepted one
-    stop = int(waiting[0]) if waiting.size else data.size
-    final_part = start < stop
-    return start[final_part], end[final_part], stop
+    return start, end, int(waiting[0]) if waiting.size else data.size
 
 
 def _without_overlaps(start: IntArray, end: IntArray) -> tuple[IntArray, IntArray]:

@@ -1,8 +1,7 @@
 import numpy as np
 
 from xsens.messages.framing import find_frames
-from xsens.messages.mtdata import DataLayout, OutputMode
-from xsens.messages.mtdata2 import read_items
+from xsens.messages.mtdata import DataLayout, OutputMode, read_items
 
 
 def test_a_record_of_a_real_mt9():
