@@ -8,7 +8,6 @@ import numpy as np
 
 from speckle3d.core.curves import CurveKey, DecorrelationCurves
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.core.geometry import require_finite
 from speckle3d.core.sweep import RFSettings
 from speckle3d.io.hdf5 import PathLike, Source, open_family, read_text
 from speckle3d.io.records import put, put_fields, read_record, written
@@ -93,8 +92,7 @@ def read_curves(path: Source) -> DecorrelationCurves:
         signal = read_signal(file, read_text(file, "signal"))
         key = read_record(file, CurveKey, signal=signal)
         curves = read_record(file, DecorrelationCurves, key=key)
-        require_finite(curves.depth_mm, "/depth_mm")
-        if not curves.depth_mm.size or (np.diff(curves.depth_mm) <= 0).any():
+        if not curves.depth_mm.size or not (np.diff(curves.depth_mm) > 0).all():
             raise InvalidInputError("/depth_mm: expected depths that increase, got others")
         return curves
 

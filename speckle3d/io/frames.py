@@ -115,8 +115,8 @@ class HDF5Slices:
         return self._frame_of_growing
 
     def _reader(self, file: h5py.File) -> ReadFrame:
-        reads = [_slice_reader(require_dataset(file, name), self.axis) for name in self.names]
-        return lambda i: self.turn(*(read(i) for read in reads))
+        sets = [require_dataset(file, name) for name in self.names]
+        return lambda i: self.turn(*(_slice(data, self.axis, i) for data in sets))
 
     def _frame_of_growing(self, i: int) -> AnyArray:
         with open_hdf5(self.path) as file:
@@ -127,17 +127,13 @@ class HDF5Slices:
         return FileFrames(self.path, self, shape, dtype, **options)
 
 
-def _slice_reader(data: h5py.Dataset, axis: int | None) -> ReadFrame:
-    """Reader of slices along an axis; of plain chunks as they lie in the file, twice as fast as by h5py."""
+def _slice(data: h5py.Dataset, axis: int | None, i: int) -> AnyArray:
+    """Slice along an axis; a plain chunk as it lies in the file, twice as fast as by h5py."""
     if axis is None:
-        return lambda _: np.asarray(data[()])
+        return np.asarray(data[()])
     is_plain = data.dtype.kind in "iuf" and data.dtype.isnative and data.chunks == (1, *data.shape[1:])
-    if axis == 0 and is_plain and not data.id.get_create_plist().get_nfilters():
-        return lambda i: _plain_chunk(data, i)
-    return lambda i: np.asarray(data[(*(slice(None),) * axis, i)])
-
-
-def _plain_chunk(data: h5py.Dataset, i: int) -> AnyArray:
+    if axis or not is_plain or data.id.get_create_plist().get_nfilters():
+        return np.asarray(data[(*(slice(None),) * axis, i)])
     values = np.empty(data.shape[1:], data.dtype)
     data.id.read_direct_chunk((i, *(0,) * values.ndim), out=values.reshape(-1).view(np.uint8))
     return values

@@ -5,7 +5,6 @@ from __future__ import annotations
 import ctypes
 import hashlib
 import os
-import struct
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
@@ -29,19 +28,6 @@ Source: TypeAlias = PathLike | h5py.File
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 """First bytes of an HDF5 file without a user block."""
 
-_DAMAGE: tuple[type[BaseException], ...] = (
-    OSError,
-    RuntimeError,
-    LookupError,
-    ValueError,
-    TypeError,
-    MemoryError,
-    ArithmeticError,
-    EOFError,
-    struct.error,
-)
-"""What h5py, NumPy and Python's own libraries raise when the bytes of a file do not make sense."""
-
 _HAS_WRITER = ("already open for write", "unable to lock file")
 """HDF5's words for a file that is being written, or whose writer was killed."""
 
@@ -53,9 +39,6 @@ _CHUNK_CACHE_BYTES = 32 * 2**20
 
 LABELS_ALONE = ".seg.nrrd"
 """Suffix of labels with their segments, which nothing else may have."""
-
-_KINDS = {"f": "fiu", "i": "iu", "b": "biu"}
-"""Kinds in a file that may become a kind of result."""
 
 
 @contextmanager
@@ -101,10 +84,9 @@ def require_suffix(path: PathLike, suffixes: Sequence[str]) -> str:
         If it is none of them.
     """
     name = Path(path).name.lower()
-    suffix = next((suffix for suffix in (LABELS_ALONE, *suffixes) if name.endswith(suffix)), None)
-    if suffix is None or suffix not in suffixes:
-        others = f", not {suffix}, which is of labels alone" if suffix else ""
-        raise InvalidInputError(f"{path}: expected a name ending in {', '.join(suffixes)}{others}")
+    suffix = next((suffix for suffix in (LABELS_ALONE, *suffixes) if name.endswith(suffix)), "another")
+    if suffix not in suffixes:
+        raise InvalidInputError(f"{path}: expected a name ending in {', '.join(suffixes)}, got {suffix}")
     return suffix
 
 
@@ -137,8 +119,6 @@ def open_hdf5(path: PathLike) -> h5py.File:
         try:
             return h5py.File(path, "r", rdcc_nbytes=_CHUNK_CACHE_BYTES)
         except OSError as error:
-            if "signature not found" in str(error):
-                raise FileError(f"{path}: expected an HDF5 file, got one of another kind") from error
             if not any(words in str(error) for words in _HAS_WRITER):
                 raise
             return _open_beside_writer(path)
@@ -159,18 +139,16 @@ def _open_beside_writer(path: PathLike) -> h5py.File:
 
 
 @contextmanager
-def reading(where: PathLike, *library_errors: type[BaseException]) -> Iterator[None]:
+def reading(where: PathLike) -> Iterator[None]:
     """Turn what a damaged or unreadable file raises in the block into a `FileError` of one line.
 
-    Other exceptions are errors of a program and pass. A library may have errors of its own; `Exception`
-    stands for them where the block is a call of such a library and nothing else.
+    Libraries stumble over damage with errors of any kind; meshio even leaves the program.
     """
-    damage = _DAMAGE + library_errors
     try:
         yield
     except Speckle3DError:
         raise
-    except damage as error:
+    except (Exception, SystemExit) as error:
         raise FileError(f"{where}: cannot be read: {one_line(error)}") from error
 
 
@@ -208,38 +186,46 @@ def find_member(group: h5py.Group, name: str) -> Any:
     Raises
     ------
     InvalidInputError
-        If the name leads to nothing or to another file, or data are in another file.
+        If the name leads to another file, or data are in another file.
     """
     where = locate(group, name)
     with reading(where):
-        if not isinstance(group, h5py.Group) or group.get(name, getlink=True) is None:
-            return None
-        node = group.get(name)
-        is_inside = node is not None and node.file.filename == group.file.filename
+        node = group.get(name) if isinstance(group, h5py.Group) else None
+        is_inside = node is None or node.file.filename == group.file.filename
         if not is_inside or (isinstance(node, h5py.Dataset) and (node.is_virtual or node.external)):
-            raise InvalidInputError(f"{where}: expected data in the file itself, got a link to none")
+            raise InvalidInputError(f"{where}: expected data in the file itself, got a link out of it")
         return node
 
 
 def has_member(group: h5py.Group, name: str) -> bool:
-    """Whether a group holds a name; a link to nothing, or out of the file, is an error and not absence."""
+    """Whether a group holds a name."""
     return find_member(group, name) is not None
 
 
 def require_group(group: h5py.Group, name: str) -> h5py.Group:
     """Return a group inside `group`, or raise `InvalidInputError` naming what is there instead."""
-    return _require_kind(group, name, h5py.Group)
-
-
-def require_dataset(group: h5py.Group, name: str) -> h5py.Dataset:
-    """Return a data set of `group`, or raise `InvalidInputError` if it is none or its data are elsewhere."""
-    return _require_kind(group, name, h5py.Dataset)
-
-
-def _require_kind(group: h5py.Group, name: str, kind: type[Node]) -> Any:
     node = find_member(group, name)
-    if not isinstance(node, kind):
-        raise InvalidInputError(f"{locate(group, name)}: expected a {kind.__name__.lower()}, got {node}")
+    if not isinstance(node, h5py.Group):
+        raise InvalidInputError(f"{locate(group, name)}: expected a group, got {node}")
+    return node
+
+
+def require_dataset(group: h5py.Group, name: str, shape: tuple[int | str, ...] | None = None) -> h5py.Dataset:
+    """Return a data set of `group`, of a shape in which a word stands for a length that is free.
+
+    Raises
+    ------
+    InvalidInputError
+        If there is none, it is of another shape, or its data are elsewhere.
+    """
+    node = find_member(group, name)
+    if not isinstance(node, h5py.Dataset):
+        raise InvalidInputError(f"{locate(group, name)}: expected a data set, got {node}")
+    free = [
+        length if isinstance(n, str) else n for n, length in zip(shape or (), node.shape or (), strict=False)
+    ]
+    if shape is not None and (len(free) != len(shape) or node.shape != (*free,)):
+        raise InvalidInputError(f"{locate(group, name)}: expected shape {shape}, got {node.shape}")
     return node
 
 
@@ -262,21 +248,11 @@ def read_array(
     FileError
         If its bytes cannot be read.
     """
-    node, where, result = require_dataset(group, name), locate(group, name), np.dtype(dtype)
-    if node.dtype.kind not in _KINDS[result.kind]:
-        raise InvalidInputError(f"{where}: expected numbers of type {result}, got {node.dtype}")
-    if shape is not None:
-        require_shape(node, shape, where)
+    node, where = require_dataset(group, name, shape), locate(group, name)
+    if not np.can_cast(node.dtype, dtype, "same_kind"):
+        raise InvalidInputError(f"{where}: expected numbers of type {np.dtype(dtype)}, got {node.dtype}")
     with reading(where):
-        return np.asarray(node[()], dtype=result)
-
-
-def require_shape(node: h5py.Dataset, shape: tuple[int | str, ...], where: str) -> None:
-    """Raise `InvalidInputError` unless a data set is of a shape; a word stands for a length that is free."""
-    pairs = zip(node.shape or (), shape, strict=False)
-    differs = any(actual != expected for actual, expected in pairs if isinstance(expected, int))
-    if differs or node.ndim != len(shape):
-        raise InvalidInputError(f"{where}: expected shape {shape}, got {node.shape}")
+        return np.asarray(node[()], dtype=dtype)
 
 
 def read_transforms(group: h5py.Group, name: str, count: int | None = None) -> RigidTransform:
@@ -289,9 +265,8 @@ def read_transforms(group: h5py.Group, name: str, count: int | None = None) -> R
 
 def read_texts(group: h5py.Group, name: str, shape: tuple[int, ...]) -> Any:
     """Read a data set of texts of a known shape, as nested lists."""
-    node, where = require_dataset(group, name), locate(group, name)
-    require_shape(node, shape, where)
-    with reading(where):  # h5py refuses what are no texts
+    node = require_dataset(group, name, shape)
+    with reading(locate(group, name)):  # h5py refuses what are no texts
         return np.asarray(node.asstr(errors="replace")[()], dtype=object).tolist()
 
 
@@ -329,5 +304,5 @@ def sha256_of(path: PathLike) -> str:
 
 def one_line(error: BaseException) -> str:
     """Return the first line of an error's own words."""
-    text = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+    text = getattr(error, "strerror", None) or str(error)
     return (text.strip() or type(error).__name__).splitlines()[0]

@@ -8,7 +8,7 @@ import h5py
 import numpy as np
 
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.core.geometry import require_finite, require_increasing, transforms_from_matrices
+from speckle3d.core.geometry import require_finite, require_increasing
 from speckle3d.core.grid import ImageGrid
 from speckle3d.core.reconstruction import (
     MODES,
@@ -25,7 +25,6 @@ from speckle3d.core.reconstruction import (
 from speckle3d.io.hdf5 import (
     PathLike,
     Source,
-    has_member,
     locate,
     open_family,
     read_array,
@@ -34,10 +33,9 @@ from speckle3d.io.hdf5 import (
     read_texts,
     read_transforms,
     read_vector_attribute,
-    require_dataset,
     require_group,
 )
-from speckle3d.io.records import put, put_fields, put_text, read_record, written
+from speckle3d.io.records import put, put_fields, read_record, written
 
 FORMAT = "speckle3d.reconstruction"
 
@@ -64,12 +62,11 @@ def write_reconstruction(path: PathLike, result: Reconstruction, pairs: Sequence
         put_fields(file, result.grid)
         put(file, "poses", result.poses)
         if trust is not None:
-            modes = {"image": trust.covariance} | {mode: of.covariance for mode, of in trust.modes.items()}
-            put(file, "pose_covariance", modes)
             put(file, "frame_flags", trust.flags)
-            if trust.shared is not None:
-                file["pose_covariance/image"].attrs.update(vars(trust.shared))
+            put(file, "pose_covariance/image", trust.covariance)
+            file["pose_covariance/image"].attrs.update({} if trust.shared is None else vars(trust.shared))
             for mode, errors in trust.modes.items():
+                put(file, f"pose_covariance/{mode}", errors.covariance)
                 file[f"pose_covariance/{mode}"].attrs["length_sigma"] = errors.length_sigma
         put_fields(file, origin, skip=["calibrations", "imported"])
         for calibration in origin.calibrations:
@@ -77,8 +74,8 @@ def write_reconstruction(path: PathLike, result: Reconstruction, pairs: Sequence
             put(file, f"calibrations/{calibration.sensor}", source)
         if origin.imported is not None:
             put(file, "import", {"name": origin.imported.name})
-            put_text(file["import"], "settings_json", origin.imported.settings_json)
-        put_text(file, "config_toml", result.config_toml)
+            file["import/settings_json"] = origin.imported.settings_json
+        file["config_toml"] = result.config_toml
         if parts:
             rows = {name: np.concatenate([vars(part)[name] for part in parts]) for name in vars(parts[0])}
             put(file, "pairs", rows | {"patch_centre_mm": parts[0].patch_centre_mm})
@@ -107,7 +104,7 @@ def read_reconstruction(path: Source, with_pairs: bool = True) -> Reconstruction
     """
     with open_family(path, FORMAT) as file:
         times, group = read_array(file, "frame_time_s", ("frame",)), require_group(file, "poses")
-        modes = [mode for mode in MODES if has_member(group, mode)]
+        modes = [mode for mode in MODES if mode in group]
         return Reconstruction(
             frame_time_s=require_increasing(times, locate(file, "frame_time_s")),
             grid=read_record(file, ImageGrid),
@@ -125,48 +122,40 @@ load_reconstruction = read_reconstruction
 
 def _read_provenance(file: h5py.File) -> Provenance:
     """Where a reconstruction came from; files of versions before 0.1 lack some groups."""
-    files = require_group(file, "calibrations") if has_member(file, "calibrations") else {}
-    calibrations = tuple(
-        read_record(require_group(files, sensor), CalibrationFile, sensor=sensor) for sensor in files
-    )
+    files = require_group(file, "calibrations") if "calibrations" in file else {}
+    calibrations = (read_record(files[sensor], CalibrationFile, sensor=sensor) for sensor in files)
     settings = None
-    if has_member(file, "import"):
+    if "import" in file:
         group = require_group(file, "import")
         settings = ImportRecord(read_text(group, "name"), read_texts(group, "settings_json", ()))
-    return read_record(file, Provenance, calibrations=calibrations, imported=settings)
+    return read_record(file, Provenance, calibrations=tuple(calibrations), imported=settings)
 
 
 def _read_trust(file: h5py.File, frames: int) -> Trust | None:
-    if not (has_member(file, "pose_covariance") and has_member(file, "frame_flags")):
+    if "pose_covariance" not in file or "frame_flags" not in file:
         return None
     group = require_group(file, "pose_covariance")
-    covariances = {mode: read_array(group, mode, (frames, 6, 6)) for mode in MODES if has_member(group, mode)}
+    covariances = {mode: read_array(group, mode, (frames, 6, 6)) for mode in MODES if mode in group}
     for mode, values in covariances.items():
         require_finite(values, locate(group, mode))
-    image, common_errors = require_dataset(group, "image"), None
-    if "turn_sigma_per_mm" in image.attrs:
-        turn = read_vector_attribute(image, "turn_sigma_per_mm", 2)
-        common_errors = read_record(image, SharedErrors, turn_sigma_per_mm=turn)
-    covariance = covariances.pop("image")
+    covariance, flags = covariances.pop("image"), read_array(file, "frame_flags", (frames,), np.int64)
     modes = {
         mode: ModeErrors(values, read_attribute(group[mode], "length_sigma"))
         for mode, values in covariances.items()
     }
-    return Trust(covariance, read_array(file, "frame_flags", (frames,), np.int64), common_errors, modes)
+    if "turn_sigma_per_mm" not in (image := group["image"]).attrs:
+        return Trust(covariance, flags, None, modes)
+    turn = read_vector_attribute(image, "turn_sigma_per_mm", 2)
+    return Trust(covariance, flags, read_record(image, SharedErrors, turn_sigma_per_mm=turn), modes)
 
 
 def _read_pairs(file: h5py.File, frames: int) -> FramePairs | None:
-    if not has_member(file, "pairs"):
+    if "pairs" not in file:
         return None
-    group = require_group(file, "pairs")
-    pairs = read_record(group, FramePairs)
-    counts = {len(rows) for name, rows in vars(pairs).items() if name != "patch_centre_mm"}
-    if (
-        len(counts) > 1
-        or not ((pairs.first >= 0) & (pairs.first < pairs.second) & (pairs.second < frames)).all()
-    ):
+    pairs = read_record(require_group(file, "pairs"), FramePairs)
+    is_within = (pairs.first >= 0) & (pairs.first < pairs.second) & (pairs.second < frames)
+    if not is_within.all():
         raise InvalidInputError(
-            f"{locate(group)}: expected rows of frames 0 <= first < second < {frames}, got others"
+            f"{locate(file, 'pairs')}: expected 0 <= first < second < {frames}, got others"
         )
-    transforms_from_matrices(pairs.first_from_second, locate(group, "first_from_second"))
     return pairs

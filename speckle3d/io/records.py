@@ -75,12 +75,6 @@ def put_fields(group: h5py.Group, record: object, skip: Sequence[str] = ()) -> N
             put(group, name, value)
 
 
-def put_text(group: h5py.Group, name: str, text: str | list[str]) -> None:
-    """Write a text, or a list of them, as a data set: it may be more than an attribute holds."""
-    plain = _unicode(text) if isinstance(text, str) else list(map(_unicode, text))
-    group.create_dataset(name, data=plain, dtype=h5py.string_dtype())
-
-
 def put(group: h5py.Group, name: str, value: Any) -> None:
     """Write a value under a name by its type.
 
@@ -96,23 +90,16 @@ def put(group: h5py.Group, name: str, value: Any) -> None:
         inner = group.require_group(name)
         for key, item in value.items():
             put(inner, key, item)
-    elif isinstance(value, str):
-        group.attrs[name] = _unicode(value)
-    elif isinstance(value, int | float | tuple):
+    elif isinstance(value, str | int | float | tuple):
         group.attrs[name] = value
     elif isinstance(value, list):
-        put_text(group, name, value)
+        group.create_dataset(name, data=value, dtype=h5py.string_dtype())
     elif isinstance(value, Rotation):
         put(group, f"{name}_wxyz", value.as_quat(scalar_first=True))
     else:
         values = np.asarray(value.as_matrix() if isinstance(value, RigidTransform) else value)
         reserve(group.file.id, values.nbytes)
         group.create_dataset(name, data=values)
-
-
-def _unicode(text: str) -> str:
-    """Escape lone surrogates, which Python writes into paths that are not Unicode."""
-    return text.encode("utf-8", "backslashreplace").decode()
 
 
 def read_record(group: h5py.Group, kind: type[Record], **values: Any) -> Record:

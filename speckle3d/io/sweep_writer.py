@@ -8,33 +8,25 @@ either as there are times.
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import replace
-from types import TracebackType
 from typing import Any, Literal, Self
 
 import h5py
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import AnyArray, FloatArray
 from speckle3d.core.errors import FileError, InvalidInputError, Speckle3DError, naming
 from speckle3d.core.files import cannot_write
-from speckle3d.core.geometry import require_finite, rotations_from_quaternions, transforms_from_matrices
+from speckle3d.core.geometry import require_finite
 from speckle3d.core.grid import ImageGrid
 from speckle3d.core.progress import Progress
-from speckle3d.core.sweep import (
-    INERTIAL,
-    BModeSettings,
-    OrientationSensor,
-    RFSettings,
-    Sweep,
-    Tracker,
-    stored_dtype,
-)
+from speckle3d.core.sweep import BModeSettings, OrientationSensor, RFSettings, Sweep, Tracker, stored_dtype
 from speckle3d.core.threads import ahead
-from speckle3d.io.hdf5 import PathLike, find_member, open_hdf5, reading, require_target
+from speckle3d.io.hdf5 import PathLike, atomic_path, open_family, require_target
 from speckle3d.io.meanings import label
 from speckle3d.io.records import put, reserve, trim, written
 from speckle3d.io.sweeps import (
@@ -42,11 +34,10 @@ from speckle3d.io.sweeps import (
     FORMAT,
     GROWING,
     IQ_VERSION,
-    MEMBERS,
     SAMPLE_TYPES,
+    SENSORS,
     VERSION,
-    SweepSlices,
-    open_sweep,
+    VERSIONS,
     require_sample_type,
 )
 
@@ -120,7 +111,7 @@ def write_sweep(
     compression: Compression = None,
     simulation: Mapping[str, Any] | None = None,
 ) -> None:
-    """Write a sweep; what its own file holds beyond the format is copied along.
+    """Write a sweep; what its own file holds beyond the format stays behind.
 
     Parameters
     ----------
@@ -162,32 +153,19 @@ def write_sweep(
             if progress is not None:
                 progress(i + 1, len(sweep))
         put(file, "frame_time_s", sweep.frame_time_s)
-        for sensor in (sweep.orientation, sweep.tracker):
-            if sensor is not None:
-                _write_sensor(file, sensor)
-        if sweep.truth is not None:
-            put(file, "truth", {"world_from_image": sweep.truth})
+        for name in SENSORS:
+            _put_sensor(file, name, getattr(sweep, name))
+        put(file, "truth", {"world_from_image": sweep.truth} if sweep.truth is not None else None)
         put(file, "probe", sweep.probe or None)
         for name, value in (simulation or {}).items():
             plain = value if isinstance(value, str | int | float) else json.dumps(value, sort_keys=True)
             put(file, "simulation", {name: plain})
-        if isinstance(source := getattr(frames, "open_file", None), SweepSlices):
-            _copy_unknown(source.path, file)
-
-
-def _copy_unknown(source: PathLike, file: h5py.File) -> None:
-    """Copy what another sweep file holds beyond this version of the format."""
-    with reading(source), naming(str(source)), open_hdf5(source) as origin:
-        for name in {*origin} - MEMBERS - {*file}:
-            origin.copy(find_member(origin, name), file, name)
-        for name in {*origin.attrs} - {*file.attrs}:
-            file.attrs[name] = origin.attrs[name]
 
 
 def attach_orientation(path: PathLike, sensor: OrientationSensor) -> None:
     """Put an orientation sensor's stream into a sweep file, in place of the one it may hold.
 
-    The file is written anew, without compression, and put back in one step, so that it is never half written.
+    A copy of the file is changed and put back in one step, so that it is never half written.
 
     Raises
     ------
@@ -196,32 +174,40 @@ def attach_orientation(path: PathLike, sensor: OrientationSensor) -> None:
     InvalidInputError
         If it is no sweep file.
     """
-    sweep = open_sweep(path).ready
-    assert sweep is not None
-    write_sweep(path, replace(sweep, orientation=sensor))
+    with open_family(path, FORMAT, VERSIONS):
+        pass
+    with atomic_path(path) as part:
+        shutil.copyfile(path, part)
+        with h5py.File(part, "r+", locking=False) as file:
+            if "orientation" in file:
+                del file["orientation"]
+            _put_sensor(file, "orientation", sensor)
+            label(file)
+        trim(part)
 
 
-def _write_sensor(file: h5py.File, sensor: OrientationSensor | Tracker) -> None:
-    readings = sensor.readings
-    values: dict[str, Any] = {"time_s": readings.time_s, "time_offset_s": sensor.time_offset_s}
-    if isinstance(sensor, Tracker):
-        name, values["world_from_sensor"] = "tracker", readings.world_from_sensor
-        values["valid"] = np.ones(len(readings), dtype=bool)
-        values["image_skew_rad"] = sensor.image_skew_rad or None
-        if (pose := sensor.sensor_from_image) is not None:
-            values["sensor_from_image"] = tuple(pose.as_matrix())
-    else:
-        name, values["quaternion"] = "orientation", readings.world_from_sensor
-        values |= {vector: getattr(sensor, vector) for vector in INERTIAL}
-        if (turn := sensor.sensor_from_image) is not None:
-            values["sensor_from_image_wxyz"] = tuple(turn.as_quat(scalar_first=True))
-    put(file, name, values)
+def _put_sensor(file: h5py.File, name: str, sensor: OrientationSensor | Tracker | None) -> None:
+    """Write a sensor's readings and mounting, if there is one."""
+    if sensor is None:
+        return
+    readings, mounting, _, _ = SENSORS[name]
+    values = {
+        key: value for key, value in vars(sensor).items() if key not in ("readings", "sensor_from_image")
+    }
+    world_from_sensor = _numbers(sensor.readings.world_from_sensor)
+    put(file, name, {**values, "time_s": sensor.readings.time_s, readings: world_from_sensor})
+    if sensor.sensor_from_image is not None:
+        file[name].attrs[mounting] = _numbers(sensor.sensor_from_image)
+
+
+def _numbers(pose: Rotation | RigidTransform) -> FloatArray:
+    """Quaternions, scalar first, or matrices."""
+    return pose.as_quat(scalar_first=True) if isinstance(pose, Rotation) else pose.as_matrix()
 
 
 _STREAMS: dict[str, dict[str, tuple[int, ...]]] = {
     "/": {"frame_time_s": ()},
-    "tracker": {"world_from_sensor": (4, 4), "valid": (), "time_s": ()},
-    "orientation": {"quaternion_wxyz": (4,), "time_s": ()},
+    **{name: {readings: shape, "time_s": ()} for name, (readings, _, shape, _) in SENSORS.items()},
 }
 """Groups whose data sets grow row by row, by the shape of a row. Times last: what has a time is whole."""
 _ROWS_PER_CHUNK = 128
@@ -279,12 +265,11 @@ class GrowingSweep:
         *,
         probe: str = "",
     ) -> None:
-        self.path, self._last_s = require_target(path), dict.fromkeys(_STREAMS, -np.inf)
+        self.path = require_target(path)
+        if self.path.exists():
+            raise FileError(f"{path}: there already; expected a new file")
         with naming(str(path)), self._writing():
-            try:
-                self._file = file = h5py.File(self.path, "x", libver="latest")
-            except FileExistsError as error:
-                raise FileError(f"{path}: there already; expected a new file") from error
+            self._file = file = h5py.File(self.path, "x", libver="latest")
             try:
                 reserve(file.id)
                 file.attrs["format"] = FORMAT
@@ -292,10 +277,8 @@ class GrowingSweep:
                 self._frames = _create_frames(file, grid, signal, dtype, compression)
                 for group, shapes in _STREAMS.items():
                     for name, shape in shapes.items():
-                        file.require_group(group).create_dataset(
-                            name, (0, *shape), "?" if name == "valid" else "f8", maxshape=(None, *shape),
-                            chunks=(_ROWS_PER_CHUNK, *shape), fillvalue=None if name == "valid" else np.nan,
-                        )  # fmt: skip
+                        sizes = {"maxshape": (None, *shape), "chunks": (_ROWS_PER_CHUNK, *shape)}
+                        file.create_dataset(f"{group}/{name}", (0, *shape), "f8", fillvalue=np.nan, **sizes)
                 file[GROWING] = np.uint8(1)
                 label(file)
                 file.swmr_mode = True
@@ -307,15 +290,10 @@ class GrowingSweep:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         try:
             with self._writing():
                 self._file[GROWING][...] = kind is not None
-        except FileError:
-            if kind is None:
-                raise
         finally:
             is_empty = not len(self)
             self._file.close()
@@ -343,17 +321,15 @@ class GrowingSweep:
             self._frames.flush()
 
     def append_pose(self, time_s: float, matrix: FloatArray, valid: bool = True) -> None:
-        """Write a tracker's reading: world_from_sensor, shape (4, 4), mm, at its time.
+        """Write a tracker's reading, unless it is not valid: world_from_sensor, shape (4, 4), mm.
 
         Raises
         ------
         InvalidInputError
-            If a valid one is not rigid, or its time is not after the one before: it is then not in the file.
+            If it is not rigid, or its time is not after the one before: it is then not in the file.
         """
-        pose = np.asarray(matrix if valid else np.eye(4))
-        transforms_from_matrices(pose[None], f"{self.path}: /tracker at {time_s} s")
-        with self._row("tracker", time_s, pose, valid):
-            pass
+        if valid:
+            self._append_reading("tracker", time_s, matrix)
 
     def append_orientation(self, time_s: float, quaternion_wxyz: FloatArray) -> None:
         """Write an orientation sensor's reading: world_from_sensor, scalar first.
@@ -363,26 +339,28 @@ class GrowingSweep:
         InvalidInputError
             If it is no unit quaternion, or its time is not after the one before: it is then not in the file.
         """
-        where = f"{self.path}: /orientation at {time_s} s"
-        rotations_from_quaternions(np.asarray(quaternion_wxyz)[None], where)
-        with self._row("orientation", time_s, quaternion_wxyz):
+        self._append_reading("orientation", time_s, quaternion_wxyz)
+
+    def _append_reading(self, name: str, time_s: float, reading: FloatArray) -> None:
+        *_, check = SENSORS[name]
+        check(np.asarray(reading)[None], f"{self.path}: /{name} at {time_s} s")
+        with self._row(name, time_s, reading):
             pass
 
     @contextmanager
     def _row(self, group: str, time_s: float, *values: Any) -> Iterator[None]:
         """Write a row of a group after the block, its time last, and hand it to the operating system."""
-        last_s = self._last_s[group]
-        if not (np.isfinite(time_s) and time_s > last_s):
+        nodes = [self._file[group][name] for name in _STREAMS[group]]
+        last_s = nodes[-1][-1] if len(nodes[-1]) else -np.inf
+        if not last_s < time_s < np.inf:
             raise InvalidInputError(f"{self.path}: {group}: expected a time after {last_s} s, got {time_s}")
         with naming(str(self.path)), self._writing():
             yield
             reserve(self._file.id)
-            for name, value in zip(_STREAMS[group], (*values, time_s), strict=True):
-                node = self._file[group][name]
+            for node, value in zip(nodes, (*values, time_s), strict=True):
                 node.resize(len(node) + 1, axis=0)
                 node[-1] = value
                 node.id.flush()
-            self._last_s[group] = time_s
 
     @contextmanager
     def _writing(self) -> Iterator[None]:

@@ -9,7 +9,7 @@ from speckle3d.core.errors import FileError
 from speckle3d.core.grid import ImageGrid
 from speckle3d.io.load import load_sweep
 from speckle3d.io.plus.write import write_sequence
-from speckle3d.io.sweep_writer import write_sweep
+from speckle3d.io.sweep_writer import attach_orientation, write_sweep
 
 
 @pytest.fixture
@@ -53,17 +53,18 @@ def test_reading_a_frame_touches_no_other(path):
         sweep.frames[2]
 
 
-def test_rewriting_keeps_unknown_groups(path, tmp_path):
+def test_attaching_a_sensor_changes_nothing_else(path, tmp_path):
     with h5py.File(path, "r+") as file:
         file["annotations/landmarks_mm"] = np.eye(3)
-        file["annotations"].attrs["by"] = "someone"
         file.attrs["operator_note"] = "left arm"
-    write_sweep(path, replace(load_sweep(path), tracker=None))
+    sweep = load_sweep(path)
+    attach_orientation(path, replace(sweep.orientation, time_offset_s=0.5))
     with h5py.File(path) as file:
         np.testing.assert_array_equal(file["annotations/landmarks_mm"], np.eye(3))
-        assert file["annotations"].attrs["by"] == "someone"
         assert file.attrs["operator_note"] == "left arm"
-        assert "tracker" not in file
+    changed = load_sweep(path)
+    assert (changed.orientation.time_offset_s, changed.grid) == (0.5, sweep.grid)
+    np.testing.assert_array_equal(changed.frames[5], sweep.frames[5])
     assert list(tmp_path.iterdir()) == [path]
 
 

@@ -94,7 +94,7 @@ def _unpack(member: Member, _: int) -> bytes:
     while any((lengths := content[at : at + 12].ljust(12, b"\0"))[:4]):
         unpacked_size, size, check_sum = struct.unpack(">III", lengths)
         at += 8 + 4 * (plain + (packs if size < unpacked_size else 0))  # behind the check sums
-        with reading(f"{member.where}: block {len(parts)}", Exception):
+        with reading(f"{member.where}: block {len(parts)}"):
             part = content[at : at + size]
             parts.append(part if size == unpacked_size else bytes(lzo.decompress(part, unpacked_size)))
             if plain and check(parts[-1]) != check_sum:

@@ -15,7 +15,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import nrrd
 import numpy as np
 
 from speckle3d.core.arrays import AnyArray, FloatArray
@@ -155,7 +154,7 @@ class SequenceHeader:
         """
         count = math.prod(self.size) * self.channels
         size, values = count * self.dtype.itemsize, np.zeros(0, self.dtype)
-        with reading(self.path, DEFLATE.error), open_regular(self.data) as stream:
+        with reading(self.path), open_regular(self.data) as stream:
             length = stream.seek(0, 2)
             start = max(length - size, 0) if self.start < 0 else self.start
             stream.seek(start)
@@ -192,7 +191,7 @@ def read_header(path: PathLike) -> SequenceHeader:
     InvalidInputError
         If it is neither, the header does not make sense, or its pixels lie outside its folder.
     """
-    with reading(path, nrrd.NRRDError), open_regular(path) as stream, naming(str(path)):
+    with reading(path), open_regular(path) as stream, naming(str(path)):
         start = stream.peek()
         if not is_image(start):
             raise InvalidInputError("expected a MetaImage or NRRD header, got something else")

@@ -199,7 +199,7 @@ def _read_nifti(path: Path) -> tuple[AnyArray, FloatArray, dict[str, str], bool]
     """
     with (
         naming(str(path)),
-        reading(path, Exception),
+        reading(path),
     ):  # a damaged file shows in whatever nibabel happens to stumble over
         image: Any = nibabel.load(path)
         voxels = np.asanyarray(image.dataobj)
