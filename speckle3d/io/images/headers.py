@@ -1,35 +1,35 @@
-"""Headers of MetaImage and NRRD files: axes, frames, pixels.
+"""Headers of MetaImage and NRRD files: axes, units, fields of frames, pixels.
 
-Pixels are read here: pynrrd reads all of a raw sequence into memory and stops at the first member of packed
-pixels.
+pynrrd parses NRRD's headers; a MetaImage's fields are put into NRRD's words. Pixels are read here: pynrrd
+reads all of a raw sequence into memory and stops at the first member of packed pixels.
+
+References
+----------
+.. [1] G. Kindlmann, "Definition of NRRD File Format", teem.sourceforge.net.
+.. [2] ITK, "MetaIO documentation".
 """
 
 from __future__ import annotations
 
 import bz2
 import math
+import re
 import zlib
+from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import takewhile
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
+import nrrd
 import numpy as np
 
 from speckle3d.core.arrays import AnyArray, FloatArray
 from speckle3d.core.errors import FileError, InvalidInputError, naming
 from speckle3d.core.files import PathLike, open_regular
 from speckle3d.io.hdf5 import reading
-from speckle3d.io.images.header_fields import (
-    frame_fields,
-    is_image,
-    meta_fields,
-    mm_per,
-    nrrd_fields,
-    number_type,
-    s_per,
-)
 from speckle3d.io.text import numbers
 
 DEFLATE: Any = zlib
@@ -43,9 +43,44 @@ except ImportError:
 ZLIB, GZIP, _EITHER = 15, 31, 47
 """Windows of deflate, and by them what is around it; either is told when unpacking."""
 
+NUMBER_TYPES = {
+    "i1": "char int8",
+    "u1": "uchar uint8",
+    "i2": "short int16",
+    "u2": "ushort uint16",
+    "i4": "int long int32",
+    "u4": "uint ulong uint32",
+    "i8": "long_long longlong int64",
+    "u8": "ulong_long ulonglong uint64",
+    "f4": "float",
+    "f8": "double",
+}
+"""Types of numbers: first as MetaImage writes them, whose LONG has four bytes, last as NRRD does."""
+
+NRRD_NAMES = {
+    "ultrasound image orientation": "UltrasoundImageOrientation",
+    "ultrasound image type": "UltrasoundImageType",
+}
+"""PLUS's fields by what it calls them in NRRD."""
+
+_SYNONYMS = {
+    "Rotation": "TransformMatrix", "Orientation": "TransformMatrix", "Position": "Offset", "Origin": "Offset",
+    "ElementByteOrderMSB": "BinaryDataByteOrderMSB",
+}  # fmt: skip
+"""Fields of MetaImage by their other names."""
+
+_START = re.compile(rb"(?:\xef\xbb\xbf)?(?:NRRD000|(?:ObjectType|NDims|Comment|ObjectSubType)\s*=)")
+_FRAME_FIELD = re.compile(r"Seq_Frame0*(\d{1,7})_(\w+)")
+_MM_PER = {
+    "": 1.0, "?": 1.0, "none": 1.0, "unknown": 1.0, "mm": 1.0, "millimeter": 1.0, "cm": 10.0,
+    "centimeter": 10.0, "m": 1e3, "meter": 1e3, "um": 1e-3, "µm": 1e-3, "micrometer": 1e-3, "micron": 1e-3,
+}  # fmt: skip
+_S_PER = {"s": 1.0, "sec": 1.0, "second": 1.0, "ms": 1e-3, "msec": 1e-3, "us": 1e-6}
+"""Units by their names, which may have an s at their end."""
 _ENCODINGS = {"ra": "raw", "gz": "deflate", "bz": "bzip2", "tx": "text", "te": "text", "as": "text"}
 """By how NRRD's words for them begin, as bzip2 or bz2."""
 _SPACE, _TIME = ("domain", "space", "", "???", "none", "?"), ("list", "time")
+"""Kinds of axes."""
 
 
 @dataclass(frozen=True)
@@ -118,15 +153,15 @@ class SequenceHeader:
         count = (*self.size, 1)[2]
         return count if self.has_images else max(count, len(self.frames))
 
-    def column(self, name: str) -> Iterator[tuple[int, str]]:
-        """Number and text of each frame that has a field of this name."""
+    def column(self, name: str) -> dict[int, str]:
+        """Text of each frame that has a field of this name, by its number."""
         rows = self.frames.items()
-        return ((i, frame[name]) for i, frame in rows if i < self.frame_count and name in frame)
+        return {i: frame[name] for i, frame in rows if i < self.frame_count and name in frame}
 
     def values(self, name: str, count: int) -> FloatArray:
         """Numbers of a field of each frame, shape (n, count); NaN where there are none that make sense."""
         values = np.full((self.frame_count, count), np.nan)
-        for i, text in self.column(name):
+        for i, text in self.column(name).items():
             with suppress(InvalidInputError):
                 values[i] = numbers(text, count, name)
         return values
@@ -173,16 +208,25 @@ class SequenceHeader:
 
 def _unpack(content: bytes, encoding: str) -> bytes:
     """Decompress the content; several gzip members are one stream."""
+    if encoding == "bzip2":
+        return bz2.decompress(content)
     plain = bytearray()
     while content:
-        stream = bz2.BZ2Decompressor() if encoding == "bzip2" else DEFLATE.decompressobj(_EITHER)
+        stream = DEFLATE.decompressobj(_EITHER)
         plain += stream.decompress(content)
         content = stream.unused_data if stream.unused_data[:2] == b"\x1f\x8b" else b""
     return bytes(plain)
 
 
+def is_image(start: bytes) -> bool:
+    """Whether a file's first bytes are those of a MetaImage or NRRD header."""
+    return _START.match(start) is not None
+
+
 def read_header(path: PathLike) -> SequenceHeader:
-    """Read the text header of a MetaImage or NRRD file.
+    """Read the text header of a MetaImage or NRRD file; axes are of image, frames and colours by their kinds.
+
+    Without kinds they are ordered as PLUS orders them.
 
     Raises
     ------
@@ -191,85 +235,180 @@ def read_header(path: PathLike) -> SequenceHeader:
     InvalidInputError
         If it is neither, the header does not make sense, or its pixels lie outside its folder.
     """
+    data = Path(path)
     with reading(path), open_regular(path) as stream, naming(str(path)):
-        start = stream.peek()
-        if not is_image(start):
+        begin = stream.peek()
+        if not is_image(begin):
             raise InvalidInputError("expected a MetaImage or NRRD header, got something else")
-        is_nrrd = start.startswith(b"NRRD")
-        return _header(Path(path), (nrrd_fields if is_nrrd else meta_fields)(stream), is_nrrd, stream.tell())
-
-
-def _header(path: Path, words: dict[str, Any], is_nrrd: bool, start: int) -> SequenceHeader:
-    """Assign axes to image, frames and colours by their kinds; without kinds, as PLUS orders them."""
-    sizes = tuple(map(int, words["sizes"]))
-    kinds = [kind.lower() for kind in words.get("kinds", ())]
-    kinds = kinds if len(kinds) == len(sizes) else [""] * len(sizes)
-    sides = [i for i, kind in enumerate(kinds) if kind in _SPACE]
-    frame_axis = next((i for i, kind in enumerate(kinds) if kind in _TIME), None)
-    colours = {*range(len(sizes))} - {*sides, frame_axis}
-    if frame_axis is None and len(sides) > 2:
-        frame_axis = sides.pop()
-    if len(sides) == 3:  # images of 3D Slicer are a pixel thick
-        thin = next((i for i in reversed(sides) if sizes[i] == 1), None)
-        sides = [i for i in sides if i != thin]
-    if len(sides) != 2 or min(sizes) < 0:
-        raise InvalidInputError(
-            "sizes: expected images on two axes and at most one of frames, not volumes in a row or segments "
-            f"in layers, got lengths {' '.join(map(str, sizes))} of kinds {' '.join(kinds)}"
+        is_nrrd = begin.startswith(b"NRRD")
+        words = (_nrrd_words if is_nrrd else _meta_words)(stream)
+        sizes = tuple(map(int, words["sizes"]))
+        kinds = [kind.lower() for kind in words.get("kinds", ())]
+        if len(kinds) != len(sizes):
+            kinds = [""] * len(sizes)
+        sides = [i for i, kind in enumerate(kinds) if kind in _SPACE]
+        frame_axis = next((i for i, kind in enumerate(kinds) if kind in _TIME), None)
+        if frame_axis is None and len(sides) > 2:
+            frame_axis = sides.pop()
+        if len(sides) == 3:  # images of 3D Slicer are a pixel thick
+            thin = [i for i in sides if sizes[i] == 1][-1:]
+            sides = [i for i in sides if i not in thin]
+        if len(sides) != 2 or min(sizes) < 0:
+            raise InvalidInputError(
+                "sizes: expected images on two axes and at most one of frames, not volumes in a row or "
+                f"segments in layers, got lengths {' '.join(map(str, sizes))} of kinds {' '.join(kinds)}"
+            )
+        size = tuple(sizes[i] for i in (*sides, frame_axis) if i is not None)
+        others = {*range(len(sizes))} - {*sides, frame_axis}
+        axes, origin = _placement(words, len(sizes))
+        spacing = None if axes is None else (*np.linalg.norm(axes, axis=1)[sides].tolist(),)
+        if spacing is not None and (not all(0 < step < math.inf for step in spacing) or spacing == (1, 1)):
+            spacing = None  # PLUS and ITK write 1 where nobody told them
+        fields, frames = _frame_fields(words)
+        if 0 not in frames and (*size, 1)[2] in frames:  # of a writer that counts from 1
+            frames = {number - 1: frame for number, frame in frames.items()}
+        if (encoding := _ENCODINGS.get(words["encoding"].lower()[:2])) is None:
+            raise InvalidInputError(f"encoding: expected raw, gzip, bzip2 or text, got {words['encoding']!r}")
+        start, skip = stream.tell(), words.get("byte skip", 0)
+        if file := words.get("data file"):
+            data, start = _data_file(data, file), 0
+        if lines := words.get("line skip", 0):
+            with open_regular(data) as pixels:
+                pixels.seek(start)
+                start += sum(len(pixels.readline()) for _ in range(lines))
+        return SequenceHeader(
+            path=str(path),
+            container="NrrdImage" if is_nrrd else "MetaImage",
+            fields=fields,
+            frames=frames,
+            size=size,
+            spacing_mm=spacing,
+            file_size=sizes,
+            frame_axis=frame_axis,
+            is_volume=len(sizes) == 3 and {*kinds} <= {"domain", "space"} and len(frames) < size[2],
+            channels=math.prod(sizes[i] for i in others if i is not None) * words.get("channels", 1),
+            axis_times_s=None if frame_axis is None else _axis_times(words, frame_axis, sizes[frame_axis]),
+            axes_mm=axes,
+            origin_mm=origin,
+            # A tracker's recording may name no type.
+            dtype=_number_type(
+                "uchar" if 0 in sizes else words["type"], words.get("endian", "").lower() == "big"
+            ),
+            data=data,
+            start=-1 if skip < 0 else start + skip,
+            encoding=encoding,
         )
-    size = tuple(sizes[i] for i in (*sides, frame_axis) if i is not None)
-    axes, origin = _placement(words, len(sizes))
-    spacing = None if axes is None else (*np.linalg.norm(axes, axis=1)[sides].tolist(),)
-    if spacing is not None and (not all(0 < step < math.inf for step in spacing) or spacing == (1.0, 1.0)):
-        spacing = None  # PLUS and ITK write 1 where nobody told them
-    fields, frames = frame_fields(words)
-    if 0 not in frames and (*size, 1)[2] in frames:  # of a writer that counts from 1
-        frames = {number - 1: frame for number, frame in frames.items()}
-    type_word = words["type"] if 0 not in sizes else "uchar"  # a tracker's may name no type
-    encoding = _ENCODINGS.get(words["encoding"].lower()[:2])
-    if encoding is None:
-        raise InvalidInputError(f"encoding: expected raw, gzip, bzip2 or text, got {words['encoding']!r}")
-    file, byte_skip = words.get("data file", ""), words.get("byte skip", 0)
-    data, start = (_data_file(path, file), 0) if file else (path, start)
-    if lines := words.get("line skip", 0):
-        with open_regular(data) as stream:
-            stream.seek(start)
-            start += sum(len(stream.readline()) for _ in range(lines))
-    return SequenceHeader(
-        str(path), "NrrdImage" if is_nrrd else "MetaImage", fields, frames, size, spacing, sizes, frame_axis,
-        len(sizes) == 3 and {*kinds} <= {"domain", "space"} and len(frames) < size[2],
-        math.prod(sizes[i] for i in colours if i is not None) * words.get("channels", 1),
-        None if frame_axis is None else _axis_times(words, frame_axis, sizes[frame_axis]), axes, origin,
-        number_type(type_word, words.get("endian", "").lower() == "big"), data,
-        -1 if byte_skip < 0 else start + byte_skip, encoding,
-    )  # fmt: skip
+
+
+def _nrrd_words(stream: BinaryIO) -> dict[str, Any]:
+    """Fields of NRRD by their names, numbers as numbers; the stream is left behind them."""
+    lines = [stream.readline().decode()]
+    for line in takewhile(str.strip, _lines(stream)):
+        name, sign, value = line.partition(":")
+        if not value.startswith("="):
+            # Fields of the format itself, unlike those of its users, may be in letters of any size.
+            name = re.sub("^(data|byte|line)(?=file|skip)", r"\1 ", name.strip().lower())
+        # Without a sign: names of files below "data file: LIST".
+        lines += [f"{NRRD_NAMES.get(name, name)}{sign}{value}"] if sign else []
+    return {"sizes": (), "type": "", "encoding": "", **nrrd.read_header(lines)}
+
+
+def _meta_words(stream: BinaryIO) -> dict[str, Any]:
+    """Fields of a MetaImage by its own and by NRRD's names; the stream is left behind them."""
+    fields = dict[str, str]()
+    for line in _lines(stream):
+        name, _, value = map(str.strip, line.partition("="))
+        fields[_SYNONYMS.get(name, name)] = value
+        if name == "ElementDataFile":
+            break
+    texts = defaultdict(str, fields)
+
+    def is_set(name: str) -> bool:
+        return texts[name][:1] in ("T", "t", "1")
+
+    file, is_text = texts["ElementDataFile"], "BinaryData" in fields and not is_set("BinaryData")
+    # Of a file that holds its pixels itself, a size is that of the header.
+    is_local, skip = file.upper() == "LOCAL", int(texts["HeaderSize"] or 0)
+    words: dict[str, Any] = {
+        "sizes": numbers(texts["DimSize"], None, "DimSize"),
+        "kinds": texts["Kinds"].split(),
+        "type": texts["ElementType"],
+        "endian": "big" if is_set("BinaryDataByteOrderMSB") else "little",
+        "encoding": "gzip" if is_set("CompressedData") else "text" if is_text else "raw",
+        "data file": "" if is_local else file,
+        "byte skip": min(skip, 0) if is_local else skip,
+        "channels": int(texts["ElementNumberOfChannels"] or 1),
+        "space units": [texts["DistanceUnits"]],
+    }
+    if steps := texts["ElementSpacing"] or texts["ElementSize"]:
+        axes = np.diag(numbers(steps, len(words["sizes"]), "ElementSpacing"))
+        if rotation := texts["TransformMatrix"]:
+            axes = axes @ np.reshape(numbers(rotation, axes.size, "TransformMatrix"), axes.shape)
+        words["space directions"] = axes
+    if place := texts["Offset"]:
+        words["space origin"] = np.array(numbers(place, None, "Offset"))
+    return fields | words
+
+
+def _frame_fields(words: Mapping[str, Any]) -> tuple[dict[str, str], dict[int, dict[str, str]]]:
+    """Texts of the file, and of frames by their numbers."""
+    fields, frames = dict[str, str](), defaultdict[int, dict[str, str]](dict)
+    for name, value in words.items():
+        if match := _FRAME_FIELD.fullmatch(name):
+            frames[int(match[1])][match[2]] = value
+        elif isinstance(value, str):
+            fields[name] = value
+    return fields, dict(frames)
+
+
+def _number_type(word: str, is_big: bool) -> np.dtype[Any]:
+    """Type of numbers by a word of either format, as ``MET_UCHAR`` or ``unsigned char``."""
+    plain = word.lower().removeprefix("met_").removesuffix("_t").replace("unsigned ", "u")
+    plain = plain.replace("signed ", "").removesuffix(" int").replace(" ", "")
+    for kind, words in NUMBER_TYPES.items():
+        if plain in words.split():
+            return np.dtype((">" if is_big else "<") + kind)
+    raise InvalidInputError(f"type: expected a type of numbers as uint8 or MET_UCHAR, got {word!r}")
+
+
+def mm_per(unit: str) -> float:
+    """Millimetres of a unit of length; what names none is in mm.
+
+    Raises
+    ------
+    InvalidInputError
+        If the unit is not known.
+    """
+    if (factor := _factor(_MM_PER, unit)) is None:
+        raise InvalidInputError(f"expected a unit as mm, cm, m or um, got {unit}")
+    return factor
+
+
+def _factor(units: Mapping[str, float], unit: str) -> float | None:
+    """Factor of a unit by its name, long ones with or without a plural's s; None if it is not among them."""
+    return units.get(unit.lower() if len(unit) < 4 else unit.lower().removesuffix("s"))
 
 
 def _placement(words: Mapping[str, Any], count: int) -> tuple[FloatArray | None, FloatArray | None]:
     """Steps along the axes and the place of the first pixel, where they are said; see `SequenceHeader`."""
-    units = words.get("units", [])
-    space_units = words.get("space units") or [unit for unit in units if s_per(unit) is None]
-    space = words.get("space", "").lower()  # as left-posterior-superior or LPS
+    units, space = words.get("units", []), words.get("space", "").lower()  # as left-posterior-superior or LPS
+    lengths = [unit for unit in units if _factor(_S_PER, unit) is None]
+    scale = mm_per("".join((words.get("space units") or lengths)[:1])) * np.ones(max(count, 3))
     is_against = [space.startswith("r"), "anterior" in space or space[1:2] == "a"]
-    scale: FloatArray = mm_per("".join(space_units[:1])) * np.ones(max(count, 3))
     scale[:2] *= np.where(is_against, -1.0, 1.0)
     axes, origin = words.get("space directions"), words.get("space origin")
     if (steps := words.get("spacings")) is not None:
-        axes = np.diag(
-            steps * np.array([mm_per(unit) if s_per(unit) is None else 1.0 for unit in units] or 1.0)
-        )
+        axes = np.diag(steps * np.array([mm_per(unit) if unit in lengths else 1.0 for unit in units] or 1.0))
     elif axes is not None:
         axes = axes * scale[: axes.shape[1]]
-    if origin is not None:
-        origin = origin * scale[: len(origin)]
-    return axes, origin
+    return axes, None if origin is None else origin * scale[: len(origin)]
 
 
 def _axis_times(words: Mapping[str, Any], axis: int, count: int) -> FloatArray | None:
     """Times of frames by the index of their axis, as 3D Slicer writes it, or by the step between them."""
-    unit_s = s_per("".join(words.get("units", ())[axis : axis + 1]))
+    unit_s = _factor(_S_PER, "".join(words.get("units", ())[axis : axis + 1]))
     index, steps = words.get(f"axis {axis} index values", "").split(), words.get("spacings")
-    if words.get(f"axis {axis} index type", "numeric") == "numeric" and index:
+    if index and words.get(f"axis {axis} index type", "numeric") == "numeric":
         times = np.array(index, dtype=float) * (unit_s or 1.0)
         return np.append(times, np.full(count, np.nan))[:count]
     step_s = 0.0 if steps is None else (unit_s or 0.0) * float(steps[axis])
@@ -278,8 +417,16 @@ def _axis_times(words: Mapping[str, Any], axis: int, count: int) -> FloatArray |
 
 def _data_file(path: Path, name: str) -> Path:
     """Path of a data file, which lies in the header's folder: a stranger's header names no other."""
-    folder, words = path.parent.resolve(), name.split()
+    folder = path.parent.resolve()
     data = (folder / name).resolve()
-    if words[0] == "LIST" or ("%" in name and len(words) > 1) or not data.is_relative_to(folder):
+    if name.startswith("LIST") or re.search(r"%.* ", name) or not data.is_relative_to(folder):
         raise InvalidInputError(f"expected pixels in one file in the header's own folder, got {name!r}")
     return data
+
+
+def _lines(stream: BinaryIO) -> Iterator[str]:
+    for line in stream:
+        try:
+            yield line.decode("utf-8-sig").rstrip("\r\n")
+        except UnicodeDecodeError:
+            yield line.decode("latin-1").rstrip("\r\n")

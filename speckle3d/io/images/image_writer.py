@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 
 from speckle3d.core.arrays import AnyArray
-from speckle3d.io.images.header_fields import NUMBER_TYPES
-from speckle3d.io.images.headers import DEFLATE, GZIP, ZLIB
+from speckle3d.io.images.headers import DEFLATE, GZIP, NUMBER_TYPES, ZLIB
 
 
 def write_image(

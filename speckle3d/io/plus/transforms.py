@@ -249,9 +249,9 @@ def _usual_pose(transforms: Sequence[str], names: Names) -> str | None:
 def _column(header: SequenceHeader, start: str, end: str) -> tuple[FloatArray, list[str]]:
     """Read one transform of every frame, either way round; the identity where it is not valid, and why."""
     key, back = (f"{_joined(pair)}Transform" for pair in ((start, end), (end, start)))
-    is_back = not any(header.column(key))
+    is_back = not header.column(key)
     key = back if is_back else key
-    matrices, statuses = header.values(key, 16).reshape(-1, 4, 4), dict(header.column(f"{key}Status"))
+    matrices, statuses = header.values(key, 16).reshape(-1, 4, 4), header.column(f"{key}Status")
     is_valid = np.isfinite(matrices[:, 0, 0]) & [statuses.get(i, "OK") == "OK" for i in range(len(matrices))]
     matrices[~is_valid] = np.eye(4)
     faults = np.where(is_valid, "", "without a valid pose").tolist()

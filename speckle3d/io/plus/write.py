@@ -21,7 +21,7 @@ from speckle3d.core.files import PathLike
 from speckle3d.core.progress import Progress
 from speckle3d.core.sweep import OrientationSensor, RFSettings, Sweep, Tracker, stored_dtype
 from speckle3d.io.hdf5 import atomic_path, require_suffix
-from speckle3d.io.images.header_fields import NRRD_NAMES
+from speckle3d.io.images.headers import NRRD_NAMES
 from speckle3d.io.images.image_writer import write_image
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.plus.transforms import IMAGE, ORIENTATION, image_matrix

@@ -17,8 +17,7 @@ from speckle3d.core.files import PathLike
 from speckle3d.core.geometry import transforms_from_matrices
 from speckle3d.core.volume import LABEL_TYPES, VOXEL_TYPES, LabelMap, Volume
 from speckle3d.io.hdf5 import reading
-from speckle3d.io.images.header_fields import is_image, mm_per
-from speckle3d.io.images.headers import read_header
+from speckle3d.io.images.headers import is_image, mm_per, read_header
 from speckle3d.io.readers import first_bytes
 from speckle3d.io.text import unescape
 from speckle3d.io.voxels.segments import is_segmentation, read_segments
