@@ -55,13 +55,12 @@ class PickedPoints:
 
     def require_inside(self, shape: tuple[int, ...]) -> None:
         """Raise `MismatchError` unless all points lie in the frames of images of `shape` (n, column, row)."""
-        count, columns, rows = shape
         places = np.column_stack([self.frame, self.pixels])
         outside = ((places < [0, -0.5, -0.5]) | (places > np.array(shape) - [1, 0.5, 0.5])).any(axis=1)
         for frame, column, row in places[outside]:
             raise MismatchError(
-                f"expected points within {count} frames of {columns} columns and {rows} rows, got column "
-                f"{column:g}, row {row:g} in frame {frame:g}"
+                f"expected points within shape (frame, column, row) {shape}, got column {column:g}, "
+                f"row {row:g} in frame {frame:g}"
             )
 
 
@@ -86,18 +85,15 @@ def read_points(path: PathLike, wire_names: Sequence[str] = ()) -> PickedPoints:
         rows.append([numbers(cell[name], 1, f"{where}: {name}")[0] for name in _COLUMNS])
         if rows[-1][0] < 0 or rows[-1][0] % 1:
             raise InvalidInputError(f"{where}: frame: expected a whole number from 0, got {cell['frame']}")
-        word = cell.get(_WIRE)
-        if word is not None and word not in wire_of:
-            names = ", ".join(wire_names) or "no wire"
-            raise InvalidInputError(f"{where}: wire: expected {names} or its number, got {word!r}")
-        wires += [] if word is None else [wire_of[word]]
-    if not rows:
-        raise InvalidInputError(f"{path}: expected points below the heading, got none")
-    places, wire = np.array(rows), np.array(wires) if wires else None
-    points = PickedPoints(places[:, 0].astype(int), places[:, 1:], wire)
-    if wire is not None and len(np.unique([points.frame, wire], axis=1).T) < len(points):
-        raise InvalidInputError(f"{path}: expected a wire once in a frame, got one again")
-    return points
+        if (word := cell.get(_WIRE)) is not None:
+            if word not in wire_of:
+                names = ", ".join(wire_names) or "no wire"
+                raise InvalidInputError(f"{where}: wire: expected {names} or its number, got {word!r}")
+            wires.append(wire_of[word])
+    if not rows or len({*zip(np.array(rows)[:, 0], wires, strict=False)}) < len(wires):
+        raise InvalidInputError(f"{path}: expected points below the heading, a wire once in a frame")
+    places = np.array(rows)
+    return PickedPoints(places[:, 0].astype(int), places[:, 1:], np.array(wires) if wires else None)
 
 
 def write_points(path: PathLike, points: PickedPoints, wire_names: Sequence[str] = ()) -> None:

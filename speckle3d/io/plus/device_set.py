@@ -12,7 +12,7 @@ References
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from functools import cached_property, reduce
+from functools import cached_property, partial, reduce
 from pathlib import Path
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
@@ -59,9 +59,7 @@ def read_xml(path: PathLike) -> Element:
 
 def vector(element: Element, attribute: str, count: int) -> tuple[float, ...]:
     """Read an attribute of `count` numbers."""
-    label = element.get("Name") or element.get("From") or ""
-    where = f"{element.tag}{f' {label}' if label else ''}: {attribute}"
-    return numbers(element.get(attribute, ""), count, where)
+    return numbers(element.get(attribute, ""), count, f"{element.tag}: {attribute}")
 
 
 @dataclass(frozen=True)
@@ -78,13 +76,13 @@ class DeviceSet:
     root: Element = field(default_factory=lambda: Element("PlusConfiguration"))
 
     def numbers(self, tag: str, count: int, *names: str) -> tuple[float, ...] | None:
-        """Numbers of the first of some attributes that the first element of a tag has."""
-        element = self.root.find(f".//{tag}")
-        name = None if element is None else next((name for name in names if name in element.attrib), None)
-        if element is None or name is None:
-            return None
-        with naming(self.path):
-            return vector(element, name, count)
+        """Numbers of the first of some attributes that an element of a tag has."""
+        for element in self.root.iterfind(f".//{tag}"):
+            for name in names:
+                if name in element.attrib:
+                    with naming(self.path):
+                        return vector(element, name, count)
+        return None
 
     def text(self, name: str, default: str = "") -> str:
         """An attribute that all elements with it share; the default where none has it, or they differ."""
@@ -129,26 +127,20 @@ class DeviceSet:
         return sum(values, ()) if all(values) else None
 
     def clip_region(self, grid: ImageGrid) -> str | None:
-        """Clip and fan of a volume reconstruction as a region of images in mm; None where it is all of them.
+        """Clip and fan of a volume reconstruction as a region of images in mm; None where there is neither.
 
         Names without a unit are those of older versions [1]_.
         """
-
-        def numbers(count: int, *names: str) -> tuple[float, ...] | None:
-            return self.numbers("VolumeReconstruction", count, *names)
-
-        outlines = list[FloatArray]()
-        corner, size = numbers(2, "ClipRectangleOrigin"), numbers(2, "ClipRectangleSize")
-        if corner is not None and size is not None and min(size) > 0:
+        region, outlines = partial(self.numbers, "VolumeReconstruction"), list[FloatArray]()
+        corner, size = region(2, "ClipRectangleOrigin"), region(2, "ClipRectangleSize")
+        if corner and size and min(size) > 0:
             # PLUS counts the pixel behind the rectangle, too (vtkIGSIOPasteSliceIntoVolume).
-            (left, top), (right, bottom) = corner, np.add(corner, size)
-            if max(left, top, grid.vectors - 1 - right, grid.samples - 1 - bottom) > 0:
-                corners = np.array([(left, top), (right, top), (right, bottom), (left, bottom)])
-                outlines.append(corners + _HAIR * np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]))
-        angles, apex = numbers(2, "FanAnglesDeg", "FanAngles"), numbers(2, "FanOriginPixel", "FanOrigin")
-        outer = numbers(1, "FanRadiusStopPixel", "FanDepth")
+            (left, top), (right, bottom) = np.subtract(corner, _HAIR), np.add(corner, size) + _HAIR
+            outlines.append(np.array([(left, top), (right, top), (right, bottom), (left, bottom)]))
+        angles, apex = region(2, "FanAnglesDeg", "FanAngles"), region(2, "FanOriginPixel", "FanOrigin")
+        outer = region(1, "FanRadiusStopPixel", "FanDepth")
         if angles and apex and outer and angles[0] != angles[1]:
-            inner = numbers(1, "FanRadiusStartPixel", "FanRadiusStart") or (0.0,)
+            inner = region(1, "FanRadiusStartPixel", "FanRadiusStart") or (0.0,)
             turns = np.deg2rad(np.linspace(min(angles), max(angles), _ARC_POINTS))
             arc = np.column_stack([np.sin(turns), np.cos(turns)])
             outline = np.concatenate([outer * arc, inner * arc[::-1]])
@@ -206,8 +198,7 @@ def _open(path: Path, _: ImportSettings) -> Facts:
         yield "time offset of the tracker", f"{-vector(root, 'TrackerLagSec', 1)[0]:+.4f}", "s"
     if use == _CONFIG:
         transducer = f"{device.text('TransducerName')} {device.geometry}"
-        for a, b in device.transforms:
-            yield f"{a} to {b}", "transform", ""
+        yield "transforms", ", ".join(f"{a}To{b}" for a, b in device.transforms) or "none", ""
         yield "pixel", "unknown" if pixel is None else " x ".join(f"{mm:.5f} mm" for mm in pixel), ""
         yield "transducer", transducer.strip() or "not said", ""
         if root.find(".//PhantomDefinition/Geometry/Pattern/Wire") is not None:

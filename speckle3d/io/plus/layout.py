@@ -74,12 +74,11 @@ class Layout:
         ------
         InvalidInputError
         """
-        path, size, dtype = header.path, header.size, header.dtype.newbyteorder("=")
-        colours = f"colour, {header.channels} numbers a pixel" if header.channels > 1 else ""
-        if colours or self.kind not in (*RF_TYPES, "BRIGHTNESS"):
+        path, dtype = header.path, header.dtype.newbyteorder("=")
+        if header.channels > 1 or self.kind not in (*RF_TYPES, "BRIGHTNESS"):
             raise InvalidInputError(
-                f"{path}: expected grey B-mode or RF images, got {colours or f'type {self.kind}'}: "
-                "export them as grey"
+                f"{path}: expected grey B-mode or RF, no colour, got {self.kind} of {header.channels} "
+                "number(s) a pixel: export them as grey"
             )
         if self.kind == "BRIGHTNESS" and dtype != np.uint8:
             raise InvalidInputError(f"{path}: expected B-mode of type uint8, got {dtype}")
@@ -87,16 +86,14 @@ class Layout:
             raise InvalidInputError(
                 f"{path}: UltrasoundImageOrientation: expected as MF, FM or MFA, got {self.orientation}"
             )
-        # Lines count the second of (x, y) where they lie in rows.
-        if self.is_complex and size[self.has_lines_in_rows ^ self._pair_axis] % 2:
-            raise InvalidInputError(f"{path}: expected I and Q in pairs, got images of size {size}")
 
     def frame(self, pixels: AnyArray) -> AnyArray:
         """Turn pixels, shape (y, x), into samples, shape (vector, sample): marked and far sides last."""
         lines = pixels if self.has_lines_in_rows else pixels.T
         if self.is_complex:
-            pairs = np.moveaxis(lines, self._pair_axis, 0)
-            lines = np.moveaxis(pairs[0::2] + np.complex64(1j) * pairs[1::2], 0, self._pair_axis)
+            axis = int(self.kind == "RF_IQ_LINE")  # of (line, number), along which I and Q alternate
+            pairs = np.moveaxis(lines, axis, 0)
+            lines = np.moveaxis(pairs[0::2] + np.complex64(1j) * pairs[1::2], 0, axis)
         lines = lines[:, ::-1] if "N" in self.orientation[:2] else lines
         return lines[::-1] if "U" in self.orientation[:2] else lines
 
@@ -104,8 +101,3 @@ class Layout:
         """Vectors and samples of an image of a size (x, y)."""
         vectors, samples = self.frame(np.broadcast_to(np.int8(0), size[1::-1])).shape
         return vectors, samples
-
-    @property
-    def _pair_axis(self) -> int:
-        """Axis of (line, number) along which I and Q alternate."""
-        return int(self.kind == RF_TYPES[1])

@@ -13,7 +13,7 @@ from typing import TypeAlias
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from speckle3d.core.arrays import FloatArray
+from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.geometry import nearest_rotation
 from speckle3d.io.images.headers import SequenceHeader
@@ -108,13 +108,22 @@ def tracked_poses(
         wanted = " and ".join(filter(None, (name, reference)))
         listing = ", ".join(transforms) or "none"
         raise InvalidInputError(f"{header.path}: expected a chain of transforms for {wanted}, got {listing}")
-    matrices, faults = np.eye(4), [""] * header.frame_count
+    matrices, is_valid = np.eye(4), np.ones(header.frame_count, dtype=bool)
     for pair in chain:
-        step, reasons = _column(header, *pair)
-        matrices, faults = step @ matrices, [a or b for a, b in zip(faults, reasons, strict=True)]
+        step, is_step_valid = _column(header, *pair)
+        matrices, is_valid = step @ matrices, is_valid & is_step_valid
     pixels = None
-    if tool == names.image:
-        matrices, pixels = _image_poses(matrices, faults, f"{header.path}: {name}Transform")
+    if tool == names.image and is_valid.any():
+        where = f"{header.path}: {name}Transform"
+        widths = np.linalg.norm(matrices[:, :3, 0], axis=1)[is_valid]
+        usual = matrices[is_valid][np.argsort(widths)[widths.size // 2]]
+        _, skew_rad = sensor_from_image(usual, 0.0, where)  # refuses what is no calibration
+        pixels = image_matrix(RigidTransform.identity(), *pixel_axes(usual, where), 0.0, skew_rad)
+        for pose in (matrices, pixels):  # a third column may be anything
+            pose[..., :3, 2] = np.cross(pose[..., :3, 0], pose[..., :3, 1])
+        # Where a frame's pixels are others, its pose is not rigid.
+        matrices = matrices @ np.linalg.inv(pixels)
+    faults = np.where(is_valid, "", "without a valid pose").tolist()
     return Poses(tool, tuple(map(_joined, chain)), matrices, faults, pixels)
 
 
@@ -141,8 +150,8 @@ def fixed_transform(header: SequenceHeader, name: str) -> FloatArray | None:
     key = f"{name}Transform"
     if key in header.fields:
         return np.reshape(numbers(header.fields[key], 16, f"{header.path}: {key}"), (4, 4))
-    matrices, faults = _column(header, *ends(name))
-    matrices = matrices[[not fault for fault in faults]]
+    matrices, is_valid = _column(header, *ends(name))
+    matrices = matrices[is_valid]
     if not np.allclose(matrices, matrices[:1], _FIXED_TOLERANCE, _FIXED_TOLERANCE):
         raise InvalidInputError(f"{header.path}: {key}: expected one for all frames, got others")
     return next(iter(matrices), None)
@@ -182,12 +191,11 @@ def sensor_from_image(
     if abs(cosine) > SKEW_TOLERANCE:
         raise InvalidInputError(f"{where}: expected square axes, got cosine {cosine:.3f}")
     # PLUS writes z = x cross y as the third column (vtkPlusProbeCalibrationAlgo); zeros say nothing.
-    volume = float(np.linalg.det(matrix[:3, :3]))
-    if volume < 0:
+    if np.linalg.det(matrix[:3, :3]) < 0:
         raise InvalidInputError(
             f"{where}: expected right-handed axes (x to the marked side, y away from the probe, z = x cross "
-            f"y), got mirrored ones (determinant {volume:.3g}): an axis has the wrong sign, or images were "
-            "flipped before they were calibrated; if the third column was never measured, make it zeros"
+            "y), got mirrored ones: an axis has the wrong sign, or images were flipped before they were "
+            "calibrated; if the third column was never measured, make it zeros"
         )
     rotation = nearest_rotation(axes)
     place = matrix[:3, 3] - rotation[:, 1] * first_sample_depth_mm
@@ -246,38 +254,12 @@ def _usual_pose(transforms: Sequence[str], names: Names) -> str | None:
     return None
 
 
-def _column(header: SequenceHeader, start: str, end: str) -> tuple[FloatArray, list[str]]:
-    """Read one transform of every frame, either way round; the identity where it is not valid, and why."""
-    key, back = (f"{_joined(pair)}Transform" for pair in ((start, end), (end, start)))
-    is_back = not header.column(key)
-    key = back if is_back else key
-    matrices, statuses = header.values(key, 16).reshape(-1, 4, 4), header.column(f"{key}Status")
+def _column(header: SequenceHeader, start: str, end: str) -> tuple[FloatArray, BoolArray]:
+    """Read one transform of every frame, either way round; the identity where it is not valid, and where."""
+    keys = [f"{_joined(pair)}Transform" for pair in ((start, end), (end, start))]
+    is_back = not header.column(keys[0])
+    matrices = header.values(keys[is_back], 16).reshape(-1, 4, 4)
+    statuses = header.column(f"{keys[is_back]}Status")
     is_valid = np.isfinite(matrices[:, 0, 0]) & [statuses.get(i, "OK") == "OK" for i in range(len(matrices))]
     matrices[~is_valid] = np.eye(4)
-    faults = np.where(is_valid, "", "without a valid pose").tolist()
-    return np.asarray(np.linalg.pinv(matrices)) if is_back else matrices, faults
-
-
-def _image_poses(
-    matrices: FloatArray, faults: Sequence[str], where: str
-) -> tuple[FloatArray, FloatArray | None]:
-    """Split transforms of pixels to mm into poses of the image and one matrix of pixels, of median size.
-
-    Where a frame's pixels are others, its pose is not rigid.
-    """
-    valid = np.flatnonzero([not fault for fault in faults])
-    if not valid.size:
-        return matrices, None
-    widths = np.linalg.norm(matrices[valid, :3, 0], axis=1)
-    usual = matrices[valid[np.argsort(widths)[widths.size // 2]]]
-    _, skew_rad = sensor_from_image(usual, 0.0, where)  # refuses what is no calibration
-    pixels = image_matrix(RigidTransform.identity(), *pixel_axes(usual, where), 0.0, skew_rad)
-    return _in_space(matrices) @ np.linalg.inv(_in_space(pixels)), pixels
-
-
-def _in_space(matrices: FloatArray) -> FloatArray:
-    """Transforms of pixels whose third column, which may be anything, is across the other two."""
-    across = np.cross(matrices[..., :3, 0], matrices[..., :3, 1])
-    result = matrices.copy()
-    result[..., :3, 2] = across
-    return result
+    return np.asarray(np.linalg.pinv(matrices)) if is_back else matrices, is_valid

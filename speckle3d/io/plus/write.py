@@ -19,7 +19,7 @@ from speckle3d.core.arrays import AnyArray, BoolArray, FloatArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.files import PathLike
 from speckle3d.core.progress import Progress
-from speckle3d.core.sweep import OrientationSensor, RFSettings, Sweep, Tracker, stored_dtype
+from speckle3d.core.sweep import RFSettings, Sweep, stored_dtype
 from speckle3d.io.hdf5 import atomic_path, require_suffix
 from speckle3d.io.images.headers import NRRD_NAMES
 from speckle3d.io.images.image_writer import write_image
@@ -54,12 +54,9 @@ def own_values(path: str, fields: Mapping[str, str]) -> dict[str, Any]:
     """
     values: dict[str, Any] = {}
     for name in (*ImportSettings.model_fields, "full_scale"):
-        text = fields.get(_PREFIX + name)
-        if text is None or name == "probe":
-            values |= {} if text is None else {name: text}
-            continue
-        parts = numbers(text, None, f"{path}: {_PREFIX}{name}")
-        values[name] = parts if len(parts) > 1 else parts[0]
+        if (text := fields.get(_PREFIX + name)) is not None:
+            parts = () if name == "probe" else numbers(text, None, f"{path}: {_PREFIX}{name}")
+            values[name] = text if name == "probe" else parts if len(parts) > 1 else parts[0]
     return values
 
 
@@ -182,26 +179,23 @@ def _add_sensors(fields: dict[str, str], sweep: Sweep) -> Iterator[str]:
     """Give each frame the sensors' poses, and tell what a sequence does not hold of the sweep."""
     times, grid, count = sweep.frame_time_s, sweep.grid, len(sweep)
     fields |= {f"Seq_Frame{i:04d}_ImageStatus": "OK" for i in range(count)}
-    sizes = grid.vector_pitch_mm, grid.sample_spacing_mm, grid.first_sample_depth_mm
-    sensors: tuple[tuple[Tracker | OrientationSensor | None, str, str], ...] = (
-        (sweep.tracker, "Probe", "Tracker"), (sweep.orientation, ORIENTATION, "World")
-    )  # fmt: skip
-    for sensor, tool, world in sensors:
-        if sensor is None:
+    for name, tool, world in (("tracker", "Probe", "Tracker"), ("orientation", ORIENTATION, "World")):
+        if (sensor := getattr(sweep, name)) is None:
             continue
         at = times - sensor.time_offset_s
         reach, matrices = sensor.readings.covers(at), np.tile(np.eye(4), (count, 1, 1))
         if reach.any():
             matrices[reach] = _rigid(sensor.readings.at(at[reach])).as_matrix()
         _add(fields, f"{tool}To{world}", matrices, reach)
-        if sensor is sweep.orientation or not np.array_equal(sensor.readings.time_s, at[reach]):
+        if name == "orientation" or not np.array_equal(sensor.readings.time_s, at[reach]):
             yield (
                 f"the {sensor.label}'s {len(sensor.readings)} readings with all that it measured: "
                 f"{np.count_nonzero(reach)} interpolated ones are at the times of {count} frames"
             )
         if (mounting := sensor.sensor_from_image) is not None:
-            skew_rad = sensor.image_skew_rad if isinstance(sensor, Tracker) else 0.0
             first = RigidTransform.from_translation([grid.first_vector_mm, 0.0, 0.0])
+            sizes = grid.vector_pitch_mm, grid.sample_spacing_mm, grid.first_sample_depth_mm
+            skew_rad = getattr(sensor, "image_skew_rad", 0.0)
             pixels = image_matrix(_rigid(mounting) * first, *sizes, skew_rad)
             _add(fields, f"{IMAGE}To{tool}", np.tile(pixels, (count, 1, 1)))
     if sweep.truth is not None:

@@ -8,6 +8,7 @@ References
 from __future__ import annotations
 
 import re
+from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 from speckle3d.core.errors import InvalidInputError
@@ -44,8 +45,8 @@ def segment_fields(segments: Iterable[Segment], shape: Sequence[int]) -> dict[st
     return fields
 
 
-def is_segmentation(fields: Mapping[str, str]) -> bool:
-    """Whether a header tells of segments."""
+def is_segmentation(fields: Iterable[str]) -> bool:
+    """Whether names of a header's fields tell of segments."""
     return any(name.startswith("Segmentation_") or _FIELD.fullmatch(name) for name in fields)
 
 
@@ -57,17 +58,17 @@ def read_segments(fields: Mapping[str, str], where: str) -> Iterator[Segment]:
     InvalidInputError
         Naming the field that does not make sense, or of a file whose segments overlap.
     """
-    rows: dict[int, dict[str, str]] = {}
+    rows = defaultdict[int, dict[str, str]](dict)
     for name, value in fields.items():
         if match := _FIELD.fullmatch(name):
-            rows.setdefault(int(match[1]), {})[match[2]] = unescape(value)
+            rows[int(match[1])][match[2]] = unescape(value)
     for i, row in sorted(rows.items()):
         place = f"{where}: Segment{i}"
-        if row.get("Layer", "0") != "0":
-            raise InvalidInputError(f"{place}_Layer: expected segments in layer 0, got {row['Layer']!r}")
         (label,) = numbers(row.get("LabelValue", "1"), 1, f"{place}_LabelValue")
         red, green, blue = numbers(row.get("Color", _UNNAMED_COLOUR), 3, f"{place}_Color")
-        if label != int(label):
-            raise InvalidInputError(f"{place}_LabelValue: expected a whole number, got {label}")
+        if label % 1 or row.get("Layer", "0") != "0":
+            raise InvalidInputError(
+                f"{place}: expected a whole LabelValue in Layer 0, got {label} in another"
+            )
         name = row.get("Name") or row.get("ID") or f"Segment {i}"
         yield Segment(int(label), name, (red, green, blue))

@@ -40,8 +40,6 @@ RAS_FROM_LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
 """World of NIfTI from that of the other formats."""
 LABELS, COMMENT = "label", "speckle3d"
 """NIfTI's intent of an image of labels, and the name of fields in its comment."""
-_LONGEST = 2**15
-"""Voxels along an axis that NIfTI-1 does not count."""
 
 
 def write_volume(path: PathLike, volume: Volume, compress: bool = True) -> None:
@@ -82,8 +80,8 @@ def write_volume(path: PathLike, volume: Volume, compress: bool = True) -> None:
         if ".nii" in suffix:
             _write_nifti(part, volume, {**volume.fields, **plain}, is_labels)
             return
-        fields = {f"{PREFIX}{name}": value for name, value in volume.fields.items()} | plain
-        fields = {name: _escape(value) for name, value in fields.items()}
+        named = {f"{PREFIX}{name}": value for name, value in volume.fields.items()} | plain
+        fields = {name: _escape(value) for name, value in named.items()}
         axes = (_meta_axes if suffix == ".mha" else _nrrd_axes)(volume)
         write_image(part, volume.voxels.T, volume.shape, volume.voxels.dtype, axes, fields, compress)
 
@@ -141,19 +139,18 @@ class VolumeWriter:
         compress: bool = True,
         segments: Sequence[Segment] | None = None,
     ) -> None:
-        self._path, self._compress, self._planes = path, compress, 0
+        self._path, self._compress = path, compress
         place = np.zeros(shape, dtype, order="F"), spacing_mm, world_from_grid, dict(fields or {})
         self._volume = Volume(*place) if segments is None else LabelMap(*place, tuple(segments))
+        self._rest = self._volume.voxels.T
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if kind is None:
-            if self._planes != self._volume.shape[2]:
-                raise MismatchError(
-                    f"{self._path}: expected {self._volume.shape[2]} planes, got {self._planes}"
-                )
+            if len(self._rest):
+                raise MismatchError(f"{self._path}: expected {len(self._rest)} more planes")
             write_volume(self._path, self._volume, self._compress)
 
     def append(self, planes: AnyArray) -> None:
@@ -164,18 +161,16 @@ class VolumeWriter:
         MismatchError
             If they are of another shape or type, or more than are left.
         """
-        target = self._volume.voxels.T[self._planes :][: len(planes)]
-        if planes.shape != target.shape or planes.dtype != target.dtype:
+        target = self._rest[: len(planes)]
+        if (planes.shape, planes.dtype) != (target.shape, target.dtype):
             expected = f"planes of shape {target.shape}, {target.dtype}"
             raise MismatchError(f"{self._path}: expected {expected}, got {planes.shape}, {planes.dtype}")
         target[:] = planes
-        self._planes += len(planes)
+        self._rest = self._rest[len(planes) :]
 
 
 def _write_nifti(path: Path, volume: Volume, fields: Mapping[str, str], is_labels: bool) -> None:
-    """Write NIfTI-1, or NIfTI-2 where an axis is too long for NIfTI-1."""
-    kind: Any = nibabel.Nifti2Image if max(volume.shape) >= _LONGEST else nibabel.Nifti1Image
-    image = kind(volume.voxels, RAS_FROM_LPS @ volume.world_from_index)
+    image: Any = nibabel.Nifti1Image(volume.voxels, RAS_FROM_LPS @ volume.world_from_index)
     image.set_qform(image.affine, 1)
     image.set_sform(image.affine, 1)
     image.header.set_xyzt_units("mm")

@@ -80,22 +80,12 @@ def read_volume(path: PathLike) -> Volume:
     start = first_bytes(path)
     if _is_nifti(Path(path), start):
         voxels, matrix, fields, is_labels = _read_nifti(Path(path))
-        remarks = {name: text for name, text in fields.items() if not is_segmentation({name: text})}
+        remarks = {name: text for name, text in fields.items() if not is_segmentation([name])}
     elif is_image(start):
-        header = read_header(path)
-        fields, is_labels = header.fields, is_segmentation(header.fields)
-        texts = {name.removeprefix(PREFIX): text for name, text in fields.items() if name.startswith(PREFIX)}
-        remarks = {name: unescape(text) for name, text in texts.items()}
-        axes = np.eye(3) if header.axes_mm is None else header.axes_mm
-        origin = np.zeros(3) if header.origin_mm is None else header.origin_mm
-        if header.channels > 1 or len(header.size) != 3 or axes.shape != (3, 3) or origin.size != 3:
-            raise InvalidInputError(
-                f"{path}: expected a grey image of three axes in space, got axes {header.file_size}, "
-                f"{header.channels} number(s) a pixel, origin of {origin.size} numbers"
-            )
-        # The first axis runs fastest in a file; a mapped file may be replaced while voxels are used.
-        voxels, matrix = np.array(header.numbers()).reshape(header.size[::-1]).T, np.eye(4)
-        matrix[:3, :3], matrix[:3, 3] = axes.T, origin
+        voxels, matrix, fields = _read_image(path)
+        is_labels = is_segmentation(fields)
+        own = {name: text for name, text in fields.items() if name.startswith(PREFIX)}
+        remarks = {name.removeprefix(PREFIX): unescape(text) for name, text in own.items()}
     else:
         raise InvalidInputError(
             f"{path}: expected NRRD, MetaImage or NIfTI (.nii.gz, .nii, .hdr), got something else"
@@ -151,8 +141,8 @@ def _right_handed(
     voxels: AnyArray, world_from_index: FloatArray
 ) -> tuple[AnyArray, tuple[float, float, float], RigidTransform]:
     """Voxels of a right-handed grid, its spacing and its pose."""
-    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # what is not finite is refused
-        matrix = np.array(world_from_index, dtype=float)
+    matrix = np.array(world_from_index, dtype=float)
+    with np.errstate(all="ignore"):  # what is not finite is refused
         spacing = np.linalg.norm(matrix[:3, :3], axis=0)
         if np.linalg.det(matrix[:3, :3]) < 0:
             matrix[:3, 3] += matrix[:3, 2] * (voxels.shape[2] - 1)
@@ -179,27 +169,27 @@ def _is_nifti(path: Path, start: bytes) -> bool:
     return start[:4] in _SIZES or (start.startswith(b"\x1f\x8b") and path.name.lower().endswith(".nii.gz"))
 
 
+def _read_image(path: PathLike) -> tuple[AnyArray, FloatArray, dict[str, str]]:
+    """Voxels of a MetaImage or NRRD image, their LPS world from index in mm, and the header's fields."""
+    header, matrix = read_header(path), np.eye(4)
+    axes = np.eye(3) if header.axes_mm is None else header.axes_mm
+    origin = np.zeros(3) if header.origin_mm is None else header.origin_mm
+    if header.channels > 1 or len(header.size) != 3 or axes.shape != (3, 3) or origin.size != 3:
+        raise InvalidInputError(
+            f"{path}: expected a grey image of three axes in space, got axes {header.file_size}, "
+            f"{header.channels} number(s) a pixel, origin of {origin.size} numbers"
+        )
+    matrix[:3, :3], matrix[:3, 3] = axes.T, origin
+    # The first axis runs fastest in a file; a mapped file may be replaced while voxels are used.
+    return np.array(header.numbers()).reshape(header.size[::-1]).T, matrix, header.fields
+
+
 def _read_nifti(path: Path) -> tuple[AnyArray, FloatArray, dict[str, str], bool]:
-    """Read an image of NIfTI-1 or NIfTI-2, of one file or two.
+    """Voxels of NIfTI-1 or NIfTI-2, their LPS world from index in mm, this package's fields, if labels.
 
-    Returns
-    -------
-    voxels : ndarray
-    world_from_index : ndarray, shape (4, 4)
-        LPS, mm, by the header's unit; a header without one means mm.
-    fields : dict of str to str
-        Of this package's own comment.
-    is_labels : bool
-
-    Raises
-    ------
-    FileError
-        In nibabel's words, if it is truncated or damaged.
+    The header's unit counts; a header without one means mm.
     """
-    with (
-        naming(str(path)),
-        reading(path),
-    ):  # a damaged file shows in whatever nibabel happens to stumble over
+    with naming(str(path)), reading(path):
         image: Any = nibabel.load(path)
         voxels = np.asanyarray(image.dataobj)
         factor = mm_per(image.header.get_xyzt_units()[0])
