@@ -14,9 +14,9 @@ from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
 from speckle3d.core.geometry import require_finite
 from speckle3d.core.grid import ImageGrid
-from speckle3d.core.shown import shown
 from speckle3d.core.streams import TimedPoses, TimedRotations
 from speckle3d.core.sweep import Frames
+from speckle3d.core.text import shown
 
 SOME_FRAMES = 100
 """Frames that choose among starting points; the answer is refined from all."""

@@ -18,7 +18,7 @@ from calibration.solution import Solution
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.calibration import Calibration, FramesUsed, Parameter
 from speckle3d.core.geometry import roll_yaw_tilt, skew
-from speckle3d.core.tables import text_rows
+from speckle3d.core.text import text_rows
 
 USED_COLOUR, DROPPED_COLOUR = "#0072B2", "#D55E00"
 """Colours of Okabe and Ito's palette, distinguishable with any colour vision."""

@@ -20,7 +20,7 @@ from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.geometry import skew
 from speckle3d.core.leastsquares import condition_number, robust_sigma
-from speckle3d.core.shown import shown
+from speckle3d.core.text import shown
 
 if TYPE_CHECKING:
     from calibration.plane import Chain, Phantom

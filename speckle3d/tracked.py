@@ -10,13 +10,12 @@ from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.curves import DecorrelationCurves
-from speckle3d.core.doubts import Doubt
+from speckle3d.core.errors import Doubt
 from speckle3d.core.grid import ImageGrid
-from speckle3d.core.pose_table import plot_poses, pose_table
+from speckle3d.core.poses import RelativePoses, plot_poses, pose_table
 from speckle3d.core.reconstruction import SharedErrors
-from speckle3d.core.relative import RelativePoses
-from speckle3d.core.shown import shown
 from speckle3d.core.sweep import Sweep
+from speckle3d.core.text import shown
 from speckle3d.motion.attenuation import Attenuation
 from speckle3d.motion.coherence import Coherence
 

@@ -32,7 +32,7 @@ from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.leastsquares import condition_number
 from speckle3d.core.progress import Progress
-from speckle3d.core.shown import shown
+from speckle3d.core.text import shown
 
 FINE = (Level(1.0, images=8), Level(0.7, images=24, overlap=0.25))
 """Resolutions at which the search's answer is refined. The last is still coarser than speckle; there many

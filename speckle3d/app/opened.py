@@ -21,7 +21,7 @@ from xsens.logs.read import read_log
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
-    from speckle3d.core.doubts import Doubt
+    from speckle3d.core.errors import Doubt
     from speckle3d.core.reconstruction import Reconstruction
     from speckle3d.core.sweep import Sweep
     from xsens.logs.samples import ImuLog

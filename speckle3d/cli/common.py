@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from speckle3d.core.errors import FileError, InvalidInputError
-from speckle3d.core.printable import printable
+from speckle3d.core.text import printable
 
 if TYPE_CHECKING:
     from calibration.beam import BeamBias
@@ -136,7 +136,7 @@ def status_line() -> Iterator[Callable[[str], None]]:
 
 def rows_of(rows: Sequence[tuple[str, Any, str]]) -> Result:
     """Rows of description, value and unit, for JSON and aligned."""
-    from speckle3d.core.tables import text_rows
+    from speckle3d.core.text import text_rows
 
     return [{"description": d, "value": v, "unit": u} for d, v, u in rows], text_rows(rows)
 
@@ -180,12 +180,18 @@ def clip_of(config: str | None, grid: ImageGrid, skew_rad: float) -> str | None:
 
 def mount(sweep: Sweep, paths: Sequence[Path]) -> Sweep:
     """Put calibration files on a sweep's sensors, and report on stderr where they contradict the sweep."""
-    from speckle3d.core.calibration import mounting_difference
+    import numpy as np
+
+    from speckle3d.examine.sensors import rigid
     from speckle3d.io.calibrations import apply_calibrations, read_calibration
 
     for path in paths:
         calibration = read_calibration(path)
-        angle_deg, shift_mm = mounting_difference(sweep, calibration)
+        mounting = getattr(getattr(sweep, calibration.sensor), "sensor_from_image", None)
+        if mounting is None:
+            continue
+        step = rigid(mounting).inv() * rigid(calibration.mounting)
+        angle_deg, shift_mm = np.rad2deg(step.rotation.magnitude()), np.linalg.norm(step.translation)
         if angle_deg > NOTED_DEG or shift_mm > NOTED_MM:
             shift = f" and {shift_mm:.0f} mm" if calibration.sensor == "tracker" else ""
             note(

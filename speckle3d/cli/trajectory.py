@@ -90,7 +90,7 @@ def score(
 
 def _table(scores: dict[str, Any]) -> str:
     from speckle3d.config import unit_of
-    from speckle3d.core.tables import text_rows
+    from speckle3d.core.text import text_rows
     from speckle3d.scoring.displacements import MEANINGS
 
     rows = [(name, str(scores[name]), "") for name in ("estimate", "poses")]

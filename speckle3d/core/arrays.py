@@ -5,16 +5,19 @@ Written out, since files are read by them: NumPy 2.5 hides the element within `n
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
-FloatArray = np.ndarray[tuple[Any, ...], np.dtype[np.float64]]
-Float32Array = np.ndarray[tuple[Any, ...], np.dtype[np.float32]]
-Float16Array = np.ndarray[tuple[Any, ...], np.dtype[np.float16]]
-IntArray = np.ndarray[tuple[Any, ...], np.dtype[np.int64]]
-BoolArray = np.ndarray[tuple[Any, ...], np.dtype[np.bool_]]
-ByteArray = np.ndarray[tuple[Any, ...], np.dtype[np.uint8]]
-ComplexArray = np.ndarray[tuple[Any, ...], np.dtype[np.complex128]]
-Complex64Array = np.ndarray[tuple[Any, ...], np.dtype[np.complex64]]
-AnyArray = np.ndarray[tuple[Any, ...], np.dtype[Any]]
+_Element = TypeVar("_Element", bound=np.generic)
+_Array = np.ndarray[tuple[Any, ...], np.dtype[_Element]]
+
+FloatArray = _Array[np.float64]
+Float32Array = _Array[np.float32]
+Float16Array = _Array[np.float16]
+IntArray = _Array[np.int64]
+BoolArray = _Array[np.bool_]
+ByteArray = _Array[np.uint8]
+ComplexArray = _Array[np.complex128]
+Complex64Array = _Array[np.complex64]
+AnyArray = _Array[Any]

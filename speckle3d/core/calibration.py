@@ -12,8 +12,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
 from speckle3d.core.geometry import roll_yaw_tilt
-from speckle3d.core.shown import shown
 from speckle3d.core.sweep import Sweep
+from speckle3d.core.text import shown
 
 SENSORS = ("tracker", "orientation")
 
@@ -62,14 +62,6 @@ class FramesUsed:
     given: int
     used: tuple[int, ...]
     dropped: dict[int, str] = field(default_factory=dict)
-
-    def reasons(self) -> dict[str, int]:
-        """Count the frames dropped for each reason, most frequent first.
-
-        A reason counts without its details, after a colon or "by", which differ from frame to frame.
-        """
-        plain = (reason.split(":")[0].split(" by ")[0] for reason in self.dropped.values())
-        return dict(Counter(plain).most_common())
 
 
 @dataclass(frozen=True)
@@ -146,26 +138,29 @@ class Calibration:
 
     def rows(self) -> list[tuple[str, str, str]]:
         """Description, value with its 95 % interval, and unit as text, angles in degrees."""
-        rows = [("method", self.method, ""), ("sensor", self.sensor, "")]
-        rows += [parameter.row() for parameter in self.parameters if parameter.name not in _ANGLES]
         angles = np.rad2deg(roll_yaw_tilt(self.rotation))
         errors = np.rad2deg(np.sqrt(np.diag(self.covariance)[2::-1]))
-        rows += [
-            (name, f"{angle:.3f} +- {1.96 * error:.3f} (95 %)", "deg")
-            for name, angle, error in zip(_ANGLES.values(), angles, errors, strict=True)
-        ]
-        rows += [
+        # A reason counts without its details, after a colon or "by", which differ from frame to frame.
+        reasons = (reason.split(":")[0].split(" by ")[0] for reason in self.frames.dropped.values())
+        offset_s = self.time_offset_s
+        return [
+            ("method", self.method, ""),
+            ("sensor", self.sensor, ""),
+            *(parameter.row() for parameter in self.parameters if parameter.name not in _ANGLES),
+            *(
+                (name, f"{angle:.3f} +- {1.96 * error:.3f} (95 %)", "deg")
+                for name, angle, error in zip(_ANGLES.values(), angles, errors, strict=True)
+            ),
             ("RMS residual" if self.rms_unit else "correlation lost", *readable(self.rms, self.rms_unit)),
             ("condition number", f"{self.condition_number:.1f}", ""),
             ("frames used", f"{len(self.frames.used)} of {self.frames.given}", ""),
+            *(
+                (f"dropped: {reason}", str(count), "frame" + "s" * (count > 1))
+                for reason, count in Counter(reasons).most_common()
+            ),
+            *([] if offset_s is None else [("sensor clock offset", f"{offset_s:+.4f}", "s")]),
+            ("verdict", self.verdict, ""),
         ]
-        rows += [
-            (f"dropped: {reason}", str(count), "frame" + "s" * (count > 1))
-            for reason, count in self.frames.reasons().items()
-        ]
-        if self.time_offset_s is not None:
-            rows.append(("sensor clock offset", f"{self.time_offset_s:+.4f}", "s"))
-        return [*rows, ("verdict", self.verdict, "")]
 
     @property
     def sensor_from_image(self) -> RigidTransform:
@@ -194,8 +189,7 @@ class Calibration:
         """
         if self.pixel_mm is None:
             raise InsufficientDataError("expected a calibration with a pixel size, got one without")
-        scale = np.diag([*self.pixel_mm, float(self.pixel_mm.mean()), 1.0])
-        return np.asarray(self.sensor_from_image.as_matrix() @ scale)
+        return self.sensor_from_image.as_matrix() * np.append(self.pixel_mm, [self.pixel_mm.mean(), 1.0])
 
 
 def calibrated(sweep: Sweep, calibration: Calibration) -> Sweep:
@@ -241,13 +235,3 @@ def calibrated(sweep: Sweep, calibration: Calibration) -> Sweep:
     if name == "tracker":
         changes["image_skew_rad"] = 0.0
     return replace(sweep, **{name: replace(sensor, sensor_from_image=calibration.mounting, **changes)})
-
-
-def mounting_difference(sweep: Sweep, calibration: Calibration) -> tuple[float, float]:
-    """Return how far a calibration's mounting is from the sweep's own, in degrees and mm; zero if unknown."""
-    mounting: Any = getattr(getattr(sweep, calibration.sensor), "sensor_from_image", None)
-    if mounting is None:
-        return 0.0, 0.0
-    step = mounting.inv() * calibration.mounting
-    turned, moved = (step, np.zeros(3)) if isinstance(step, Rotation) else (step.rotation, step.translation)
-    return float(np.rad2deg(turned.magnitude())), float(np.linalg.norm(moved))

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import Any, Literal, TypeVar
 
 import numpy as np
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError, MismatchError
-from speckle3d.core.shown import shown
 from speckle3d.core.sweep import BModeSettings, RFSettings
+from speckle3d.core.text import shown
 
 EDGE_FRACTION = 0.1
 """Of `CurveKey.edge_fraction` in files that do not give it: all that versions before wrote by default."""
@@ -62,16 +63,10 @@ class CurveKey:
 
     def require_same(self, other: CurveKey, what: str = "the curves do not match the sweep") -> None:
         """Raise `MismatchError` naming the first setting in which `other` (a sweep's key) differs."""
-        mine, others = _settings(self), _settings(other)
-        if any(getattr(key.signal, "dynamic_range_sigma_db", 0.0) for key in (self, other)):
-            others["dynamic_range_db"] = mine.get("dynamic_range_db")
-        for name, value in mine.items():
+        others = _settings(other)
+        for name, value in _settings(self).items():
             theirs = others.get(name, value)
-            if isinstance(value, str):
-                same = theirs in (value, "") or not value
-            else:
-                same = np.allclose(value, theirs, rtol=1e-3, atol=1e-9)
-            if not same:
+            if theirs != value if isinstance(value, str) else not np.allclose(value, theirs, 1e-3, 1e-9):
                 advice = BAND_ADVICE if name == "bandwidth_hz" else ""
                 raise MismatchError(f"{what}: {name} is {value!r} and {theirs!r}{advice}")
 
@@ -136,8 +131,7 @@ class EchoSpectra:
     def at(self, depth_mm: FloatArray, frequency_hz: FloatArray) -> FloatArray:
         """Power at depths of any shape and at other frequencies, shape (..., f)."""
         columns = np.stack([np.interp(frequency_hz, self.frequency_hz, row) for row in self.power])
-        flat = [np.interp(depth_mm.ravel(), self.depth_mm, column) for column in columns.T]
-        return np.stack(flat, axis=-1).reshape(*depth_mm.shape, -1)
+        return np.stack([np.interp(depth_mm, self.depth_mm, column) for column in columns.T], axis=-1)
 
 
 @dataclass(frozen=True)
@@ -217,20 +211,18 @@ class DecorrelationCurves:
     def __post_init__(self) -> None:
         rho, shape = self.correlation, (self.depth_mm.size, self.distance_mm.size)
         even = np.linspace(0.0, self.distance_mm[-1], shape[1])
-        by_depth = [self.cells, *(vars(self.speckle).values() if self.speckle else ())]
-        by_depth += vars(self.tilt).values() if self.tilt else ()
+        parts = [vars(part).values() for part in (self.speckle, self.tilt) if part is not None]
+        by_depth = [self.cells, *chain(*parts)]
         requirements = {
-            "distance_mm: expected equal steps from zero": shape[1] > 1
-            and even[-1] > 0
+            "distance_mm: expected equal steps from zero": even[-1] > 0
             and np.allclose(self.distance_mm, even),
             "correlation: expected values in (0, 1] that fall with distance": rho.shape == shape
-            and ((rho > 0) & (rho <= 1)).all()
-            and (np.diff(rho, axis=1) <= 0).all(),
-            "cells: expected values above zero": (self.cells > 0).all(),
-            "scale_sigma: expected zero or more": self.scale_sigma >= 0.0,
-            "cells, speckle, tilt: expected a number for each depth": all(
+            and (rho > 0).all()
+            and (np.diff(rho, axis=1, prepend=1.0) <= 0).all(),
+            "cells, speckle, tilt: expected a number for each depth, of cells above zero": all(
                 values.shape == shape[:1] and np.isfinite(values).all() for values in by_depth
-            ),
+            )
+            and (self.cells > 0).all(),
         }
         for expected, holds in requirements.items():
             if not holds:
@@ -277,9 +269,12 @@ def curve_widths(distance_mm: FloatArray, correlation: FloatArray) -> FloatArray
 
 
 def _settings(key: CurveKey) -> dict[str, Any]:
-    kind = "RF" if isinstance(key.signal, RFSettings) else "B-mode"
+    """Settings that are told of the signal and the patches, by name."""
+    is_rf = isinstance(key.signal, RFSettings)
+    settings = {"signal": "", "lines": ""} | vars(key) | vars(key.signal)
     # How finely the echo was sampled, real or as I/Q, is no property of the beam, and matching resamples it.
-    left_out = ["demodulation_frequency_hz", "dynamic_range_sigma_db", *["sampling_rate_hz"] * (kind == "RF")]
+    left_out = ["demodulation_frequency_hz", "dynamic_range_sigma_db", "sampling_rate_hz" * is_rf]
     left_out += ["vector_pitch_mm"] if key.lines == "fan" else ["array_radius_mm", "line_step_rad"]
-    settings = {"signal": "", "lines": ""} | vars(key) | vars(key.signal) | {"signal": kind}
-    return {name: value for name, value in settings.items() if name not in left_out}
+    left_out += ["dynamic_range_db"] * (settings.get("dynamic_range_sigma_db", 0.0) > 0)
+    settings["signal"] = "RF" if is_rf else "B-mode"
+    return {name: value for name, value in settings.items() if name not in left_out and value != ""}

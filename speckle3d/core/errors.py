@@ -1,11 +1,12 @@
-"""Errors raised on purpose. A message is one line: what was expected, what came, and where."""
+"""Errors raised on purpose, and doubts about a recording; a message is one line: expected, got, and where."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 
-from speckle3d.core.printable import printable
+from speckle3d.core.text import printable
 
 _LONGEST = 1200
 """Letters of a message; a path alone may have hundreds."""
@@ -43,9 +44,7 @@ class NoSpaceError(FileError):
 
 def _quotable(words: str) -> str:
     text = printable(words)
-    if len(text) <= _LONGEST:
-        return text
-    return f"{text[: _LONGEST // 2]} ... {text[-_LONGEST // 4 :]}"
+    return text if len(text) <= _LONGEST else f"{text[: _LONGEST // 2]} ... {text[-_LONGEST // 4 :]}"
 
 
 @contextmanager
@@ -57,3 +56,37 @@ def naming(where: str) -> Iterator[None]:
         if str(error).startswith(printable(where)):
             raise
         raise type(error)(f"{where}: {error}") from error
+
+
+@dataclass(frozen=True)
+class Doubt:
+    """A contradiction between streams of one recording, or within one.
+
+    Attributes
+    ----------
+    about : str
+        What is doubted: "tracker", "orientation sensor", "curves" or "images"; "images and
+        tracker" where these disagree.
+    suspect : str
+        The likely cause in a word or two: "units", "handedness", ...; empty where either may be wrong.
+    evidence : str
+        What was expected and what was seen, one line with figures.
+    refuted : bool
+        True if no honest noise explains it: what rests on it is refused. False: used, and flagged.
+    frames : tuple of (int, int)
+        First and last frames of the stretches where it was found; empty for the recording as a whole.
+    """
+
+    about: str
+    suspect: str
+    evidence: str
+    refuted: bool
+    frames: tuple[tuple[int, int], ...] = ()
+
+    def __post_init__(self) -> None:
+        # As read from JSON these are lists.
+        object.__setattr__(self, "frames", tuple((int(first), int(last)) for first, last in self.frames))
+
+    def __str__(self) -> str:
+        cause = f" (suspect: {self.suspect})" if self.suspect else ""
+        return f"{self.about}: {self.evidence}{cause}" + "; refused" * self.refuted

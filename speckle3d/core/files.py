@@ -10,7 +10,6 @@ import glob
 import importlib
 import os
 import secrets
-import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from io import BufferedReader
@@ -33,13 +32,11 @@ def open_regular(path: PathLike) -> BufferedReader:
     FileError
         If there is none, it cannot be read, or it is a folder, a pipe, a socket or a device.
     """
+    # A pipe without a writer would wait.
+    if os.path.exists(path) and not os.path.isfile(path):
+        raise FileError(f"{path}: expected a file, got a folder, pipe or device")
     try:
-        # A pipe without a writer would wait.
-        if not stat.S_ISREG(os.stat(path).st_mode):
-            raise FileError(f"{path}: expected a file, got a folder, pipe or device")
         return open(path, "rb")
-    except FileError:
-        raise
     except (OSError, ValueError) as error:
         raise FileError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
 

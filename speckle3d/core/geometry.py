@@ -18,7 +18,7 @@ from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
 
 RIGID_TOLERANCE = 1e-4
-"""How far R^T R may be from the identity, and |q| from one, in data read from files (float32 safe)."""
+"""How far entries may be from the nearest rotation's, and |q| from one, in files (float32 safe)."""
 
 
 def rotation_from_fixed_angles(alpha: npt.ArrayLike, beta: npt.ArrayLike, gamma: npt.ArrayLike) -> Rotation:
@@ -33,8 +33,7 @@ def rotation_from_fixed_angles(alpha: npt.ArrayLike, beta: npt.ArrayLike, gamma:
     ----------
     .. [1] Prager et al., CUED/F-INFENG/TR 303, 1997, section 2.
     """
-    angles = np.stack(np.broadcast_arrays(alpha, beta, gamma), axis=-1).astype(float)
-    return Rotation.from_euler("ZYX", angles)
+    return Rotation.from_euler("ZYX", np.stack(np.broadcast_arrays(alpha, beta, gamma), axis=-1))
 
 
 def roll_yaw_tilt(rotation: Rotation) -> FloatArray:
@@ -57,8 +56,7 @@ def relative_poses(world_from_image: RigidTransform) -> RigidTransform:
 
 def elevational_steps(world_from_image: RigidTransform, centre_mm: FloatArray) -> FloatArray:
     """Signed travel of the image centre along the previous frame's z, shape (n - 1,), mm."""
-    steps = relative_poses(world_from_image).apply(centre_mm) - centre_mm
-    return np.asarray(steps[:, 2])
+    return np.asarray((relative_poses(world_from_image).apply(centre_mm) - centre_mm)[:, 2])
 
 
 def mirrored(world_from_image: RigidTransform) -> RigidTransform:
@@ -114,11 +112,9 @@ def rotations_from_quaternions(wxyz: npt.ArrayLike, where: str) -> Rotation:
     InvalidInputError
         Naming `where` and the first bad index.
     """
-    q = _require_rows(wxyz, (4,), where)
-    with np.errstate(over="ignore"):
-        off = np.abs(np.linalg.norm(q, axis=1) - 1.0) > RIGID_TOLERANCE
-    if off.any():
-        first = int(off.argmax())
+    q = require_rows(wxyz, (4,), where)
+    # Clipped, so that no square overflows.
+    for first in np.flatnonzero(np.abs(np.linalg.norm(q.clip(-2, 2), axis=1) - 1.0) > RIGID_TOLERANCE):
         raise InvalidInputError(f"{where}[{first}]: expected a unit quaternion, got {q[first]}")
     return Rotation.from_quat(q, scalar_first=True)
 
@@ -131,15 +127,12 @@ def transforms_from_matrices(matrices: npt.ArrayLike, where: str) -> RigidTransf
     InvalidInputError
         Naming `where` and the first index that is not a proper rotation with translation.
     """
-    m = _require_rows(matrices, (4, 4), where).copy()
-    r, last = m[:, :3, :3], [0.0, 0.0, 0.0, 1.0]
-    with np.errstate(all="ignore"):
-        square = np.abs(r.transpose(0, 2, 1) @ r - np.eye(3)).max(axis=(1, 2)) <= RIGID_TOLERANCE
-        rigid = square & (np.linalg.det(r) > 0) & np.isclose(m[:, 3], last, 0, RIGID_TOLERANCE).all(axis=1)
-    if not rigid.all():
-        raise InvalidInputError(f"{where}[{rigid.argmin()}]: expected a rigid 4x4 matrix, got another")
-    m[:, 3] = last  # SciPy wants it exact
-    return RigidTransform.from_matrix(m)
+    m = require_rows(matrices, (4, 4), where)
+    exact = np.tile(np.eye(4), (len(m), 1, 1))
+    exact[:, :3] = np.concatenate([nearest_rotation(m[:, :3, :3]), m[:, :3, 3:]], axis=2)
+    for first in np.flatnonzero(np.abs(m - exact).max(axis=(1, 2)) > RIGID_TOLERANCE):
+        raise InvalidInputError(f"{where}[{first}]: expected a rigid 4x4 matrix, got another")
+    return RigidTransform.from_matrix(exact)
 
 
 def require_finite(values: npt.NDArray[np.floating], where: str) -> None:
@@ -151,7 +144,7 @@ def require_finite(values: npt.NDArray[np.floating], where: str) -> None:
 
 def require_increasing(times_s: npt.ArrayLike, where: str) -> FloatArray:
     """Return `times_s`, shape (m,), if finite and strictly increasing; else raise `InvalidInputError`."""
-    t = _require_rows(times_s, (), where)
+    t = require_rows(times_s, (), where)
     for i in np.flatnonzero(t[1:] <= t[:-1]) + 1:
         raise InvalidInputError(
             f"{where}[{i}]: expected strictly increasing times, got {t[i]:.6f} s after {t[i - 1]:.6f} s"
@@ -159,8 +152,8 @@ def require_increasing(times_s: npt.ArrayLike, where: str) -> FloatArray:
     return t
 
 
-def _require_rows(values: npt.ArrayLike, row: tuple[int, ...], where: str) -> FloatArray:
-    """Finite values of shape (m, *row), as an array."""
+def require_rows(values: npt.ArrayLike, row: tuple[int, ...], where: str) -> FloatArray:
+    """Return finite values of shape (m, *row) as an array of floats; else raise `InvalidInputError`."""
     rows = np.asarray(values, dtype=float)
     if rows.ndim != 1 + len(row) or rows.shape[1:] != row:
         raise InvalidInputError(f"{where}: expected shape {('m', *row)}, got {rows.shape}")

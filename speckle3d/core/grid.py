@@ -1,4 +1,4 @@
-"""Grid of an image's samples on parallel vectors or a fan, and regions of it.
+"""Grid of an image's samples on parallel vectors or a fan, its scan conversion, and regions of it.
 
 Positions are millimetres in the image: x lateral from the first vector, y axial, the depth.
 """
@@ -7,18 +7,22 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from scipy.ndimage import map_coordinates
 
-from speckle3d.core.arrays import BoolArray, FloatArray
+from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.extras import extra_module
-from speckle3d.core.geometry import require_finite
 
 _ROUNDING = 1e-6
 """Of a pitch, by which a place may miss the first or the last sample and be in the image."""
 
+_PIXELS_PER_PITCH = 4
+"""Of the picture in the distance of neighbouring vectors at the middle depth: linear interpolation between
+vectors then shows nothing of the pixels."""
 
 REGION_HELP = "'rectangle x0,y0 x1,y1', 'fan x,y angle,angle radius,radius' or 'polygon x,y x,y x,y ...'"
 """How a region is written: mm in the image, degrees from straight down, several joined by ' and '."""
@@ -78,11 +82,11 @@ class ImageGrid:
 
     def __post_init__(self) -> None:
         require_positive(self, ("vectors", "samples", "vector_pitch_mm", "sample_spacing_mm"))
-        if not np.isfinite([self.first_sample_depth_mm, self.first_vector_mm]).all():
+        fan, first_mm = self.fan, self.first_sample_depth_mm + self.first_vector_mm
+        if not np.isfinite(first_mm):
             raise InvalidInputError("first_sample_depth_mm, first_vector_mm: expected finite values")
-        fan = self.fan
         if fan is not None and not (
-            np.isfinite([*fan.apex_mm, fan.radius_mm]).all()
+            np.isfinite(sum(fan.apex_mm, fan.radius_mm))
             and fan.radius_mm >= max(0.0, -self.first_sample_depth_mm)
             and fan.step_rad > 0
             and np.abs(self.angle_rad([0, self.vectors - 1])).max() <= np.pi / 2
@@ -131,23 +135,36 @@ class ImageGrid:
 
     def mm(self, vector: npt.ArrayLike, sample: npt.ArrayLike) -> FloatArray:
         """Place of samples in P, shape (..., 2), mm; numbers may be fractional."""
-        v, s = np.broadcast_arrays(np.asarray(vector, dtype=float), sample)
+        v, s = np.broadcast_arrays(vector, sample)
+        place = np.asarray(np.stack([v, s, np.ones(v.shape)], axis=-1) @ self._from_sample.T)
         if self.fan is None:
-            return np.asarray(np.stack([v, s, np.ones(v.shape)], axis=-1) @ self.image_from_sample[:2].T)
-        angle = self.angle_rad(v)
-        radius = self.fan.radius_mm + self.first_sample_depth_mm + s * self.sample_spacing_mm
+            return place
+        angle, radius = np.moveaxis(place, -1, 0)
         return np.stack([radius * np.sin(angle), radius * np.cos(angle)], axis=-1) + self.fan.apex_mm
+
+    @property
+    def places_mm(self) -> FloatArray:
+        """Place of every sample in P, shape (vector, sample, 2), mm."""
+        return self.mm(np.arange(self.vectors)[:, None], np.arange(self.samples))
 
     def sample_at(self, place_mm: npt.ArrayLike) -> FloatArray:
         """Fractional vector and sample at places in P, shape (..., 2); the inverse of `mm`."""
         place = np.asarray(place_mm, dtype=float)
-        if self.fan is None:
-            axes, first = np.split(self.image_from_sample[:2], [2], axis=1)
-            return np.asarray((place - first.T[0]) @ np.linalg.inv(axes).T)
-        x, y = np.moveaxis(place - self.fan.apex_mm, -1, 0)
-        depth = np.hypot(x, y) - self.fan.radius_mm - self.first_sample_depth_mm
-        vector = (np.arctan2(x, y) - self.fan.first_rad) / self.fan.step_rad
-        return np.stack([vector, depth / self.sample_spacing_mm], axis=-1)
+        if self.fan is not None:
+            x, y = np.moveaxis(place - self.fan.apex_mm, -1, 0)
+            place = np.stack([np.arctan2(x, y), np.hypot(x, y)], axis=-1)
+        return np.asarray((place - self._from_sample[:, 2]) @ np.linalg.inv(self._from_sample[:, :2]).T)
+
+    @property
+    def _from_sample(self) -> FloatArray:
+        """Affine map from (vector, sample, 1) to x and y in P, or of a fan to angle and radius."""
+        across, down, depth_mm = self.vector_pitch_mm, self.sample_spacing_mm, self.first_sample_depth_mm
+        if self.fan is not None:
+            first, step = self.fan.first_rad, self.fan.step_rad
+            return np.array([[step, 0.0, first], [0.0, down, self.fan.radius_mm + depth_mm]])
+        along, beside = np.cos(self.skew_rad / 2), np.sin(self.skew_rad / 2)
+        x = [along * across, beside * down, self.first_vector_mm]
+        return np.array([x, [beside * across, along * down, depth_mm]])
 
     def holds(self, place_mm: npt.ArrayLike) -> BoolArray:
         """Mask of places in P, shape (..., 2), among the samples, the outermost included."""
@@ -184,8 +201,7 @@ class ImageGrid:
         v, s = self.vectors - 1, self.samples - 1
         corners = self.mm([0, v, v, 0], [0, 0, s, s])
         if self.fan is not None:
-            (left, top), (right, bottom) = self.extent_mm
-            corners = np.array([[left, top], [right, top], [right, bottom], [left, bottom]])
+            corners = self.extent_mm[[[0, 0], [1, 0], [1, 1], [0, 1]], [0, 1]]
         return np.pad(corners, ((0, 0), (0, 1)))
 
     @property
@@ -199,11 +215,47 @@ class ImageGrid:
         """
         if self.fan is not None:
             raise InvalidInputError("expected parallel vectors, got a fan's: take its images scan-converted")
-        along, beside = np.cos(self.skew_rad / 2), np.sin(self.skew_rad / 2)
-        across, down = self.vector_pitch_mm, self.sample_spacing_mm
-        x = [along * across, beside * down, self.first_vector_mm]
-        y = [beside * across, along * down, self.first_sample_depth_mm]
-        return np.array([x, y, [0.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+        return np.vstack([self._from_sample, [[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]]])
+
+
+def box_grid(fan: ImageGrid, pixel_mm: float) -> ImageGrid:
+    """Grid of square pixels over the smallest box around a fan."""
+    left, top = fan.extent_mm[0].tolist()
+    columns, rows = (int(count) + 1 for count in np.ceil(np.ptp(fan.extent_mm, axis=0) / pixel_mm - 1e-6))
+    return ImageGrid(columns, rows, pixel_mm, pixel_mm, top, first_vector_mm=left)
+
+
+class ScanConversion:
+    """Draws images of a fan on a rectangle about it.
+
+    Parameters
+    ----------
+    fan : ImageGrid
+        Of the images.
+    grid : ImageGrid, optional
+        Of the pictures; by default the box of the fan in square pixels, a quarter of the pitch of vectors or
+        a sample wide.
+
+    Attributes
+    ----------
+    grid : ImageGrid
+        In the same image frame P.
+    """
+
+    def __init__(self, fan: ImageGrid, grid: ImageGrid | None = None) -> None:
+        self.grid = grid or box_grid(fan, max(fan.vector_pitch_mm / _PIXELS_PER_PITCH, fan.sample_spacing_mm))
+        # Places on the fan's edge are inside it whatever rounding does.
+        self._sample = np.moveaxis(fan.sample_at(self.grid.places_mm).round(6), -1, 0)
+
+    def __call__(self, image: npt.NDArray[Any]) -> Float32Array:
+        """Picture of an image, shape (column, row), by linear interpolation; NaN outside the fan.
+
+        Parameters
+        ----------
+        image : ndarray, shape (vector, sample)
+        """
+        levels = np.asarray(image, dtype=np.float32)
+        return map_coordinates(levels, self._sample, np.float32, order=1, cval=np.nan, prefilter=False)
 
 
 def require_positive(settings: object, names: tuple[str, ...]) -> None:
@@ -275,8 +327,7 @@ class Region:
         return replace(grid, vectors=wide, samples=high, first_vector_mm=left, first_sample_depth_mm=top)
 
     def _inside(self, grid: ImageGrid) -> BoolArray:
-        places = grid.mm(np.arange(grid.vectors)[:, None], np.arange(grid.samples))
-        inside = np.ones(places.shape[:2], dtype=bool)
+        places, inside = grid.places_mm, np.ones((grid.vectors, grid.samples), dtype=bool)
         for part in self.text.split(" and "):
             try:
                 kind, *words = part.split()
@@ -308,14 +359,13 @@ def polygon_mask(places: FloatArray, corners: npt.ArrayLike, name: str = "polygo
     Raises
     ------
     InvalidInputError
-        If corners are too few, or not all finite.
+        If corners are too few.
     """
-    outline = np.asarray(corners, dtype=float)
-    if outline.ndim != 2 or outline.shape[0] < 3 or outline.shape[1] != 2:
+    outline = np.round(np.asarray(corners, dtype=float), 6)
+    if outline.ndim != 2 or len(outline) < 3 or outline.shape[1] != 2:
         raise InvalidInputError(f"{name}: expected shape (k, 2) with k of 3 or more, got {outline.shape}")
-    require_finite(outline, name)
     measure = extra_module("skimage.measure", "calibrate", "a region")
-    inside = measure.points_in_poly(np.round(places.reshape(-1, 2), 6), np.round(outline, 6))
+    inside = measure.points_in_poly(np.round(places.reshape(-1, 2), 6), outline)
     return np.asarray(inside.reshape(places.shape[:2]))
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from speckle3d.core.printable import printable
+from speckle3d.core.text import printable
 
 Progress = Callable[[int, int], None]
 """Called with what is done and what there is in all, frames or the like."""

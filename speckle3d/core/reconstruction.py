@@ -11,8 +11,8 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.grid import ImageGrid
-from speckle3d.core.pose_table import plot_poses, pose_table
-from speckle3d.core.shown import shown
+from speckle3d.core.poses import plot_poses, pose_table
+from speckle3d.core.text import shown
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -223,12 +223,11 @@ class Reconstruction:
         """Poses of a mode as a `pandas.DataFrame`, a row for each frame; see `pose_table`."""
         if mode not in self.poses:
             raise InvalidInputError(f"mode: expected one of {', '.join(self.poses)}, got {mode!r}")
-        covariance = flags = None
+        covariance, columns = None, dict[str, FloatArray | IntArray](time_s=self.frame_time_s)
         if self.trust is not None:
             errors = self.trust if mode == "image" else self.trust.modes.get(mode)
-            covariance, flags = getattr(errors, "covariance", None), self.trust.flags
-        others = {"time_s": self.frame_time_s, "flags": flags}
-        return pose_table(self.poses[mode], self.grid.centre_mm, covariance, **others)
+            covariance, columns["flags"] = getattr(errors, "covariance", None), self.trust.flags
+        return pose_table(self.poses[mode], self.grid.centre_mm, covariance, **columns)
 
     def __post_init__(self) -> None:
         n = self.frame_time_s.size
@@ -236,10 +235,11 @@ class Reconstruction:
             raise InvalidInputError(
                 f"expected mode image, and others among {', '.join(MODES)}, got {', '.join(self.poses)}"
             )
-        for mode, poses in self.poses.items():
-            if len(poses) != n:
-                raise InvalidInputError(f"mode {mode}: expected {n} poses, got {len(poses)}")
+        frames = {len(poses) for poses in self.poses.values()}
         if self.trust is not None:
-            claims = [self.trust.covariance, *(errors.covariance for errors in self.trust.modes.values())]
-            if self.trust.flags.shape != (n,) or any(claim.shape != (n, 6, 6) for claim in claims):
-                raise InvalidInputError(f"trust: expected flags and a covariance of each of {n} frames")
+            errors: list[Trust | ModeErrors] = [self.trust, *self.trust.modes.values()]
+            frames |= {len(self.trust.flags), *(len(part.covariance) for part in errors)}
+        if frames != {n}:
+            raise InvalidInputError(
+                f"expected a pose of each mode, flags and a covariance of each of {n} frames, got {frames}"
+            )

@@ -13,7 +13,7 @@ from scipy.spatial.transform import RigidTransform, Rotation, Slerp
 from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.geometry import require_increasing
-from speckle3d.core.shown import shown
+from speckle3d.core.text import shown
 
 DEFAULT_MAX_GAP_S = 0.2
 """Longest pause between two samples that interpolation bridges: five frames at 25 frames/s, about the time

@@ -11,16 +11,14 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
-from speckle3d.core.compression import USUAL_PIXEL_MM, estimate_dynamic_range
+from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.extras import extra_module
 from speckle3d.core.geometry import require_increasing
-from speckle3d.core.grid import ImageGrid, require_positive
-from speckle3d.core.images import ImageFrames, any_thread
-from speckle3d.core.scan_conversion import ScanConversion
-from speckle3d.core.shown import shown
+from speckle3d.core.grid import ImageGrid, ScanConversion, require_positive
+from speckle3d.core.images import USUAL_PIXEL_MM, ImageFrames, any_thread, estimate_dynamic_range
 from speckle3d.core.streams import Samples, TimedPoses, TimedRotations, TimedSamples
+from speckle3d.core.text import shown
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -60,25 +58,18 @@ def stored_dtype(frames: Frames) -> np.dtype[Any]:
 _READING = threading.RLock()
 
 
-def spread_frames(count: int, most: int) -> IntArray:
-    """Every frame of a short sweep, evenly spread ones of a long one, both ends included."""
-    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(np.int64))
-
-
-@dataclass(frozen=True)
 class _FramesPart:
-    """Part of some frames, from `first` on, read one at a time, on any thread.
+    """Part of some frames, from `first` to before `stop`, read one at a time, on any thread.
 
     Those that do not say ``any_thread = True`` may reuse their memory or hold a place in a file: each is read
     while no other is, and copied.
     """
 
-    frames: Frames
-    first: int
-    shape: tuple[int, int, int]
-    dtype: np.dtype[Any]
-    stored_dtype: np.dtype[Any]
-    any_thread: ClassVar[bool] = True
+    any_thread = True
+
+    def __init__(self, frames: Frames, first: int, stop: int) -> None:
+        self.frames, self.first, self.shape = frames, first, (stop - first, *frames.shape[1:])
+        self.dtype, self.stored_dtype = np.dtype(frames.dtype), stored_dtype(frames)
 
     def __getitem__(self, index: int) -> npt.NDArray[Any]:
         number = self.first + range(self.shape[0])[index]
@@ -284,7 +275,7 @@ class Sweep:
                 f"if any, got {self.frames.shape}"
             )
         if not any_thread(self.frames):
-            object.__setattr__(self, "frames", self._part_of_frames(0, len(self)))
+            object.__setattr__(self, "frames", _FramesPart(self.frames, 0, len(self)))
         are_complex = np.dtype(self.frames.dtype).kind == "c"
         if are_complex != (isinstance(self.signal, RFSettings) and self.signal.are_complex):
             raise InvalidInputError(
@@ -344,15 +335,16 @@ class Sweep:
         if frame_time_s is None and frame_rate_hz is not None:
             frame_time_s = np.arange(n) / frame_rate_hz
         across, down = np.broadcast_to(USUAL_PIXEL_MM if pitch_mm is None else pitch_mm, (2,)).tolist()
-        kind: RFSettings | BModeSettings | None = signal
+        kind: Any = signal
         if signal is None and read.dtype == np.uint8:
-            known_db = None if dynamic_range_db is None else (dynamic_range_db, 0.0)
-            range_db = known_db or estimate_dynamic_range(read, across, down)
+            range_db = (
+                (dynamic_range_db, 0.0) if dynamic_range_db else estimate_dynamic_range(read, across, down)
+            )
             kind = range_db and BModeSettings(range_db[0], dynamic_range_sigma_db=range_db[1])
         of_kind = "dynamic_range_db" if read.dtype == np.uint8 else "signal"
-        if pitch_mm is None or frame_time_s is None or kind is None:
-            known = {"pitch_mm": pitch_mm, "frame_rate_hz": frame_time_s, of_kind: kind}
-            missing = ", ".join(name for name, value in known.items() if value is None)
+        required = {"pitch_mm": pitch_mm, "frame_rate_hz": frame_time_s, of_kind: kind}
+        missing = ", ".join(name for name, value in required.items() if value is None)
+        if missing:
             raise InvalidInputError(f"arrays do not say, so give {missing}: see docs/howto/pictures.md")
         if isinstance(kind, RFSettings):
             down = kind.sample_spacing_mm
@@ -366,15 +358,14 @@ class Sweep:
         """
         xarray = extra_module("xarray", "notebook", "a labelled array")
         grid, vector = self.grid, np.arange(self.grid.vectors)
-        lateral, places = "lateral_mm", grid.first_vector_mm + vector * grid.vector_pitch_mm
+        across = {"lateral_mm": grid.mm(vector, 0)[:, 0]}
         if grid.fan is not None:
-            lateral, places = "angle_rad", grid.angle_rad(vector)
+            across = {"angle_rad": grid.angle_rad(vector)}
         depth_mm = grid.first_sample_depth_mm + np.arange(grid.samples) * grid.sample_spacing_mm
-        frames = {"frame": np.arange(len(self)), "time_s": ("frame", self.frame_time_s)}
         return xarray.DataArray(
-            np.stack([np.asarray(self.frames[i]) for i in range(len(self))]),
-            coords=frames | {lateral: places, "depth_mm": depth_mm},
-            dims=("frame", lateral, "depth_mm"),
+            np.stack([self.frames[i] for i in range(len(self))]),
+            {"time_s": ("frame", self.frame_time_s), **across, "depth_mm": depth_mm},
+            ("frame", *across, "depth_mm"),
             name=self.name,
         )
 
@@ -387,7 +378,7 @@ class Sweep:
         image, label = np.asarray(self.frames[number]), "grey level"
         if not isinstance(self.signal, BModeSettings):
             echo = np.abs(image if np.iscomplexobj(image) else hilbert(image.astype(np.float32)))
-            below = np.maximum(echo / max(float(echo.max()), 1e-9), 10 ** (-_SHOWN_DB / 20))
+            below = np.maximum(echo / (echo.max() or 1.0), 10 ** (-_SHOWN_DB / 20))
             image, label = 20 * np.log10(below), "dB below the maximum"
         if grid.fan is not None:
             picture = ScanConversion(grid)
@@ -414,15 +405,10 @@ class Sweep:
             )
         return replace(
             self,
-            frames=self._part_of_frames(first, stop),
+            frames=_FramesPart(self.frames, first, stop),
             frame_time_s=self.frame_time_s[first:stop],
             truth=None if self.truth is None else self.truth[first:stop],
         )
-
-    def _part_of_frames(self, first: int, stop: int) -> _FramesPart:
-        frames = self.frames
-        shape = stop - first, *frames.shape[1:]
-        return _FramesPart(frames, first, shape, np.dtype(frames.dtype), stored_dtype(frames))
 
     @property
     def orientation_source(self) -> OrientationSensor | Tracker | None:

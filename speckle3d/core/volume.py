@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,7 @@ from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.core.shown import shown
+from speckle3d.core.text import shown
 
 VOXEL_TYPES = ("uint8", "int16", "uint16", "float32")
 """Types that voxels may have."""
@@ -45,7 +44,7 @@ class Volume:
     voxels: npt.NDArray[Any]
     spacing_mm: tuple[float, float, float]
     world_from_grid: RigidTransform
-    fields: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
+    fields: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.voxels.ndim != 3 or not self.voxels.size or self.voxels.dtype.name not in VOXEL_TYPES:
@@ -74,8 +73,7 @@ class Volume:
     @property
     def world_from_index(self) -> FloatArray:
         """Affine matrix from voxel indices to world mm, shape (4, 4)."""
-        scale = np.diag([*self.spacing_mm, 1.0])
-        return np.asarray(self.world_from_grid.as_matrix() @ scale)
+        return self.world_from_grid.as_matrix() * [*self.spacing_mm, 1.0]
 
 
 LABEL_TYPES = ("uint8", "uint16")

@@ -65,25 +65,27 @@ class WirePhantom:
         return len(self.names)
 
     @cached_property
-    def n_shapes(self) -> tuple[tuple[int, int, int], ...]:
+    def n_shapes(self) -> tuple[tuple[int, ...], ...]:
         """Those of the patterns that are an N: outer, middle and outer wire."""
-        along = self.directions
 
-        def sine(first: int, second: int) -> float:
-            return float(np.linalg.norm(np.cross(along[first], along[second])))
+        def is_n(wires: tuple[int, ...]) -> bool:
+            first, *others = self.directions[list(wires)]
+            middle, outer = np.linalg.norm(np.cross(first, others), axis=1)
+            return bool(outer < _PARALLEL_SINE < middle)
 
-        threes = [(p[0], p[1], p[2]) for p in self.patterns if len(p) == 3]
-        return tuple(n for n in threes if sine(n[0], n[2]) < _PARALLEL_SINE < sine(n[0], n[1]))
+        return tuple(wires for wires in self.patterns if len(wires) == 3 and is_n(wires))
 
     def crossings_mm(self) -> FloatArray:
         """Where the middle wire of each N meets the first and the last wire, shape (n_shapes, 2, 3)."""
-        n = np.array(self.n_shapes, dtype=int).reshape(-1, 3)
-        point, along = self.points_mm[n], self.directions[n]
-        across = np.cross(along[:, 1:2], along[:, ::2])
-        # The place of the middle wire that is nearest to the outer one.
-        aside = np.cross(point[:, ::2] - point[:, 1:2], along[:, ::2])
-        step = (aside * across).sum(axis=-1, keepdims=True) / (across**2).sum(axis=-1, keepdims=True)
-        return np.asarray(point[:, 1:2] + step * along[:, 1:2])
+
+        def crossing(middle: int, outer: int) -> FloatArray:
+            along, beside = self.directions[[middle, outer]]
+            between = self.points_mm[outer] - self.points_mm[middle]
+            step, _ = np.linalg.lstsq(np.stack([along, -beside], axis=1), between)[0]
+            return np.asarray(self.points_mm[middle] + step * along)
+
+        ends = [crossing(n[1], outer) for n in self.n_shapes for outer in (n[0], n[2])]
+        return np.reshape(ends, (-1, 2, 3))
 
     @cached_property
     def _normals(self) -> FloatArray:

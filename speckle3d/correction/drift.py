@@ -17,7 +17,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.geometry import elevational_steps, roll_yaw_tilt
-from speckle3d.core.shown import shown
+from speckle3d.core.text import shown
 from speckle3d.correction.claims import curve_errors, length_sigma
 from speckle3d.correction.curves import (
     AXES,

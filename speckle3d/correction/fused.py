@@ -24,8 +24,8 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import MismatchError
 from speckle3d.core.leastsquares import huber_weights
+from speckle3d.core.poses import RelativePoses
 from speckle3d.core.reconstruction import SharedErrors
-from speckle3d.core.relative import RelativePoses
 from speckle3d.core.sweep import OrientationSensor, Tracker
 from speckle3d.correction.claims import length_sigma
 from speckle3d.correction.image_path import ImagePath

@@ -10,8 +10,8 @@ from scipy.sparse.linalg import splu
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import FloatArray, IntArray
+from speckle3d.core.poses import HELD, SCALE_CHANGE_MM, SHARED, STRUCTURE, TURN_CHANGE_MM, RelativePoses
 from speckle3d.core.reconstruction import SharedErrors
-from speckle3d.core.relative import HELD, SCALE_CHANGE_MM, SHARED, STRUCTURE, TURN_CHANGE_MM, RelativePoses
 from speckle3d.correction.curves import AXES, CorrectedChain
 from speckle3d.correction.scale import ScaleEvidence
 

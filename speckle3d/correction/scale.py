@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import FloatArray
-from speckle3d.core.shown import shown
+from speckle3d.core.text import shown
 
 
 class ScaleEvidence(NamedTuple):

@@ -15,8 +15,7 @@ from scipy.optimize import least_squares
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.curves import DecorrelationCurves, SpeckleSize, curve_widths
-from speckle3d.core.doubts import Doubt
-from speckle3d.core.errors import MismatchError, Speckle3DError
+from speckle3d.core.errors import Doubt, MismatchError, Speckle3DError
 from speckle3d.core.sweep import RFSettings
 from speckle3d.matching.intensity import two_way_wavenumber
 from speckle3d.matching.patches import PatchGrid

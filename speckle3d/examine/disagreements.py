@@ -10,7 +10,7 @@ from scipy.ndimage import median_filter
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import FloatArray, IntArray
-from speckle3d.core.doubts import Doubt
+from speckle3d.core.errors import Doubt
 from speckle3d.core.geometry import relative_poses
 from speckle3d.core.sweep import OrientationSensor, Sweep, Tracker
 from speckle3d.examine.sensors import jitter, rigid

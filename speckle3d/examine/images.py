@@ -15,9 +15,8 @@ from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.curves import DecorrelationCurves
-from speckle3d.core.doubts import Doubt
-from speckle3d.core.errors import InsufficientDataError, MismatchError
-from speckle3d.core.relative import HELD
+from speckle3d.core.errors import Doubt, InsufficientDataError, MismatchError
+from speckle3d.core.poses import HELD
 from speckle3d.core.sweep import RFSettings
 from speckle3d.examine.curves import examine_curves, require_usable
 from speckle3d.examine.sensors import runs_of

@@ -16,8 +16,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.stats import median_abs_deviation
 
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
-from speckle3d.core.doubts import Doubt
-from speckle3d.core.errors import MismatchError
+from speckle3d.core.errors import Doubt, MismatchError
 from speckle3d.core.geometry import nearest_rotation
 from speckle3d.core.leastsquares import robust_sigma
 from speckle3d.core.sweep import OrientationSensor, Sweep, Tracker

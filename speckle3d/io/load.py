@@ -12,9 +12,9 @@ import h5py
 
 from speckle3d.core.errors import FileError, InvalidInputError, naming
 from speckle3d.core.files import PathLike
-from speckle3d.core.printable import written_path
 from speckle3d.core.reconstruction import ImportRecord
 from speckle3d.core.sweep import Sweep
+from speckle3d.core.text import written_path
 from speckle3d.io import sweeps
 from speckle3d.io.formats import challenge
 from speckle3d.io.formats.challenge import Landmarks

@@ -18,11 +18,11 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from speckle3d.core.arrays import FloatArray, IntArray
-from speckle3d.core.compression import USUAL_PIXEL_MM, estimate_dynamic_range
 from speckle3d.core.errors import FileError, InvalidInputError, naming
 from speckle3d.core.grid import ImageGrid
-from speckle3d.core.printable import printable
+from speckle3d.core.images import USUAL_PIXEL_MM, estimate_dynamic_range
 from speckle3d.core.sweep import BModeSettings, OrientationSensor, RFSettings, Sweep, Tracker
+from speckle3d.core.text import printable
 from speckle3d.io.import_settings import (
     SPEED_OF_SOUND_M_S,
     ImportSettings,

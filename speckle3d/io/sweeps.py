@@ -20,9 +20,9 @@ from speckle3d.core.geometry import (
     transforms_from_matrices,
 )
 from speckle3d.core.grid import FanLines, ImageGrid
-from speckle3d.core.printable import printable
 from speckle3d.core.streams import TimedPoses, TimedRotations
 from speckle3d.core.sweep import INERTIAL, BModeSettings, OrientationSensor, RFSettings, Sweep, Tracker
+from speckle3d.core.text import printable
 from speckle3d.io.frames import FileFrames, HDF5Slices
 from speckle3d.io.hdf5 import (
     Node,

@@ -24,7 +24,7 @@ from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.geometry import mirrored
-from speckle3d.core.relative import RelativePoses
+from speckle3d.core.poses import RelativePoses
 from speckle3d.core.sweep import BModeSettings, Sweep
 from speckle3d.core.threads import on_one_thread
 from speckle3d.matching.frames import FrameByFrame, ImageSink

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
-from speckle3d.core.sweep import Sweep, spread_frames
+from speckle3d.core.images import spread_frames
+from speckle3d.core.sweep import Sweep
 from speckle3d.core.threads import ahead
 from speckle3d.kernels.inplane import Frame
 from speckle3d.matching.matcher import FrameMatcher, compose, inverse

@@ -15,7 +15,8 @@ from scipy.signal import welch
 
 from speckle3d.core.arrays import BoolArray, Complex64Array, Float32Array, FloatArray, IntArray
 from speckle3d.core.curves import EchoSpectra, SpeckleSize
-from speckle3d.core.sweep import BModeSettings, RFSettings, Sweep, spread_frames
+from speckle3d.core.images import spread_frames
+from speckle3d.core.sweep import BModeSettings, RFSettings, Sweep
 from speckle3d.matching.matcher import FrameMatcher, ReadyFrame
 
 FRAMES = 16

@@ -30,7 +30,7 @@ from scipy.special import log_ndtr, logsumexp
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.curves import DecorrelationCurves, EchoSpectra
-from speckle3d.core.doubts import Doubt
+from speckle3d.core.errors import Doubt
 from speckle3d.core.sweep import RFSettings
 from speckle3d.motion.diffraction import NEPER_PER_DB
 from speckle3d.motion.lens import stretched

@@ -23,7 +23,7 @@ from scipy.ndimage import map_coordinates
 from scipy.special import log_softmax, logsumexp, softmax
 
 from speckle3d.core.arrays import FloatArray, IntArray
-from speckle3d.core.shown import shown
+from speckle3d.core.text import shown
 from speckle3d.kernels.plane_misfit import EchoModels
 from speckle3d.kernels.statistics import INTERPOLATION, correlation_variance
 from speckle3d.matching.table import CorrelationTable

@@ -10,8 +10,8 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.geometry import mirrored
+from speckle3d.core.poses import MIRROR, RelativePoses
 from speckle3d.core.reconstruction import FramePairs, SharedErrors
-from speckle3d.core.relative import MIRROR, RelativePoses
 from speckle3d.kernels.plane_misfit import EchoModels
 from speckle3d.matching.table import CorrelationTable
 from speckle3d.motion.coherence import Coherence, estimate_coherence

@@ -11,7 +11,7 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import BoolArray, FloatArray
-from speckle3d.core.doubts import Doubt
+from speckle3d.core.errors import Doubt
 from speckle3d.core.sweep import OrientationSensor, Sweep, Tracker, image_orientation
 from speckle3d.motion.estimate import Motion, solve_planes
 from speckle3d.motion.planes import pair_planes, patch_distances, raised

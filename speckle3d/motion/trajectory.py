@@ -14,7 +14,7 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.geometry import rotation_from_fixed_angles, skew
 from speckle3d.core.leastsquares import huber_weights
-from speckle3d.core.relative import HELD, RelativePoses
+from speckle3d.core.poses import HELD, RelativePoses
 from speckle3d.matching.table import CorrelationTable
 from speckle3d.motion.planes import PairPlanes
 

@@ -8,9 +8,8 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import FloatArray
-from speckle3d.core.pose_errors import PoseErrors
+from speckle3d.core.poses import SCALE_CHANGE_MM, SHARED, STRUCTURE, TURN_CHANGE_MM, PoseErrors
 from speckle3d.core.reconstruction import SharedErrors
-from speckle3d.core.relative import SCALE_CHANGE_MM, SHARED, STRUCTURE, TURN_CHANGE_MM
 from speckle3d.motion.planes import PairPlanes, PlaneSettings
 
 TREMBLING_MM = 0.1

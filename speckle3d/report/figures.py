@@ -15,8 +15,8 @@ from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.grid import ImageGrid
+from speckle3d.core.images import spread_frames
 from speckle3d.core.reconstruction import FramePairs
-from speckle3d.core.sweep import spread_frames
 from speckle3d.scoring.references import SweepCurves
 from speckle3d.study.figures import CURVE_LABELS, colour_of, label_of, new_figure
 from speckle3d.study.overall import Row, words_of

@@ -16,7 +16,7 @@ import numpy as np
 from markupsafe import Markup
 
 from speckle3d.core.errors import Speckle3DError
-from speckle3d.core.printable import printable
+from speckle3d.core.text import printable
 from speckle3d.io.hdf5 import atomic_path
 from speckle3d.report import figures as draw
 from speckle3d.report import tables

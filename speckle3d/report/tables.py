@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from markupsafe import Markup
 
-from speckle3d.core.printable import printable
+from speckle3d.core.text import printable
 from speckle3d.scoring.statistics import FEWEST
 from speckle3d.study.figures import colour_of
 from speckle3d.study.overall import (

@@ -7,7 +7,7 @@ lie in that plane and cross at the origin.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache, lru_cache
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -19,6 +19,7 @@ from speckle3d.simulation.medium import (
     Box,
     Layer,
     Scatterers,
+    Tile,
     TiledMedium,
     tile_rng,
     tiles_near,
@@ -65,10 +66,13 @@ _HALF_LENGTH_MM = 40.0
 _BEARINGS_DEG = (40.0, 125.0)
 """Directions of the threads in their plane, from x towards z: a little off square, as a bench has them."""
 
+_DUST = [Layer(-60.0, np.zeros((0, 5)), 0.02)]
+"""Echo strength of what is in the water."""
+
 
 @lru_cache(maxsize=200)
-def _sheet_tile(entropy: int, i: int, j: int) -> FloatArray:
-    """Scatterers of a rough surface in the plane y = 0 on the tile whose first corner is at i, j tiles.
+def _sheet(entropy: int, tile: Tile) -> FloatArray:
+    """Scatterers of a rough surface in the plane y = 0 on a tile.
 
     They are of one sign, on a lattice, raised and lowered at random. The lattice is finer than half the
     shortest wavelength, so that the scatterers sum to a mirror where they are level, and echo in all
@@ -76,8 +80,8 @@ def _sheet_tile(entropy: int, i: int, j: int) -> FloatArray:
     exp(-(2 k s)^2) of the power is specular, the rest diffuse.
     """
     along = (np.arange(round(TILE_MM / _SPACING_MM)) + 0.5) * _SPACING_MM
-    x, z = np.meshgrid(i * TILE_MM + along, j * TILE_MM + along)
-    height = tile_rng(entropy, i=i, j=j).normal(0.0, _ROUGHNESS_MM, x.size)
+    x, z = np.meshgrid(tile[0] * TILE_MM + along, tile[1] * TILE_MM + along)
+    height = tile_rng(tile, entropy).normal(0.0, _ROUGHNESS_MM, x.size)
     return np.stack([x.ravel(), height, z.ravel()], axis=1)
 
 
@@ -102,14 +106,12 @@ class Level(NamedTuple):
         return RigidTransform.from_components(origin, Rotation.from_matrix(axes))
 
 
-@dataclass(frozen=True)
-class WaterBath:
-    """A medium whose reflector is a floor, or the bar of a Cambridge phantom, under water with a little dust.
+@dataclass(frozen=True, eq=False)
+class WaterBath(TiledMedium):
+    """Water with a little dust, over a floor or the bar of a Cambridge phantom.
 
     Parameters
     ----------
-    entropy : int
-        Seed of the reflector's surface, and of the dust.
     reflector : str
         wall: the whole floor. bar: a strip in the floor's plane that is only in the middle of the beam, and
         always turned towards the probe.
@@ -120,12 +122,10 @@ class WaterBath:
        sections 3.3 and 3.4.
     """
 
-    entropy: int
     reflector: Reflector = "wall"
-    attenuation_db_cm_mhz: float = 0.0
 
     def scatterers(self, medium_from_image: RigidTransform, box: Box) -> list[Scatterers]:
-        """Reflector, its reverberations and the haze in a box of the image."""
+        """Dust in a box of the image, the reflector, and its reverberations."""
         translation, rotation = medium_from_image.as_components()
         level = Level(rotation.as_matrix()[1], -float(translation[1]))
         strength = _STRENGTH_PER_MM2 * _SPACING_MM**2
@@ -152,46 +152,28 @@ class WaterBath:
             place = medium_from_image * level.image_from_sheet
             sheets.append((place.apply(position), _REVERBERATION**count))
         return [
-            *_haze(self.entropy, 0.0).scatterers(medium_from_image, box),
+            *super().scatterers(medium_from_image, box),
             *((place, np.full(len(place), amplitude * strength, np.float32)) for place, amplitude in sheets),
         ]
 
     def _near(self, image_from_sheet: RigidTransform, box: Box) -> FloatArray:
         """Scatterers of the reflector, in its sheet, on tiles that may reach into a box, shape (n, 3)."""
-        tiles = tiles_near(image_from_sheet.inv(), box).tolist()
-        position = np.concatenate([_sheet_tile(self.entropy, i, j) for i, j in tiles])
+        tiles = tiles_near(image_from_sheet.inv(), box)
+        position = np.concatenate([_sheet(self.entropy, tile) for tile in tiles])
         return position if self.reflector == "wall" else position[np.abs(position[:, 2]) <= _BAR_MM / 2.0]
 
 
-@dataclass(frozen=True)
-class CrossedThreads:
-    """Two braided threads under water with a little dust.
+def water_bath(entropy: int, reflector: Reflector) -> WaterBath:
+    """Make a bath with a floor, or a bar in its place; the dust is 34 dB weaker than unit speckle."""
+    return WaterBath(entropy, 2.0, 0.0, _DUST, depth_mm=(-60.0, 0.0), reflector=reflector)
+
+
+def crossed_threads(entropy: int) -> TiledMedium:
+    """Make water with two braided threads.
 
     A braid is rough on the scale of the wavelength, so that it echoes in all directions; a smooth wire would
     be a mirror, dark wherever the beam does not meet it squarely.
     """
-
-    entropy: int
-    attenuation_db_cm_mhz: float = 0.0
-
-    def scatterers(self, medium_from_image: RigidTransform, box: Box) -> list[Scatterers]:
-        """Haze in a box of the image, and the threads."""
-        position = _threads(self.entropy)
-        threads = position, np.full(len(position), _THREAD_STRENGTH, np.float32)
-        return [*_haze(self.entropy, 30.0).scatterers(medium_from_image, box), threads]
-
-
-@cache
-def _haze(entropy: int, down_to_mm: float) -> TiledMedium:
-    """Make a little dust in water, 34 dB weaker than speckle of unit strength."""
-    return TiledMedium(
-        entropy, 2.0, 0.0, [Layer(-60.0, np.zeros((0, 5)), 0.02)], depth_mm=(-60.0, down_to_mm)
-    )
-
-
-@cache
-def _threads(entropy: int) -> FloatArray:
-    """Scatterers of two threads, at random in them, shape (n, 3)."""
     rng = np.random.default_rng([entropy, 2])
     count = round(2.0 * _HALF_LENGTH_MM / _THREAD_SPACING_MM)
     threads = []
@@ -202,4 +184,6 @@ def _threads(entropy: int) -> FloatArray:
         angle, radius = rng.uniform(0.0, 2.0 * np.pi, count), _THREAD_RADIUS_MM * np.sqrt(rng.random(count))
         aside = np.outer(radius * np.cos(angle), across) + np.outer(radius * np.sin(angle), [0.0, 1.0, 0.0])
         threads.append(np.outer(place, along) + aside)
-    return np.concatenate(threads)
+    position = np.concatenate(threads)
+    objects = [(position, np.full(len(position), _THREAD_STRENGTH, np.float32))]
+    return TiledMedium(entropy, 2.0, 0.0, _DUST, depth_mm=(-60.0, 30.0), objects=objects)

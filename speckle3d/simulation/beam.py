@@ -33,8 +33,10 @@ _COMPONENTS = 4
 They are what makes a short sum broadband.
 """
 
-_FLOOR_DB = -40.0
-"""Under each depth's peak: what is left out."""
+_FLOOR = 0.01
+"""Of each depth's peak: smaller fields are left out."""
+
+_SIGNAL = RFSettings(200e6 / 3, 1540.0, 7.5e6, (5e6, 10e6))
 
 
 @dataclass(frozen=True)
@@ -56,6 +58,8 @@ class Probe:
         Raised-cosine apodisation's weight at the aperture's ends, both ways.
     elevation_aperture_mm, elevation_focus_mm : float
         Height of the elements, and where the lens focuses.
+    signal : RFSettings
+        Sampling of the vectors.
     """
 
     pitch_mm: float = 0.3
@@ -66,21 +70,11 @@ class Probe:
     edge_weight: float = 0.08
     elevation_aperture_mm: float = 5.0
     elevation_focus_mm: float = 20.0
-    centre_frequency_hz: float = 7.5e6
-    bandwidth_hz: tuple[float, float] = (5e6, 10e6)
-    sampling_rate_hz: float = 200e6 / 3
-    speed_of_sound_m_s: float = 1540.0
-
-    @property
-    def signal(self) -> RFSettings:
-        """Sampling of this probe's vectors."""
-        return RFSettings(
-            self.sampling_rate_hz, self.speed_of_sound_m_s, self.centre_frequency_hz, self.bandwidth_hz
-        )
+    signal: RFSettings = _SIGNAL
 
     def spectrum(self, frequency_hz: FloatArray) -> FloatArray:
         """Two-way pulse spectrum: a raised cosine, halved in amplitude (-6 dB) at the band's edges."""
-        low, high = self.bandwidth_hz
+        low, high = self.signal.bandwidth_hz
         phase = (np.asarray(frequency_hz) - (low + high) / 2.0) / (high - low)
         return np.where(np.abs(phase) < 1.0, np.cos(np.pi / 2.0 * phase) ** 2, 0.0)
 
@@ -143,7 +137,7 @@ class BeamTable:
         """
         spectra = self.spectra(frequency_hz)
         df = frequency_hz[1] - frequency_hz[0]
-        gram = 2.0 * spectra @ spectra.conj().T * df / self.probe.sampling_rate_hz
+        gram = 2.0 * spectra @ spectra.conj().T * df / self.probe.signal.sampling_rate_hz
         field = self.residual * (np.arange(_ELEVATION_MM.size) < self.reach[:, :, None])[..., None]
         # Both mirror halves count, the axis once.
         sides = np.outer(*(np.where(at > 0.0, 2.0, 1.0) for at in (self.lateral_mm, _ELEVATION_MM)))
@@ -171,7 +165,7 @@ def tabulate_beam(probe: Probe = Probe(), attenuation_db_cm_mhz: float = 0.0) ->
     """
     step = probe.pitch_mm / _PER_PITCH
     lateral = step * np.arange(round(_LATERAL_REACH_MM / step) + 1, dtype=float)
-    wavenumbers = 2e-3 * np.pi * _NODES_HZ / probe.speed_of_sound_m_s
+    wavenumbers = 2e-3 * np.pi * _NODES_HZ / probe.signal.speed_of_sound_m_s
     field = _sum_sources(probe, lateral, wavenumbers)
     neper = attenuation_db_cm_mhz * _NEPER_PER_DB * 1e-7 * _NODES_HZ
     field *= np.exp(-2.0 * _DEPTH_MM[:, None] * neper)[:, None, None, :]
@@ -182,7 +176,7 @@ def tabulate_beam(probe: Probe = Probe(), attenuation_db_cm_mhz: float = 0.0) ->
     kz = np.array([_parabola(row, _ELEVATION_MM, double) for row in middle[:, 0, :]])
     depth, bend_x, bend_z = (values[:, None, None] for values in (_DEPTH_MM, kx, kz))
     echo = depth + bend_x * lateral[:, None] ** 2 + bend_z * _ELEVATION_MM**2
-    reach = _reach(np.abs(field).max(axis=-1), 10.0 ** (_FLOOR_DB / 20.0))
+    reach = _reach(np.abs(field).max(axis=-1))
     field *= np.exp(2j * echo[..., None] * wavenumbers)
     residual, components = _compress(field, probe.spectrum(_NODES_HZ))
     return BeamTable(probe, lateral, residual, components, reach, np.stack([kx, kz], axis=1))
@@ -241,21 +235,19 @@ def _parabola(profile: ComplexArray, across: FloatArray, wavenumber: float) -> f
 
 def _compress(field: ComplexArray, pulse: FloatArray) -> tuple[Complex64Array, ComplexArray]:
     """Principal components of the field over frequency, with depths and the pulse's band equally weighted."""
+    depth_rms = np.sqrt((np.abs(field) ** 2).mean(axis=(1, 2, 3), keepdims=True))
     weight = np.maximum(pulse, 0.1 * pulse.max())
-    depth_rms = np.sqrt((np.abs(field) ** 2).mean(axis=(1, 2, 3)))
-    rows = (field * weight / depth_rms[:, None, None, None]).reshape(-1, pulse.size)
-    _, vectors = np.linalg.eigh(rows.conj().T @ rows)
-    main = vectors[:, : -_COMPONENTS - 1 : -1]
-    residual = (field * weight) @ main
-    return residual.astype(np.complex64), main.conj().T / weight
+    field = field * weight
+    rows = (field / depth_rms).reshape(-1, pulse.size)
+    main = np.linalg.eigh(rows.conj().T @ rows)[1][:, : -_COMPONENTS - 1 : -1]
+    return (field @ main).astype(np.complex64), main.conj().T / weight
 
 
-def _reach(amplitude: FloatArray, floor: float) -> IntArray:
-    """Elevational steps beyond which the field stays below `floor` of that depth's peak."""
+def _reach(amplitude: FloatArray) -> IntArray:
+    """Elevational steps beyond which the field stays below the floor of that depth's peak."""
     nz = amplitude.shape[2]
-    above = amplitude > floor * amplitude.max(axis=(1, 2), keepdims=True)
-    last = np.where(above, np.arange(1, nz + 1), 0).max(axis=2)
-    reach = np.asarray(np.minimum(last, nz - 1), dtype=np.int64)
+    above = amplitude > _FLOOR * amplitude.max(axis=(1, 2), keepdims=True)
+    reach: IntArray = np.where(above, np.arange(1, nz + 1), 0).max(axis=2).clip(max=nz - 1)
     # A cell between two tabulated depths or laterals must reach as far as the farther of its corners.
     reach[:-1] = np.maximum(reach[:-1], reach[1:])
     reach[:, :-1] = np.maximum(reach[:, :-1], reach[:, 1:])

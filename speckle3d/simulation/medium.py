@@ -11,12 +11,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import product
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray
 
 Scatterers = tuple[FloatArray, Float32Array]
 """Positions, shape (n, 3), mm, and strengths, shape (n,): unit strength at 1 per mm^3 is the reference."""
@@ -44,30 +44,27 @@ Box = tuple[FloatArray, FloatArray]
 """Opposite corners of a box of the image, the lower first, mm."""
 
 
-class Medium(Protocol):
-    """Anything that can list its scatterers in a box."""
-
-    @property
-    def attenuation_db_cm_mhz(self) -> float:
-        """One-way attenuation, proportional to frequency."""
-
-    def scatterers(self, medium_from_image: RigidTransform, box: Box) -> list[Scatterers]:
-        """Blocks of scatterers, in the medium, that include all those in a box of the image."""
+Tile = tuple[int, int]
+"""Number of a tile along x and along z."""
 
 
-def tiles_near(medium_from_image: RigidTransform, box: Box) -> IntArray:
-    """Indices of the tiles of a medium that together hold a box of the image, shape (n, 2)."""
-    corners = np.stack(np.meshgrid(*np.stack(box, axis=-1)), axis=-1)
-    extent = medium_from_image.apply(corners.reshape(-1, 3))[:, [0, 2]]
-    first = np.floor(extent.min(axis=0) / TILE_MM).astype(int)
-    last = np.floor(extent.max(axis=0) / TILE_MM).astype(int)
-    return np.asarray(np.indices(last - first + 1).reshape(2, -1).T + first)
+def tiles_near(medium_from_image: RigidTransform, box: Box) -> list[Tile]:
+    """Tiles of a medium that together hold a box of the image."""
+    corners = np.stack(np.meshgrid(*np.transpose(box)), axis=-1).reshape(-1, 3)
+    extent = np.floor(medium_from_image.apply(corners)[:, [0, 2]] / TILE_MM).astype(int)
+    (i, j), (last_i, last_j) = extent.min(axis=0).tolist(), extent.max(axis=0).tolist()
+    return list(product(range(i, last_i + 1), range(j, last_j + 1)))
 
 
-def tile_rng(entropy: int, *part: int, i: int, j: int) -> np.random.Generator:
+def tile_rng(tile: Tile, *seed: int) -> np.random.Generator:
     """Random numbers of a part of a tile."""
     # Seeds are not negative: remainders are distinct on either side of the origin.
-    return np.random.default_rng([entropy, *part, i % 2**32, j % 2**32])
+    return np.random.default_rng([*seed, *(number % 2**32 for number in tile)])
+
+
+def tile_corner(tile: Tile, depth_mm: float = 0.0) -> FloatArray:
+    """First corner of a tile, at a depth."""
+    return np.array([tile[0] * TILE_MM, depth_mm, tile[1] * TILE_MM])
 
 
 def wave_sum(waves: FloatArray, position_mm: FloatArray) -> FloatArray:
@@ -154,12 +151,11 @@ class Clusters(NamedTuple):
     wander_rad: float = 0.05
     coherent: bool = True
 
-    def draw(self, entropy: int, number: int, i: int, j: int) -> Scatterers:
+    def draw(self, tile: Tile, *seed: int) -> Scatterers:
         """Children of the parents in one tile; some lie outside it."""
-        rng = tile_rng(entropy, 1000 + number, i=i, j=j)
-        size = np.array([TILE_MM, self.depth_mm[1] - self.depth_mm[0], TILE_MM])
-        n = rng.poisson(self.per_mm3 * size.prod())
-        parent = np.array([i * TILE_MM, self.depth_mm[0], j * TILE_MM]) + rng.random((n, 3)) * size
+        rng, (top, bottom) = tile_rng(tile, *seed), self.depth_mm
+        n = rng.poisson(self.per_mm3 * (bottom - top) * TILE_MM**2)
+        parent = tile_corner(tile, top) + rng.random((n, 3)) * [TILE_MM, bottom - top, TILE_MM]
         axis = np.asarray(self.direction) + self.wander_rad * rng.standard_normal((n, 3))
         axis *= (self.length_mm * rng.uniform(0.25, 1.0, n) / np.linalg.norm(axis, axis=1))[:, None]
         along = rng.random((n, self.children, 1)) - 0.5
@@ -186,6 +182,8 @@ class TiledMedium:
         Slow variation of the background's echo strength, in nepers.
     clusters, spheres
         Spheres multiply whatever lies in them.
+    objects : sequence of Scatterers
+        In every box, wherever they lie.
     depth_mm : tuple of float
         The slab, from a little above the skin so that a probe may move up.
     """
@@ -198,27 +196,26 @@ class TiledMedium:
     clusters: Sequence[Clusters] = ()
     spheres: Sequence[Sphere] = ()
     depth_mm: tuple[float, float] = (-3.0, 50.0)
+    objects: Sequence[Scatterers] = ()
 
     def scatterers(self, medium_from_image: RigidTransform, box: Box) -> list[Scatterers]:
-        """Tiles that together hold all scatterers in a box of the image."""
-        return [_tile(self, i, j) for i, j in tiles_near(medium_from_image, box).tolist()]
+        """Blocks of scatterers, in the medium, that include all those in a box of the image."""
+        return [*(_scatterers(self, tile) for tile in tiles_near(medium_from_image, box)), *self.objects]
 
-    def _background(self, i: int, j: int) -> Scatterers:
+    def _background(self, tile: Tile) -> Scatterers:
         """Half of the scatterers Poisson distributed, half of them one anywhere in each of equal cells.
 
         Few scatterers per resolution cell make intensity vary more than fully developed speckle's if they
         are Poisson distributed, and less by as much if their number does not vary. Half and half, the
         moments up to the fourth, and so the correlation of intensity, are those of a dense medium.
         """
-        rng, height = tile_rng(self.entropy, 0, i=i, j=j), self.depth_mm[1] - self.depth_mm[0]
-        size = np.array([TILE_MM, height, TILE_MM])
-        loose = rng.random((rng.poisson(self.per_mm3 / 2.0 * size.prod()), 3)) * size
-        across = round(TILE_MM / _CELL_MM)
-        down = round(height * self.per_mm3 / 2.0 * _CELL_MM**2)
+        rng, (top, bottom) = tile_rng(tile, self.entropy, 0), self.depth_mm
+        height, per_mm3 = bottom - top, self.per_mm3 / 2.0
+        loose = rng.random((rng.poisson(per_mm3 * height * TILE_MM**2), 3)) * [TILE_MM, height, TILE_MM]
+        across, down = round(TILE_MM / _CELL_MM), round(height * per_mm3 * _CELL_MM**2)
         cell = np.indices((across, down, across)).reshape(3, -1).T
         spread = (cell + rng.random(cell.shape)) * [_CELL_MM, height / down, _CELL_MM]
-        position = np.concatenate([loose, spread])
-        position += [i * TILE_MM, self.depth_mm[0], j * TILE_MM]
+        position = np.concatenate([loose, spread]) + tile_corner(tile, top)
         n = len(position)
         strength, fill = np.ones(n), np.ones(n)
         for layer in self.layers:
@@ -231,23 +228,23 @@ class TiledMedium:
         present = rng.random(n) < fill
         return position[present], strength[present].astype(np.float32)
 
-    def _fascia(self, layer: Layer, number: int, i: int, j: int) -> Scatterers:
-        rng = tile_rng(self.entropy, 1 + number, i=i, j=j)
+    def _fascia(self, tile: Tile, layer: Layer, number: int) -> Scatterers:
+        rng = tile_rng(tile, self.entropy, 1 + number)
         n = rng.poisson(_FASCIA_PER_MM2 * TILE_MM**2)
-        position = [i * TILE_MM, 0.0, j * TILE_MM] + rng.random((n, 3)) * [TILE_MM, 0.0, TILE_MM]
+        position = tile_corner(tile) + rng.random((n, 3)) * [TILE_MM, 0.0, TILE_MM]
         position[:, 1] = layer.top_mm + wave_sum(layer.undulation, position) + rng.normal(0.0, 0.015, n)
         return position, np.full(n, layer.fascia / _FASCIA_PER_MM2, np.float32)
 
 
 @lru_cache(_KEPT_TILES)
-def _tile(medium: TiledMedium, i: int, j: int) -> Scatterers:
+def _scatterers(medium: TiledMedium, tile: Tile) -> Scatterers:
     """All scatterers of one tile."""
-    parts = [medium._background(i, j)]
-    parts += [medium._fascia(layer, n, i, j) for n, layer in enumerate(medium.layers) if layer.fascia]
+    parts = [medium._background(tile)]
+    parts += [medium._fascia(tile, layer, n) for n, layer in enumerate(medium.layers) if layer.fascia]
     # Children of a neighbouring tile's parents may lie in this tile.
-    for di, dj in product((-1, 0, 1), repeat=2) if medium.clusters else ():
-        position, strength = _family(medium, i + di, j + dj)
-        inside = (np.floor(position[:, [0, 2]] / TILE_MM) == [i, j]).all(axis=1)
+    for step in product((-1, 0, 1), repeat=2) if medium.clusters else ():
+        position, strength = _family(medium, (tile[0] + step[0], tile[1] + step[1]))
+        inside = (np.floor(position[:, [0, 2]] / TILE_MM) == tile).all(axis=1)
         parts.append((position[inside], strength[inside]))
     position, strength = _concatenate(parts)
     for sphere in medium.spheres:
@@ -261,9 +258,9 @@ def _tile(medium: TiledMedium, i: int, j: int) -> Scatterers:
 
 
 @lru_cache(_KEPT_TILES)
-def _family(medium: TiledMedium, i: int, j: int) -> Scatterers:
+def _family(medium: TiledMedium, tile: Tile) -> Scatterers:
     """Children of all parents in a tile; some lie outside it."""
-    return _concatenate([kind.draw(medium.entropy, n, i, j) for n, kind in enumerate(medium.clusters)])
+    return _concatenate([kind.draw(tile, medium.entropy, 1000 + n) for n, kind in enumerate(medium.clusters)])
 
 
 def _concatenate(parts: Sequence[Scatterers]) -> Scatterers:

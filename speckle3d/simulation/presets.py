@@ -9,11 +9,11 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.grid import ImageGrid
-from speckle3d.core.shown import shown
 from speckle3d.core.sweep import OrientationSensor, Sweep, Tracker
-from speckle3d.simulation.bath import CrossedThreads, WaterBath
+from speckle3d.core.text import shown
+from speckle3d.simulation.bath import crossed_threads, water_bath
 from speckle3d.simulation.beam import BeamTable, Probe, tabulate_beam
-from speckle3d.simulation.medium import Medium, fully_developed, phantom, tissue
+from speckle3d.simulation.medium import TiledMedium, fully_developed, phantom, tissue
 from speckle3d.simulation.movement import (
     calibration_scan,
     frame_times,
@@ -97,11 +97,11 @@ def simulate(settings: SimulationSettings) -> tuple[SimulatedSweep, ...]:
     return tuple(_sweep(settings, beam, medium, world, sweep_seeds[number], number) for number in numbers)
 
 
-def _medium(settings: SimulationSettings, entropy: int) -> Medium:
+def _medium(settings: SimulationSettings, entropy: int) -> TiledMedium:
     if settings.preset == "plane":
-        return WaterBath(entropy, settings.reflector)
+        return water_bath(entropy, settings.reflector)
     if settings.preset == "wires":
-        return CrossedThreads(entropy)
+        return crossed_threads(entropy)
     if settings.preset == "stepped":
         return fully_developed(entropy)
     return (tissue if settings.preset in _TISSUE else phantom)(entropy, settings.length_mm)
@@ -114,7 +114,7 @@ def _entropy(seed: np.random.SeedSequence) -> int:
 def _sweep(
     settings: SimulationSettings,
     beam: BeamTable,
-    medium: Medium,
+    medium: TiledMedium,
     world: RigidTransform,
     seed: np.random.SeedSequence,
     number: int,

@@ -59,9 +59,6 @@ class ReceivedFrames:
         n, vectors, samples = self.frames.shape
         return n, vectors, -(-samples // self.decimation)
 
-    def __len__(self) -> int:
-        return self.frames.shape[0]
-
     def __getitem__(self, index: int) -> npt.NDArray[Any]:
         """One frame, shape (vector, sample)."""
         echoes = filters.hilbert(self.frames[index], axis=1)

@@ -16,7 +16,7 @@ from speckle3d.core.geometry import rotation_from_fixed_angles
 from speckle3d.core.grid import ImageGrid
 from speckle3d.kernels.scatter import EchoGrid, scatter_echoes
 from speckle3d.simulation.beam import BeamTable
-from speckle3d.simulation.medium import Medium
+from speckle3d.simulation.medium import TiledMedium
 
 _FULL_SCALE = 8191
 """14 bits, signed."""
@@ -41,7 +41,7 @@ class SimulatedFrames:
     Parameters
     ----------
     beam : BeamTable
-    medium : Medium
+    medium : TiledMedium
     medium_from_image : RigidTransform, length n
     image : ImageGrid
     snr_db : float
@@ -51,7 +51,7 @@ class SimulatedFrames:
     """
 
     beam: BeamTable
-    medium: Medium
+    medium: TiledMedium
     medium_from_image: RigidTransform
     image: ImageGrid
     snr_db: float = 40.0
@@ -65,12 +65,9 @@ class SimulatedFrames:
         """Frames, vectors, samples."""
         return len(self.medium_from_image), self.image.vectors, self.image.samples
 
-    def __len__(self) -> int:
-        return len(self.medium_from_image)
-
     def __getitem__(self, index: int) -> npt.NDArray[np.int16]:
         """One frame, shape (vector, sample), 14-bit counts."""
-        counts: Float32Array = self.waveforms(range(len(self))[index]) * self._levels[0]
+        counts: Float32Array = self.waveforms(range(self.shape[0])[index]) * self._levels[0]
         return np.clip(np.rint(counts), -_FULL_SCALE, _FULL_SCALE).astype(np.int16)
 
     def waveforms(self, index: int) -> Float32Array:
@@ -87,7 +84,7 @@ class SimulatedFrames:
         """Baseband echoes of frame `index`, shape (vector, sample, component of the beam)."""
         probe, image = self.beam.probe, self.image
         out = np.zeros((image.vectors, self._length, len(self.beam.components)), np.complex64)
-        carrier = 2e-3 * float(self._frequency_hz[self._carrier_bin]) / probe.speed_of_sound_m_s
+        carrier = 2e-3 * float(self._frequency_hz[self._carrier_bin]) / probe.signal.speed_of_sound_m_s
         grid = EchoGrid(image.first_sample_depth_mm, image.sample_spacing_mm, carrier)
         # A fan's face lies deeper in the image at its middle than at its ends; reflectors see it as flat.
         number = np.arange(1 if image.fan is None else image.vectors)
@@ -111,12 +108,12 @@ class SimulatedFrames:
     @cached_property
     def _frequency_hz(self) -> FloatArray:
         """Frequencies of the FFT's bins."""
-        return np.arange(self._length // 2 + 1) * self.beam.probe.sampling_rate_hz / self._length
+        return np.arange(self._length // 2 + 1) * self.beam.probe.signal.sampling_rate_hz / self._length
 
     @property
     def _carrier_bin(self) -> int:
         probe = self.beam.probe
-        return round(probe.centre_frequency_hz / probe.sampling_rate_hz * self._length)
+        return round(probe.signal.centre_frequency_hz / probe.signal.sampling_rate_hz * self._length)
 
     @cached_property
     def _pulses(self) -> tuple[IntArray, Complex64Array]:
@@ -129,7 +126,7 @@ class SimulatedFrames:
     def _levels(self) -> tuple[Float32Array, float]:
         """Gain at each sample, and RF rms of unit speckle at the focus."""
         probe, image = self.beam.probe, self.image
-        rms = np.sqrt(self.beam.echo_power(np.linspace(0.0, probe.sampling_rate_hz / 2.0, 513)))
+        rms = np.sqrt(self.beam.echo_power(np.linspace(0.0, probe.signal.sampling_rate_hz / 2.0, 513)))
         depth = image.first_sample_depth_mm + np.arange(image.samples) * image.sample_spacing_mm
         focus = float(np.interp(probe.transmit_focus_mm, self.beam.depth_mm, rms))
         quietest = focus * 10.0 ** (-_MOST_GAIN_DB / 20.0)

@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from speckle3d.core.printable import printable
+from speckle3d.core.text import printable
 from speckle3d.io.hdf5 import atomic_path, make_folder
 from speckle3d.scoring.references import SweepCurves
 

@@ -11,9 +11,8 @@ import numpy.typing as npt
 from speckle3d.config import stored_config
 from speckle3d.core.arrays import Float32Array, FloatArray
 from speckle3d.core.errors import InvalidInputError, MismatchError
-from speckle3d.core.grid import ImageGrid
+from speckle3d.core.grid import ImageGrid, ScanConversion
 from speckle3d.core.reconstruction import Reconstruction
-from speckle3d.core.scan_conversion import ScanConversion
 from speckle3d.core.sweep import BModeSettings, Sweep
 from speckle3d.imaging.voxels.settings import Levels
 from speckle3d.io.calibrations import apply_calibrations

@@ -16,7 +16,6 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.config import Config
 from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.core.errors import InsufficientDataError, MismatchError
-from speckle3d.core.printable import written_path
 from speckle3d.core.progress import Progress, after
 from speckle3d.core.reconstruction import (
     FramePairs,
@@ -26,8 +25,8 @@ from speckle3d.core.reconstruction import (
     SourceFile,
     Trust,
 )
-from speckle3d.core.shown import shown
 from speckle3d.core.sweep import Sweep
+from speckle3d.core.text import shown, written_path
 from speckle3d.correction.crossing.pair import CrossedPair
 from speckle3d.correction.drift import DriftCorrection
 from speckle3d.correction.modes import CUBIC_MODES, require_modes

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from speckle3d.core.tables import text_table
+from speckle3d.core.text import text_table
 from speckle3d.scoring.displacements import MEANINGS
 from speckle3d.scoring.statistics import FEWEST, holm, mean_interval, signed_rank_p
 

@@ -28,7 +28,7 @@ from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.progress import Progress
 from speckle3d.core.streams import TimedRotations
 from speckle3d.core.sweep import OrientationSensor, Sweep
-from speckle3d.core.tables import text_table
+from speckle3d.core.text import text_table
 from speckle3d.io.hdf5 import make_folder
 from speckle3d.io.load import load_sweep
 from speckle3d.io.reconstructions import read_reconstruction

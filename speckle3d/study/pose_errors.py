@@ -8,7 +8,7 @@ import numpy as np
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError
-from speckle3d.core.pose_errors import PoseErrors
+from speckle3d.core.poses import PoseErrors
 from speckle3d.core.reconstruction import Reconstruction, SharedErrors
 from speckle3d.imaging.measures.belonging import require_inside
 from speckle3d.imaging.measures.measure import Measurement, measure_points

@@ -14,8 +14,8 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.core.arrays import IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
 from speckle3d.core.reconstruction import Reconstruction
-from speckle3d.core.shown import shown
 from speckle3d.core.sweep import BModeSettings, Sweep
+from speckle3d.core.text import shown
 from speckle3d.imaging.images import ChosenImages, PosedImages
 from speckle3d.imaging.voxels.settings import Levels
 from speckle3d.io.calibrations import apply_calibrations, fitted_pixels, resized

@@ -18,10 +18,9 @@ from typing import Any
 
 from pydantic_core import to_json
 
-from speckle3d.core.doubts import Doubt
-from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.errors import Doubt, InvalidInputError
 from speckle3d.core.reconstruction import Provenance
-from speckle3d.core.tables import text_table
+from speckle3d.core.text import text_table
 from speckle3d.io.fileset import FileSet
 from speckle3d.io.hdf5 import atomic_path, make_folder, require_target
 from speckle3d.scoring.lengths import ModeError
@@ -92,7 +91,7 @@ class Summary:
         """Notes below the table: doubts, modes left out, and remarks on rows."""
         remarks = dict.fromkeys(f"{row.mode}: {self.remark(row)}" for row in self.rows if self.remark(row))
         left_out = (f"mode {mode} is left out" for mode in self.left_out)
-        words = (*(doubt.consequence for doubt in self.doubts), *left_out, *remarks)
+        words = (*(str(doubt) for doubt in self.doubts), *left_out, *remarks)
         return [f"{self.sweep}: {text}" for text in words]
 
     def remark(self, row: ModeError) -> str:

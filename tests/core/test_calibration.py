@@ -6,8 +6,10 @@ import sweep_examples
 from calibration_files import ROTATION, example_calibration
 from scipy.spatial.transform import Rotation
 
-from speckle3d.core.calibration import calibrated, mounting_difference
+from speckle3d.cli.common import mount
+from speckle3d.core.calibration import calibrated
 from speckle3d.core.errors import InvalidInputError, MismatchError
+from speckle3d.io.calibrations import write_calibration
 
 
 def test_a_pixel_is_where_the_readings_and_the_calibration_put_it():
@@ -42,15 +44,18 @@ def test_a_sweep_without_the_sensor_is_refused(sensor):
 
 
 @pytest.mark.parametrize("sensor", ["tracker", "orientation"])
-def test_mountings_are_compared_where_both_are_known(sensor):
+def test_a_mounting_that_differs_from_the_sweeps_is_told(sensor, tmp_path, capsys):
     sweep = calibrated(sweep_examples.rf_sweep(), example_calibration(sensor))
-    remount = example_calibration(sensor, rotation=ROTATION * Rotation.from_euler("y", 7, degrees=True))
-    shift_mm = 5.0 if sensor == "tracker" else 0.0
+    remount = example_calibration(sensor, rotation=ROTATION * Rotation.from_euler("y", 17, degrees=True))
     if sensor == "tracker":
-        remount = replace(remount, translation_mm=remount.translation_mm + np.array([3.0, 0.0, -4.0]))
-    assert mounting_difference(sweep, remount) == pytest.approx((7.0, shift_mm), abs=1e-6)
+        remount = replace(remount, translation_mm=remount.translation_mm + np.array([30.0, 0.0, -40.0]))
+    write_calibration(tmp_path / "c.h5", remount)
+    mount(sweep, [tmp_path / "c.h5"])
+    far = "17 degrees and 50 mm from" if sensor == "tracker" else "17 degrees from"
+    assert far in " ".join(capsys.readouterr().err.split())
     unknown = replace(sweep, **{sensor: replace(getattr(sweep, sensor), sensor_from_image=None)})
-    assert mounting_difference(unknown, remount) == (0.0, 0.0)
+    mount(unknown, [tmp_path / "c.h5"])
+    assert capsys.readouterr().err == ""
 
 
 @pytest.mark.parametrize(

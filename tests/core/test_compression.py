@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, uniform_filter
 
-from speckle3d.core.compression import USUAL_DB, estimate_dynamic_range
+from speckle3d.core.images import USUAL_DB, estimate_dynamic_range
 
 PITCH_MM, SPACING_MM = 0.3, 0.09
 

@@ -5,8 +5,7 @@ import pytest
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.core.grid import ImageGrid
-from speckle3d.core.scan_conversion import ScanConversion
+from speckle3d.core.grid import ImageGrid, ScanConversion
 from speckle3d.imaging.cuts.planes import lateral_line
 from speckle3d.imaging.measures.belonging import belonging_of
 

@@ -7,7 +7,7 @@ import pytest
 import speckle
 from pair_planes import AT, TILT, fit_many, from_coefficients, problem_of
 
-from speckle3d.core.relative import TURN_CHANGE_MM
+from speckle3d.core.poses import TURN_CHANGE_MM
 from speckle3d.kernels.statistics import correlation_variance
 from speckle3d.motion.planes import PlaneSettings
 from speckle3d.motion.uncertainty import weigh_slopes

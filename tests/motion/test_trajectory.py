@@ -7,7 +7,7 @@ import pair_planes
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from speckle3d.core.relative import RelativePoses
+from speckle3d.core.poses import RelativePoses
 from speckle3d.matching.table import CorrelationTable
 from speckle3d.motion import trajectory
 from speckle3d.motion.trajectory import edges_of, solve_trajectory

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from report_examples import HOSTILE, MODES, REASON
 
-from speckle3d.core.printable import printable
+from speckle3d.core.text import printable
 from speckle3d.report.data import load_view
 from speckle3d.report.page import write_report
 from speckle3d.study.figures import label_of

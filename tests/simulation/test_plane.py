@@ -6,7 +6,7 @@ from scipy.signal import hilbert
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.grid import ImageGrid
-from speckle3d.simulation.bath import WaterBath
+from speckle3d.simulation.bath import water_bath
 from speckle3d.simulation.beam import tabulate_beam
 from speckle3d.simulation.presets import SimulationSettings, simulate
 from speckle3d.simulation.scan import SimulatedFrames
@@ -33,7 +33,7 @@ def bath_frames(beam, reflector, poses_deg_mm, vectors=64):
         turn = Rotation.from_euler("YXZ", np.deg2rad([40.0, tilt, roll]))
         below = np.array([image.width_mm / 2.0, depth, 0.0])
         poses.append(RigidTransform.from_components([3.0, 0.0, -5.0] - turn.apply(below), turn))
-    return SimulatedFrames(beam, WaterBath(11, reflector), RigidTransform.concatenate(poses), image)
+    return SimulatedFrames(beam, water_bath(11, reflector), RigidTransform.concatenate(poses), image)
 
 
 def envelopes(frame):

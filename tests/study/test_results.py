@@ -3,7 +3,7 @@
 import json
 from dataclasses import replace
 
-from speckle3d.core.doubts import Doubt
+from speckle3d.core.errors import Doubt
 from speckle3d.core.reconstruction import Provenance
 from speckle3d.scoring.lengths import ModeError
 from speckle3d.study.results import (

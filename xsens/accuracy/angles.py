@@ -20,9 +20,8 @@ from scipy.spatial.transform import Rotation
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
-from speckle3d.core.shown import shown
 from speckle3d.core.streams import TimedRotations
-from speckle3d.core.tables import text_table
+from speckle3d.core.text import shown, text_table
 
 ANGLES = ("roll", "yaw", "tilt")
 """Turns about the image's z, y and x, in this order everywhere."""

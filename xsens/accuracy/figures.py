@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError
-from speckle3d.core.printable import printable
+from speckle3d.core.text import printable
 from xsens.accuracy.angles import ANGLES, PairErrors
 
 OFF_AXIS_RAD = np.deg2rad(0.5)

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError, MismatchError
-from speckle3d.core.shown import shown
+from speckle3d.core.text import shown
 from xsens.fusion.engines import Filter
 from xsens.fusion.readings import PAUSE_S, Samples, lost_variance
 from xsens.fusion.settings import LOST, FusionSettings

@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.core.shown import shown
 from speckle3d.core.streams import TimedRotations
+from speckle3d.core.text import shown
 from xsens.fusion.readings import PAUSE_S, Estimate, Samples, usable_samples
 from xsens.fusion.settings import DEFAULT_METHOD, FusionSettings, Method
 from xsens.logs.samples import ImuLog, finite_rows

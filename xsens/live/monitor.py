@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from speckle3d.core.errors import InvalidInputError, Speckle3DError
-from speckle3d.core.shown import shown
+from speckle3d.core.text import shown
 from xsens.fusion.field import ROUGH, dip_rad
 from xsens.logs.parts import Hints
 from xsens.logs.read import parse_stream

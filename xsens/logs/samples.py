@@ -15,9 +15,9 @@ from scipy.spatial.transform import Rotation
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
 from speckle3d.core.geometry import require_increasing
-from speckle3d.core.shown import shown
 from speckle3d.core.streams import DEFAULT_MAX_GAP_S
 from speckle3d.core.streams import TimedRotations as TimedRotations
+from speckle3d.core.text import shown
 
 VECTORS = ("accelerometer_m_s2", "gyroscope_rad_s", "magnetometer_au")
 

@@ -24,7 +24,7 @@ from speckle3d.app.sweep.plots import (
 )
 from speckle3d.config import Config, stored_config
 from speckle3d.core.arrays import FloatArray
-from speckle3d.core.doubts import Doubt
+from speckle3d.core.errors import Doubt
 from speckle3d.core.reconstruction import Reconstruction
 from speckle3d.core.sweep import OrientationSensor, Sweep, Tracker
 from speckle3d.examine.sensors import repair_readings
@@ -131,7 +131,7 @@ class _Player(param.Parameterized):  # type: ignore[misc]
             *(patches if self.colour != "none" else []),
             levels,
             self._text,
-            *(pn.pane.HTML(f"&bull; {escape(doubt.consequence)}") for doubt in self._page.doubts),
+            *(pn.pane.HTML(f"&bull; {escape(str(doubt))}") for doubt in self._page.doubts),
             pn.pane.Bokeh(self._times.marks, **wide),
             *(streams or [pn.pane.HTML("No sensor was recorded with this sweep.")]),
             sizing_mode="stretch_both",

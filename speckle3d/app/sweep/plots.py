@@ -15,7 +15,7 @@ from scipy.spatial.transform import RigidTransform
 
 from speckle3d.app.plots import ImagePlot, time_plot
 from speckle3d.core.arrays import FloatArray, IntArray
-from speckle3d.core.doubts import Doubt
+from speckle3d.core.errors import Doubt
 from speckle3d.core.grid import ImageGrid
 from speckle3d.core.reconstruction import FramePairs
 from speckle3d.core.sweep import Sweep
@@ -132,9 +132,7 @@ class TimePlots:
             for frame in ([] if flags is None else np.flatnonzero(flags & int(flag)).tolist())
         ]
         marks += [
-            (doubt.about, *ends, _DOUBT_COLOUR, doubt.consequence)
-            for doubt in doubts
-            for ends in doubt.frames
+            (doubt.about, *ends, _DOUBT_COLOUR, str(doubt)) for doubt in doubts for ends in doubt.frames
         ]
         rows = list(dict.fromkeys(row for row, *_ in marks))
         self.marks.y_range.factors = rows[::-1] or ["no frame"]

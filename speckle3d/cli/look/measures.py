@@ -13,7 +13,7 @@ from speckle3d.core.errors import InvalidInputError, naming
 
 if TYPE_CHECKING:
     from speckle3d.core.grid import ImageGrid
-    from speckle3d.core.pose_errors import PoseErrors
+    from speckle3d.core.poses import PoseErrors
     from speckle3d.core.surface import Surface
     from speckle3d.core.volume import Volume
     from speckle3d.imaging.measures.measure import Measurement

@@ -12,7 +12,7 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError, MismatchError
 from speckle3d.core.geometry import mirrored
-from speckle3d.core.shown import shown
+from speckle3d.core.text import shown
 from speckle3d.correction.crossing.fit import CrossingFit, Parts, Prior, covariance
 from speckle3d.correction.crossing.planes import (
     BENDS,

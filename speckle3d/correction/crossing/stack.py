@@ -6,8 +6,7 @@ import numpy as np
 
 from speckle3d.core.arrays import Float16Array, Float32Array
 from speckle3d.core.errors import InsufficientDataError
-from speckle3d.core.grid import ImageGrid
-from speckle3d.core.scan_conversion import ScanConversion, box_grid
+from speckle3d.core.grid import ImageGrid, ScanConversion, box_grid
 
 PIXEL_MM = 0.35
 """About the finest blur at which sweeps are compared: finer pixels show only speckle that the other sweep's

@@ -10,7 +10,8 @@ import numpy as np
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.core.pose_errors import Belonging, PoseErrors
+from speckle3d.core.poses import PoseErrors
+from speckle3d.imaging.measures.belonging import Belonging, changes
 
 NORMAL_95 = 1.959964
 """Deviations of a normal variable that 95 % of its values lie within."""
@@ -97,7 +98,7 @@ def measure_points(
 
     def row(kind: str, numbers: range, quantity: Quantity, unit: str = "mm") -> Measurement:
         value, gradient = quantity(points[numbers])
-        by_poses = errors.of_gradient(points[numbers], gradient, belonging.of_points(np.array(numbers)))
+        by_poses = changes(errors, points[numbers], gradient, belonging.of_points(np.array(numbers)))
         pose_sigma, pick_sigma = float(np.linalg.norm(by_poses)), pick_mm * float(np.linalg.norm(gradient))
         return Measurement(kind, tuple(numbers), value, pose_sigma, pick_sigma, unit)
 

@@ -13,10 +13,10 @@ from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.extras import extra_module
 from speckle3d.core.grid import ImageGrid
-from speckle3d.core.pose_errors import PoseErrors
+from speckle3d.core.poses import PoseErrors
 from speckle3d.core.surface import Surface
 from speckle3d.core.volume import Volume
-from speckle3d.imaging.measures.belonging import belonging_of
+from speckle3d.imaging.measures.belonging import belonging_of, changes
 
 Inside = Literal["above", "below"]
 TAUBIN = (0.5, -0.53)
@@ -226,8 +226,7 @@ def _sigma(surface: Surface, gradient: FloatArray, errors: PoseErrors, grid: Ima
     near = belonging_of(surface.vertices_mm, grid, errors.world_from_image)
     corner = surface.triangles.ravel()
     points, gradient = surface.vertices_mm[corner], gradient.reshape(-1, 3)
-    by_errors = errors.of_gradient(points, gradient, near.of_points(corner))
-    return float(np.linalg.norm(by_errors))
+    return float(np.linalg.norm(changes(errors, points, gradient, near.of_points(corner))))
 
 
 def _march(volume: Volume, values: FloatArray, level: float, inside: Inside, mask: BoolArray) -> Surface:

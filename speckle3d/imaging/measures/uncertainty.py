@@ -7,8 +7,8 @@ from scipy.ndimage import zoom
 
 from speckle3d.core.arrays import ByteArray, Float32Array, FloatArray
 from speckle3d.core.grid import ImageGrid
-from speckle3d.core.pose_errors import PoseErrors
-from speckle3d.imaging.measures.belonging import belonging_of
+from speckle3d.core.poses import PoseErrors
+from speckle3d.imaging.measures.belonging import belonging_of, variances
 from speckle3d.imaging.voxels.grid import VoxelGrid
 
 COARSE_MM = 0.75
@@ -53,4 +53,4 @@ def deviations(errors: PoseErrors, grid: ImageGrid, points_mm: FloatArray) -> Fl
     """Standard deviation of points' positions along the sweep, shape (k,), mm."""
     near = belonging_of(points_mm, grid, errors.world_from_image)
     along = errors.world_from_image.rotation[near.frames[:, 0]].apply([0.0, 0.0, 1.0])
-    return np.sqrt(errors.variance(points_mm, along, near))
+    return np.sqrt(variances(errors, points_mm, along, near))

@@ -16,7 +16,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from speckle3d.core.arrays import BoolArray, ByteArray, Float32Array, FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.grid import ImageGrid
-from speckle3d.core.shown import shown
+from speckle3d.core.text import shown
 from speckle3d.core.threads import in_parallel
 from speckle3d.core.volume import Volume
 from speckle3d.imaging.images import Images, PosedImages

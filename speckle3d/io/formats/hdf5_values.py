@@ -13,7 +13,7 @@ import numpy as np
 
 from speckle3d.core.arrays import AnyArray, FloatArray
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.core.printable import printable
+from speckle3d.core.text import printable
 from speckle3d.io.carrier import demodulation_of
 from speckle3d.io.frames import FileFrames, HDF5Slices
 from speckle3d.io.hdf5 import has_member, locate, read_array

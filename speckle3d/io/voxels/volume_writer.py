@@ -23,7 +23,7 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.core.arrays import AnyArray
 from speckle3d.core.errors import MismatchError
 from speckle3d.core.files import PathLike
-from speckle3d.core.printable import printable
+from speckle3d.core.text import printable
 from speckle3d.core.volume import LabelMap, Segment, Volume
 from speckle3d.io.hdf5 import LABELS_ALONE, atomic_path, require_suffix
 from speckle3d.io.images.image_writer import write_image

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from scipy.ndimage import uniform_filter1d
 
 from speckle3d.core.arrays import Float32Array
-from speckle3d.core.sweep import spread_frames
+from speckle3d.core.images import spread_frames
 from speckle3d.study.figures import (
     RANGE_DB,
     UNSEEN,

@@ -15,10 +15,10 @@ from matplotlib.colors import to_rgb
 from speckle3d.core.arrays import ByteArray, FloatArray
 from speckle3d.core.files import PathLike
 from speckle3d.core.grid import Region
-from speckle3d.core.printable import printable
 from speckle3d.core.progress import Progress
 from speckle3d.core.reconstruction import MODES
 from speckle3d.core.sweep import BModeSettings, Sweep
+from speckle3d.core.text import printable
 from speckle3d.core.volume import STATE_SEGMENTS
 from speckle3d.imaging.cuts.outlines import frame_outlines
 from speckle3d.imaging.images import PosedImages

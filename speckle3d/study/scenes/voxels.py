@@ -15,7 +15,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.grid import ImageGrid, Region
-from speckle3d.core.pose_errors import PoseErrors
+from speckle3d.core.poses import PoseErrors
 from speckle3d.core.volume import EMPTY, FILLED, MEASURED, STATE_SEGMENTS, LabelMap, Volume
 from speckle3d.imaging.axes import principal_axes, sweep_axes
 from speckle3d.imaging.measures.uncertainty import deviation_volume

@@ -6,7 +6,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.grid import ImageGrid
-from speckle3d.core.pose_errors import PoseErrors
+from speckle3d.core.poses import PoseErrors
 from speckle3d.imaging.measures.belonging import belonging_of, require_inside
 from speckle3d.imaging.measures.measure import angle, length, measure_points
 

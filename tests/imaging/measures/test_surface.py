@@ -6,7 +6,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.grid import ImageGrid
-from speckle3d.core.pose_errors import PoseErrors
+from speckle3d.core.poses import PoseErrors
 from speckle3d.core.volume import Volume
 from speckle3d.imaging.measures.belonging import belonging_of
 from speckle3d.imaging.measures.surface import (

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.grid import ImageGrid
-from speckle3d.core.pose_errors import PoseErrors
+from speckle3d.core.poses import PoseErrors
 from speckle3d.imaging.measures.belonging import belonging_of
 from speckle3d.imaging.measures.uncertainty import deviation_volume, deviations
 from speckle3d.imaging.voxels.grid import VoxelGrid, grid_around

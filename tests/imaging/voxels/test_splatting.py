@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
-from speckle3d.core.grid import ImageGrid
-from speckle3d.core.scan_conversion import ScanConversion
+from speckle3d.core.grid import ImageGrid, ScanConversion
 from speckle3d.imaging.voxels.grid import VoxelGrid
 from speckle3d.imaging.voxels.volume import compound
 

@@ -8,8 +8,7 @@ from igsio_twin import Clip
 from image_examples import frame_fields, grey, write_mha
 from scipy.spatial.transform import Rotation
 
-from speckle3d.core.grid import ImageGrid, Region
-from speckle3d.core.scan_conversion import ScanConversion
+from speckle3d.core.grid import ImageGrid, Region, ScanConversion
 from speckle3d.io.import_settings import ImportSettings, MissingSettingsError
 from speckle3d.io.load import load_sweep
 from speckle3d.io.plus.device_set import read_device_set
