@@ -189,7 +189,7 @@ class Calibration:
         """
         if self.pixel_mm is None:
             raise InsufficientDataError("expected a calibration with a pixel size, got one without")
-        return self.sensor_from_image.as_matrix() * np.append(self.pixel_mm, [self.pixel_mm.mean(), 1.0])
+        return self.sensor_from_image.as_matrix() @ np.diag([*self.pixel_mm, self.pixel_mm.mean(), 1.0])
 
 
 def calibrated(sweep: Sweep, calibration: Calibration) -> Sweep:
