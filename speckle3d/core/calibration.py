@@ -189,7 +189,8 @@ class Calibration:
         """
         if self.pixel_mm is None:
             raise InsufficientDataError("expected a calibration with a pixel size, got one without")
-        return self.sensor_from_image.as_matrix() @ np.diag([*self.pixel_mm, self.pixel_mm.mean(), 1.0])
+        scale = [*self.pixel_mm.tolist(), self.pixel_mm.mean(), 1.0]
+        return np.asarray(self.sensor_from_image.as_matrix() * scale)
 
 
 def calibrated(sweep: Sweep, calibration: Calibration) -> Sweep:
