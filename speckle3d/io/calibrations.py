@@ -20,9 +20,9 @@ import numpy as np
 from speckle3d.core.calibration import Calibration, FramesUsed, Parameter, calibrated
 from speckle3d.core.errors import InvalidInputError, MismatchError, naming
 from speckle3d.core.geometry import rotations_from_quaternions
-from speckle3d.core.printable import written_path
 from speckle3d.core.reconstruction import CalibrationFile
 from speckle3d.core.sweep import BModeSettings, Sweep
+from speckle3d.core.text import written_path
 from speckle3d.io.hdf5 import (
     PathLike,
     Source,
