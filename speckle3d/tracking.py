@@ -28,7 +28,7 @@ def track(
     """Estimate the pose of every frame from the images, and from the orientation-consistent patches.
 
     The second set of poses, `Tracked.subset`, needs an orientation sensor calibrated to the image that has
-    readings for all frames.
+    readings for all frames, or for frames nearby.
 
     Parameters
     ----------

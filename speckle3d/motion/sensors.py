@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from typing import NamedTuple
 
@@ -125,20 +126,27 @@ def same_turns(sensor_turns: FloatArray, image_turns: FloatArray) -> int | None:
 
 
 def sensed_orientation(sweep: Sweep, settings: SensorSettings) -> Rotation | None:
-    """Smoothed orientation of every frame; None if the subset is off or a frame has no reading."""
-    sensor = sweep.orientation_source
+    """Smoothed orientation of every frame; None if the subset is off or too few frames have a reading.
+
+    Frames without one take that of the nearest frame, which may be `SensorSettings.smooth_s` away.
+    """
+    sensor, time_s, sigma_s = sweep.orientation_source, sweep.frame_time_s, settings.smooth_s
     if not settings.consistent_subset or sensor is None or sensor.sensor_from_image is None:
         return None
-    time_s, sigma_s = sweep.frame_time_s, settings.smooth_s
-    if not sensor.covers(time_s).all():
+    read_s = time_s[sensor.covers(time_s)]
+    if not read_s.size:
         return None
-    orientation = image_orientation(sensor, time_s)
+    nearest_s = read_s[np.rint(np.interp(time_s, read_s, np.arange(read_s.size))).astype(int)]
+    if np.abs(nearest_s - time_s).max() > sigma_s:
+        return None
+    orientation = image_orientation(sensor, nearest_s)
     if sigma_s == 0:
         return orientation
-    # As turns from their mean, of which they stay within a half turn.
+    # As turns from their mean, of which they stay within a half turn; a steady turn goes on beyond the ends.
     mean, frames = orientation.mean(), sigma_s / float(np.median(np.diff(time_s)))
-    turns = gaussian_filter1d((mean.inv() * orientation).as_rotvec(), frames, axis=0, mode="nearest")
-    return mean * Rotation.from_rotvec(turns)
+    turns, margin = (mean.inv() * orientation).as_rotvec(), min(math.ceil(4.0 * frames), len(sweep) - 1)
+    turns = np.pad(turns, ((margin, margin), (0, 0)), "reflect", reflect_type="odd")
+    return mean * Rotation.from_rotvec(gaussian_filter1d(turns, frames, axis=0)[margin:-margin])
 
 
 class ConsistentPoses(NamedTuple):
@@ -147,7 +155,7 @@ class ConsistentPoses(NamedTuple):
     Attributes
     ----------
     poses : RigidTransform, length n, or None
-        None without a sensed orientation of every frame.
+        None without a sensed orientation.
     used : ndarray of bool, shape (e, p)
         Patches of each pair that they come from.
     rejected_share : float
