@@ -29,24 +29,19 @@ dB."""
 
 
 def flat(group: h5py.Group, name: str) -> FloatArray:
-    """Read finite numbers along one axis, whatever other axes of length 1 there are."""
-    values: FloatArray = read_array(group, name, None)
-    if sum(n > 1 for n in values.shape) > 1 or not np.isfinite(values).all():
-        raise InvalidInputError(
-            f"{locate(group, name)}: expected finite numbers along one axis, got others, {values.shape}"
-        )
-    return values.ravel()
+    """Numbers of an array in one row, whatever axes of length 1 there are; empty where there is none."""
+    return read_array(group, name, None).ravel() if has_member(group, name) else np.zeros(0)
 
 
 def single(group: h5py.Group, name: str) -> float | None:
-    """Read one finite number; None if there is none, or an empty array, of this name.
+    """Read one number; None if there is none, or an empty array, of this name.
 
     Raises
     ------
     InvalidInputError
         If there are several that differ, as one per transmission may.
     """
-    values = flat(group, name) if has_member(group, name) else np.zeros(0)
+    values = flat(group, name)
     if values.size and np.ptp(values):
         raise InvalidInputError(
             f"{locate(group, name)}: expected one number, got {values.min():g} to {values.max():g}"
@@ -55,21 +50,19 @@ def single(group: h5py.Group, name: str) -> float | None:
 
 
 def values_of(group: h5py.Group, places: Mapping[str, str]) -> dict[str, Value]:
-    """Read the numbers of a file that are there and not 0, by the names of their settings."""
-    numbers = {name: single(group, place) for name, place in places.items()}
-    return {
-        name: Value(number, f"in {group.name.strip('/')}/{places[name]}".replace("in /", "in "))
-        for name, number in numbers.items()
-        if number
-    }
+    """Read the numbers of a file that are there and not 0, by the names of their settings.
 
-
-def band_about(values: Mapping[str, Value], share: float | None, place: str) -> dict[str, Value]:
-    """Band about the centre frequency, by its width as a share of that; none where either is not known."""
-    centre = values.get("centre_frequency_hz")
-    if not share or centre is None:
-        return {}
-    return {"bandwidth_hz": Value((centre.value * (1 - share / 2), centre.value * (1 + share / 2)), place)}
+    A bandwidth is a share of the centre frequency, or in percent of it where its name says so.
+    """
+    values = dict[str, Value]()
+    for name, place in places.items():
+        if number := single(group, place):
+            values[name] = Value(number, f"in {group[place].name[1:]}")
+    if (band := values.pop("bandwidth_hz", None)) and (centre := values.get("centre_frequency_hz")):
+        half = band.value / (200 if "percent" in band.source else 2)
+        edges = centre.value * (1 - half), centre.value * (1 + half)
+        values["bandwidth_hz"] = replace(band, value=edges)
+    return values
 
 
 def by_phase(

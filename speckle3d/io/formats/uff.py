@@ -25,7 +25,6 @@ import numpy as np
 
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.io.formats.hdf5_values import (
-    band_about,
     by_phase,
     fan_values,
     flat,
@@ -89,9 +88,8 @@ def open_uff(file: h5py.File, settings: ImportSettings) -> Facts:
     values["demodulation_frequency_hz"] = modulation
     if modulation_hz:
         values["centre_frequency_hz"] = replace(modulation, source=f"assumed: {modulation.source[3:]}")
-    if pulse := values_of(group, {"centre_frequency_hz": "pulse/center_frequency"}):
-        share = single(group, "pulse/fractional_bandwidth")
-        values |= pulse | band_about(pulse, share, f"in {name}/pulse/fractional_bandwidth")
+    pulse = {"centre_frequency_hz": "pulse/center_frequency", "bandwidth_hz": "pulse/fractional_bandwidth"}
+    values |= values_of(group, pulse)
     for channels in (channels for channels, kind in objects.items() if kind == _CHANNEL_CLASS):
         values |= values_of(file, {"speed_of_sound_m_s": f"{channels}/sound_speed"})
     shape = count, lines, samples

@@ -18,7 +18,6 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
@@ -26,11 +25,10 @@ import h5py
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from speckle3d.core.arrays import FloatArray
+from speckle3d.core.arrays import AnyArray, FloatArray
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.sweep import Tracker
 from speckle3d.io.formats.hdf5_values import (
-    band_about,
     by_phase,
     fan_values,
     frame_of,
@@ -67,72 +65,69 @@ _ROTATIONS = ("quaternion_wxyz", "quaternion_xyzw", "euler_xyz")
 
 def is_zea(file: h5py.File) -> bool:
     """Whether an open file has zea's groups, and no format of this package's family."""
-    return not file_format(file) and bool(_arrays(file, (*_READ, *_CHANNEL_DATA)))
+    kinds = {Path(name).name for name in _members(file)}
+    return not file_format(file) and not kinds.isdisjoint((*_READ, *_CHANNEL_DATA))
 
 
-def _homes(file: h5py.File) -> list[str]:
-    """Prefixes of the ``data`` groups: empty at the root, ``tracks/NAME/`` of tracks."""
+def _members(file: h5py.File) -> list[str]:
+    """Members of the ``data`` groups: at the root, or of tracks."""
     tracks = find_member(file, "tracks")
-    names = sorted(map(str, tracks)) if isinstance(tracks, h5py.Group) else []
-    homes = [""] if has_member(file, "data") else [f"tracks/{name}/" for name in names]
-    return [home for home in homes if isinstance(find_member(file, f"{home}data"), h5py.Group)]
-
-
-def _arrays(file: h5py.File, kinds: Sequence[str]) -> list[tuple[str, str, str]]:
-    """Names of arrays of some kinds, their kinds, and the prefixes of their ``data`` groups."""
-    names = ((f"{home}data/{kind}", kind, home) for kind in kinds for home in _homes(file))
-    return [row for row in names if has_member(file, row[0])]
+    homes = ["data", *(f"tracks/{name}/data" for name in tracks or ())]
+    groups = ((home, find_member(file, home)) for home in homes)
+    return [f"{home}/{name}" for home, group in groups if isinstance(group, h5py.Group) for name in group]
 
 
 def open_zea(file: h5py.File, settings: ImportSettings) -> Facts:
     """Read beamformed RF or I/Q, else an envelope, else images; with the probe's poses."""
-    path = Path(file.filename)
-    members = [f"{home}data/{name}" for home in _homes(file) for name in file[f"{home}data"]]
+    path, members = Path(file.filename), _members(file)
     contents = ", ".join(members)
     if any(name.endswith(_CHANNEL_DATA) for name in members):
         contents += ": channel data need beamforming, by zea's Pipeline, and its result written"
     yield "holds", contents, ""
     choice = settings.arrays.get("data", "").strip("/").removesuffix("/values")
-    arrays = [row for row in _arrays(file, _READ) if choice in ("", row[0])]
-    if not arrays:
-        raise InvalidInputError(f"expected {' or '.join(_READ)}, got {contents}")
-    name, kind, home = arrays[0]
-    if kind in [row[1] for row in arrays[1:]]:
+    kinds = ([name for name in members if Path(name).name == kind and choice in ("", name)] for kind in _READ)
+    names = next(filter(None, kinds), [])
+    if len(names) != 1:
         raise InvalidInputError(
-            f"expected one track, got {contents}: say which by arrays = {{ data = NAME }} in "
-            f"{path.name}.toml beside it"
+            f"expected one of {' or '.join(_READ)}, got {contents}: say which by arrays = {{ data = NAME }} "
+            f"in {path.name}.toml beside it"
         )
-    yield "read", name, ""
-    group, scan = find_member(file, name), f"{home}scan"
+    yield "read", names[0], ""
+    group, kind = find_member(file, names[0]), Path(names[0]).name
+    is_alone = len({Path(name).parent for name in members}) == 1
+    home = names[0].removesuffix(f"data/{kind}")
+    scan, has_channels, has_places = (
+        f"{home}scan",
+        kind == "beamformed_data",
+        has_member(group, "coordinates"),
+    )
     node = group if isinstance(group, h5py.Dataset) else require_dataset(group, "values")
-    places = {"speed_of_sound_m_s": f"{scan}/sound_speed", "centre_frequency_hz": f"{scan}/center_frequency"}
-    values = values_of(file, places)
-    percent = single(file, f"{scan}/bandwidth_percent") or 0.0
-    values |= band_about(values, percent / 100.0, f"in {scan}/bandwidth_percent")
-    is_image, has_channels = node.dtype == np.uint8, kind == "beamformed_data"
-    is_sound = node.dtype.kind == "f" or (is_image and kind.startswith("image"))
     sizes, channels = node.shape[:3], node.shape[3:]
-    if not is_sound or len(sizes) < 3 or channels not in ([(1,), (2,)] if has_channels else [()]):
+    if len(sizes) < 3 or channels not in ([(1,), (2,)] if has_channels else [()]):
         raise InvalidInputError(
             f"{locate(node)}: expected echoes of shape (frame, z, x), of beamformed_data (frame, z, x, 1 or "
             f"2), got {node.shape} {node.dtype}"
         )
-    left_mm, x_first, has_places = None, False, has_member(group, "coordinates")
+    places = {
+        "speed_of_sound_m_s": f"{scan}/sound_speed",
+        "centre_frequency_hz": f"{scan}/center_frequency",
+        "bandwidth_hz": f"{scan}/bandwidth_percent",
+    }
+    values, left_mm, x_first = values_of(file, places), None, False
     if has_places:
         numbers, left_mm, x_first = _pixels(require_dataset(group, "coordinates"), sizes)
         values |= numbers
     lines, samples = sizes[1:] if x_first else sizes[:0:-1]
     shape, is_complex = (sizes[0], lines, samples), channels == (2,)
-    source = HDF5Slices(
-        path, (str(node.name),), partial(frame_of, shape=shape[1:], across=not x_first, pairs=is_complex)
-    )
-    if has_channels or is_image:
-        frames = source.frames(shape, np.uint8 if is_image else np.complex64 if is_complex else np.float32)
+    turn = partial(frame_of, shape=shape[1:], across=not x_first, pairs=is_complex)
+    source = HDF5Slices(path, (str(node.name),), turn)
+    if has_channels or node.dtype == np.uint8:
+        dtype = np.complex64 if is_complex else np.float32 if has_channels else np.uint8
+        frames = source.frames(shape, dtype)
     else:
-        is_db, given_db = kind != "envelope_data", settings.dynamic_range_db
-        frames, values["dynamic_range_db"] = grey_frames(source, shape, is_db, given_db)
-    shift_hz = single(file, f"{scan}/demodulation_frequency")
-    if is_complex and shift_hz and has_places:
+        is_db, range_db = kind != "envelope_data", settings.dynamic_range_db
+        frames, values["dynamic_range_db"] = grey_frames(source, shape, is_db, range_db)
+    if is_complex and has_places and (shift_hz := single(file, f"{scan}/demodulation_frequency")):
         stated = Value(source="of scan/demodulation_frequency")
         values["demodulation_frequency_hz"] = by_phase(frames, shift_hz, stated, values, settings)
     try:
@@ -144,7 +139,7 @@ def open_zea(file: h5py.File, settings: ImportSettings) -> Facts:
         settings,
         frames,
         values,
-        time_s=_times(file, group, scan, shape[0]),
+        time_s=_times(file, group, scan if is_alone else "", shape[0]),
         tracker=tracker,
         chain=_POSES,
         probe=settings.probe or text_of(file.attrs.get("probe_name", file.attrs.get("probe"))),
@@ -154,7 +149,7 @@ def open_zea(file: h5py.File, settings: ImportSettings) -> Facts:
 
 
 def _pixels(node: h5py.Dataset, shape: tuple[int, ...]) -> tuple[dict[str, Value], float | None, bool]:
-    """Where the pixels of a Cartesian or polar grid lie, the same in all frames.
+    """Where the pixels of a Cartesian or polar grid lie, by the first frame.
 
     Returns
     -------
@@ -164,31 +159,31 @@ def _pixels(node: h5py.Dataset, shape: tuple[int, ...]) -> tuple[dict[str, Value
     x_first : bool
         Whether the first axis counts lines.
     """
+    where, source = locate(node), "of the coordinates"
     if node.shape != (*shape, 3) or 0 in shape:
-        raise InvalidInputError(f"{locate(node)}: expected shape {(*shape, 3)}, got {node.shape}")
-    start, middle, end = (1e3 * node[i].astype(np.float64) for i in (0, shape[0] // 2, shape[0] - 1))
-    source, where = "of the coordinates", locate(node)
+        raise InvalidInputError(f"{where}: expected shape {(*shape, 3)}, got {node.shape}")
+    places_mm = 1e3 * node[0].astype(np.float64)
 
-    def is_zero(*off: FloatArray) -> bool:
+    def is_zero(*off: AnyArray) -> bool:
         return bool(max(np.abs(array).max() for array in off) <= _TOLERANCE_MM)
 
     for x_first in (False, True):
-        x, y, z = (start if x_first else start.swapaxes(0, 1)).transpose(2, 0, 1)
-        if not is_zero(y - y[0, 0], middle - start, end - start):
-            break
-        if is_zero(x - x[:, :1], z - z[:1]) and np.ptp(x) * np.ptp(z) > 0:
+        x, y, z = np.moveaxis(places_mm if x_first else places_mm.swapaxes(0, 1), 2, 0)
+        if is_zero(x - x[:, :1], z - z[:1], y - y[0, 0]) and np.ptp(x) * np.ptp(z) > 0:
             return grid_values(x[:, 0], z[0], where, source), float(x[0, 0]), x_first
-        # Lines meet where the distance from all of them is least.
-        angle = np.arctan2(x[:, -1] - x[:, 0], z[:, -1] - z[:, 0])
-        normals = np.column_stack([np.cos(angle), -np.sin(angle)])
-        apex = np.linalg.lstsq(normals, normals[:, 0] * x[:, 0] + normals[:, 1] * z[:, 0])[0]
-        radius = np.hypot(x[0] - apex[0], z[0] - apex[1])
-        across, down = np.outer(np.sin(angle), radius), np.outer(np.cos(angle), radius)
-        if is_zero(x - apex[0] - across, z - apex[1] - down) and np.ptp(angle) > 0:
-            return fan_values(angle, radius, -float(apex[1]), where, source), None, x_first
+        # Lines meet where the distance from all of them is least; places are complex, z + ix.
+        place = z + 1j * x
+        angle = np.angle(place[:, -1] - place[:, 0])
+        along = np.exp(1j * angle)
+        apex = np.linalg.lstsq(np.column_stack([-along.imag, along.real]), (place[:, 0] * along.conj()).imag)[
+            0
+        ] @ [1, 1j]
+        radius = np.abs(place[0] - apex)
+        if is_zero(place - apex - np.outer(along, radius), y - y[0, 0]) and np.ptp(angle) > 0:
+            return fan_values(angle, radius, -float(apex.real), where, source), None, x_first
     raise InvalidInputError(
-        f"{locate(node)}: expected pixels on a Cartesian or polar grid in one plane, the same in all frames, "
-        "got others: beamform onto zea's cartesian_pixel_grid, or scan-convert them"
+        f"{where}: expected pixels on a Cartesian or polar grid in one plane, got others: beamform onto "
+        "zea's cartesian_pixel_grid, or scan-convert them"
     )
 
 
@@ -202,7 +197,7 @@ def _times(file: h5py.File, group: h5py.Group, scan: str, count: int) -> FloatAr
             read_array(group, "timestamps", (count,)) + (single(group, "start_time_offset") or 0)
         )
     name = f"{scan}/time_to_next_transmit"
-    if len(_homes(file)) > 1 or not has_member(file, name):
+    if not scan or not has_member(file, name):
         return None
     # The last transmission of all has no next one.
     lengths = read_array(file, name, (count, "transmission"))[:-1].sum(axis=1)
@@ -225,15 +220,13 @@ def _tracker(file: h5py.File, left_mm: float | None) -> tuple[Tracker | None, li
     rate, count = single(node, "sampling_frequency"), len(places_m)
     turns = read_array(node, "rotation", (count, 3 if is_euler else 4))
     stamps = np.arange(count) / rate if rate else read_array(node, "timestamps", (count,))
-    sound = np.isfinite(turns).all(axis=1) & (turns.any(axis=1) | is_euler)
-    turns[~sound] = 1.0
     if is_euler:
         rotations = Rotation.from_euler("xyz", turns)
     else:
+        turns[~turns.any(axis=1)] = np.nan
         rotations = Rotation.from_quat(turns, scalar_first=kind == "quaternion_wxyz")
     matrices = np.tile(np.eye(4), (count, 1, 1))
     matrices[:, :3, :3], matrices[:, :3, 3] = rotations.as_matrix(), 1e3 * places_m
-    matrices[~sound] = np.nan
     readings, notes = timed_poses(stamps + (single(node, "start_time_offset") or 0.0), matrices)
     if readings is None:
         return None, [*notes, f"{_POSES}: no pose is of use"]
