@@ -31,7 +31,6 @@ References
 from __future__ import annotations
 
 import re
-from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -50,7 +49,7 @@ G_M_S2 = 9.80665
 MEANING = "scalar first, world from sensor"
 
 _VECTORS = [f"{name} {axis}" for name in ("accelerometer", "gyroscope", "magnetometer") for axis in "xyz"]
-_NAMES = [*_VECTORS, "q0", "q1", "q2", "q3"]
+_NAMES = ["timestamp", *_VECTORS, "q0", "q1", "q2", "q3"]
 _FIELD = re.compile(r"(\w[\w ]*): *([-+.\w]+)")
 _MOST_OFF_DEG = 10.0
 """A hand's accelerations of a tenth of g tilt what is measured by 6 deg."""
@@ -110,14 +109,10 @@ def read_samples(member: Member) -> SensorSamples:
     InvalidInputError
         If no sample is of use.
     """
-    documents = [text for text in re.split(r"^---.*$", member.text(), flags=re.MULTILINE) if text.strip()]
-    table = np.full((len(documents), 14), np.nan)
-    for row, text in zip(table, documents, strict=True):
-        fields = dict(_FIELD.findall(text))
-        with suppress(ValueError, KeyError):  # what cannot be read stays without a time or a value
-            row[1:] = [float(fields.get(name, "nan")) for name in _NAMES]
-            row[0] = int(fields["timestamp"]) / 1e9
-    stamps, table = table[:, 0], table[:, 1:]
+    documents = filter(str.strip, re.split(r"^---.*$", member.text(), flags=re.MULTILINE))
+    fields = map(dict, map(_FIELD.findall, documents))
+    rows = [[_number(sample.get(name, "")) for name in _NAMES] for sample in fields]
+    stamps, table = np.split(np.array(rows).reshape(-1, len(_NAMES)), [1], axis=1)
     # A magnetometer and a quaternion are in some files alone.
     has_column = np.isfinite(table).sum(axis=0) > 0.5 * len(table)
     table[:, ~has_column] = 0.0
@@ -127,37 +122,50 @@ def read_samples(member: Member) -> SensorSamples:
     faults = np.where(sound, "", "without a value, or a quaternion of unit length").astype(object)
     repeats = np.flatnonzero(sound)[1:][(np.diff(table[sound], axis=0) == 0).all(axis=1)]
     faults[repeats] = "with the values of the one before"
-    places, remarks = usable("samples of the sensor", stamps, faults.tolist())
+    places, remarks = usable("samples of the sensor", stamps[:, 0] / 1e9, faults.tolist())
     if not places.size or not has_column[:6].all():
         raise InvalidInputError(f"{member.where}: expected samples of the sensor, got none of use")
-    time_s, parts = stamps[places], np.split(table[places], [3, 6, 9], axis=1)
-    measured_g, gyroscope, magnetometer, wxyz = parts
+    measured_g, gyroscope, magnetometer, wxyz = np.split(table[places], [3, 6, 9], axis=1)
     norms = np.linalg.norm(measured_g, axis=1)
     if not _LEAST_G <= np.median(norms) <= _MOST_G:
         remarks.append(
             f"the accelerometer's median norm is {np.median(norms):.3g} g, and 1 g is felt at rest: its unit "
             "or scale is another than assumed"
         )
-    rotation, sign, fault, rows = None, -1.0, "is missing", list[Row]()
+    rotation, sign, fault, facts = None, -1.0, "is missing", list[Row]()
     if has_column[9:].all():
         rotation = Rotation.from_quat(wxyz, scalar_first=True)
         along = rotation.apply(measured_g)[:, 2] / norms
         sign = 1.0 if along.mean() >= 0 else -1.0
         off = np.rad2deg(np.sqrt(np.mean(np.arccos(np.clip(sign * along, -1.0, 1.0)) ** 2)))
         meaning = "specific force" if sign > 0 else "gravity (against the world's z): negated"
-        rows = [
+        facts = [
             ("quaternion, off the vertical", f"{off:.2f}", "deg RMS"),
             ("accelerometer taken as", meaning, ""),
+            ("quaternion", f"{MEANING} (checked against the accelerometer)", ""),
         ]
         if off >= _MOST_OFF_DEG:
             rotation, sign, fault = None, -1.0, "does not agree with gravity"
     if rotation is None:
+        facts = facts[:2]
         remarks.append(
             f"the sensor's quaternion {fault}: the sweep has no orientation, which `speckle3d imu orient "
             f"{member.path} --into SWEEP.h5` finds"
         )
-    else:
-        rows.append(("quaternion", f"{MEANING} (checked against the accelerometer)", ""))
-    force = sign * G_M_S2 * measured_g
-    field = magnetometer if has_column[6:9].all() else None
-    return SensorSamples(time_s, force, gyroscope, field, rotation, rows, remarks)
+    return SensorSamples(
+        stamps[places, 0] / 1e9,
+        sign * G_M_S2 * measured_g,
+        gyroscope,
+        magnetometer if has_column[6:9].all() else None,
+        rotation,
+        facts,
+        remarks,
+    )
+
+
+def _number(text: str) -> float:
+    """Number that a text holds; NaN where it is none."""
+    try:
+        return float(text)
+    except ValueError:
+        return np.nan

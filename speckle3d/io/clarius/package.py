@@ -15,15 +15,13 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.files import open_regular
 from speckle3d.io.hdf5 import reading
 
 _NAME = re.compile(
     r"(?!\.)(?:(?P<name>.*)_)?(?P<kind>rf|iq|env|imu)\.(?P<content>raw|ya?ml|tgc)(?:(?<=raw)\.lzo)?"
 )
-_FIELD = re.compile(rb"^(?:# raw data parameters|sampling rate:|size:|timestamp:)", re.MULTILINE)
-_START_BYTES = 4096
 
 
 @dataclass(frozen=True)
@@ -59,16 +57,11 @@ class Member:
         """Name for messages: the file, and the member where it is one."""
         return str(self.path) if self.path.name == Path(self.name).name else f"{self.path}: {self.name}"
 
-    @property
-    def is_of_scanner(self) -> bool:
-        """Whether the scanner wrote it, unlike others' ``my_env.yml``."""
-        return self.content in ("raw", "tgc") or _FIELD.search(self.read(_START_BYTES)) is not None
-
-    def read(self, limit: int | None = None) -> bytes:
-        """Read all bytes, or the first ones."""
+    def read(self) -> bytes:
+        """Read all bytes."""
         with open_regular(self.path) as stream:
             stream.seek(self.start)
-            return stream.read(self.size if limit is None else min(self.size, limit))
+            return stream.read(self.size)
 
     def text(self) -> str:
         """Content as text in UTF-8."""
@@ -82,41 +75,19 @@ class Files:
 
     Attributes
     ----------
-    path : path
-        As it was given.
     name : str
         What the names of all its files begin with; a time stamp.
     """
 
-    path: Path
     name: str
     raw: dict[str, Member]
     yml: dict[str, Member]
 
-    def require_samples(self) -> None:
-        """Refuse descriptions without raw samples, and samples without a description.
 
-        Raises
-        ------
-        InvalidInputError
-            Naming the files that are lacking.
-        """
-        kinds = self.raw.keys() - self.yml.keys() if self.raw else self.yml.keys() - {"imu"}
-        if kinds or not self.raw:
-            start, suffix = f"{self.name}_" if self.name else "", "yml" if self.raw else "raw"
-            lacks = " or ".join(f"{start}{kind}.{suffix}" for kind in sorted(kinds)) or "samples (.raw)"
-            names = [Path(member.name).name for member in (*self.raw.values(), *self.yml.values())]
-            raise InvalidInputError(
-                f"{self.path}: expected {lacks} beside {', '.join(names) or 'their gain (.tgc)'}, got none"
-            )
-
-
-def is_package(path: Path, start: bytes) -> bool:
+def is_package(path: Path, _: bytes) -> bool:
     """Whether a file or folder looks like a package, or one file of one."""
-    is_part = path.is_file() and _NAME.fullmatch(path.name)
-    if is_part or path.is_dir() or path.suffix.lower() == ".tar" or start[257:262] == b"ustar":
-        with suppress(OSError, ValueError):
-            return any(member.is_of_scanner for member in _members(path))
+    with suppress(FileError, OSError):
+        return bool(_members(path))
     return path.suffix.lower() == ".tar"  # one that is cut says so when it is read
 
 
@@ -136,16 +107,15 @@ def find_files(path: Path) -> Files:
         If it holds several recordings or none.
     """
     members = _members(path)
-    recordings = sorted({member.recording for member in members if member.is_of_scanner})
+    recordings = sorted({member.recording for member in members})
     if len(recordings) != 1:
         raise InvalidInputError(
             f"{path}: expected files of one recording, as 2024-05-01_rf.raw and _rf.yml, got those of "
             f"{', '.join(recordings) or 'none'}: give the raw file of one (of a tar file: unpack it first)"
         )
-    members = [member for member in members if member.recording == recordings[0]]
     raw = {member.kind: member for member in members if member.content == "raw"}
     yml = {member.kind: member for member in members if member.content.startswith("y")}
-    return Files(path, Path(recordings[0]).name, raw, yml)
+    return Files(Path(recordings[0]).name, raw, yml)
 
 
 def _members(path: Path) -> list[Member]:

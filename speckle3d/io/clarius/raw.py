@@ -13,7 +13,6 @@ References
 from __future__ import annotations
 
 import struct
-import zlib
 from functools import lru_cache
 from typing import Any
 
@@ -23,7 +22,6 @@ from speckle3d.core.arrays import AnyArray, ComplexArray
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.extras import extra_module
 from speckle3d.io.clarius.package import Member
-from speckle3d.io.clarius.sidecars import Description
 from speckle3d.io.frames import ReadFrame
 from speckle3d.io.hdf5 import reading
 
@@ -33,7 +31,7 @@ SAMPLES = {"RF": ("<i2", 1, np.int16), "IQ": ("<i2", 2, np.complex64), "envelope
 """By kind: type of the numbers in the file, how many make a sample, and type of the samples."""
 
 
-def open_raw(member: Member, yml: Description) -> AnyArray:
+def open_raw(member: Member, kind: str) -> AnyArray:
     """Frames as they lie in a raw file: ``time`` in ns and ``samples``, shape (line, sample, part).
 
     Raises
@@ -41,31 +39,28 @@ def open_raw(member: Member, yml: Description) -> AnyArray:
     FileError
         If the file ends early.
     InvalidInputError
-        If its header contradicts the yml.
+        If its samples are of another size than those of the kind.
     """
-    content, (dtype, parts, _) = _content(member), SAMPLES[yml.kind]
-    size = yml.size.lines, yml.size.samples
-    expected = (yml.frames, *size, parts * np.dtype(dtype).itemsize)
-    header = HEADER.unpack(bytes(content[: HEADER.size]).ljust(HEADER.size, b"\0"))[1:]
-    if header != expected or 0 in header:
+    content, (dtype, parts, _) = _content(member), SAMPLES[kind]
+    _, count, *size, sample_bytes = HEADER.unpack(content[: HEADER.size])
+    if sample_bytes != parts * np.dtype(dtype).itemsize:
         raise InvalidInputError(
-            f"{member.where}: header: expected frames, lines, samples and bytes of a sample of {yml.kind} "
-            f"as in the yml, {expected}, got {header}"
+            f"{member.where}: expected samples of {kind} as in the yml, got some of {sample_bytes} bytes"
         )
     record = np.dtype([("time", "<u8"), ("samples", dtype, (*size, parts))])
     whole = (len(content) - HEADER.size) // record.itemsize
-    if whole < yml.frames:
-        raise FileError(f"{member.where}: ends early: {whole} of {yml.frames} frames")
-    return np.frombuffer(content, record, yml.frames, HEADER.size)
+    if whole < count:
+        raise FileError(f"{member.where}: ends early: {whole} of {count} frames")
+    return np.frombuffer(content, record, count, HEADER.size)
 
 
-def open_frames(member: Member, yml: Description, turns: ComplexArray | None = None) -> ReadFrame:
+def open_frames(member: Member, kind: str, turns: ComplexArray | None = None) -> ReadFrame:
     """Map or unpack a raw file, whose I/Q are multiplied by `turns`, shape (sample,)."""
-    samples = open_raw(member, yml)["samples"]
+    samples = open_raw(member, kind)["samples"]
 
     def frame(i: int) -> Any:
         parts = samples[i]
-        echoes = (parts.astype(np.float32).view(np.complex64) if yml.kind == "IQ" else parts)[..., 0]
+        echoes = (parts.astype(np.float32).view(np.complex64) if kind == "IQ" else parts)[..., 0]
         return echoes if turns is None else echoes * turns
 
     return frame
@@ -90,14 +85,11 @@ def _unpack(member: Member, _: int) -> bytes:
     at = 37 if flags & 0x800 else 33
     at += 1 + content[at] + 4
     plain, packs = (sum(bool(flags & bit) for bit in bits) for bits in ((0x1, 0x100), (0x2, 0x200)))
-    check = zlib.adler32 if flags & 0x1 else zlib.crc32
-    while any((lengths := content[at : at + 12].ljust(12, b"\0"))[:4]):
-        unpacked_size, size, check_sum = struct.unpack(">III", lengths)
+    while any((lengths := content[at : at + 8].ljust(8, b"\0"))[:4]):
+        unpacked_size, size = struct.unpack(">II", lengths)
         at += 8 + 4 * (plain + (packs if size < unpacked_size else 0))  # behind the check sums
         with reading(f"{member.where}: block {len(parts)}"):
             part = content[at : at + size]
             parts.append(part if size == unpacked_size else bytes(lzo.decompress(part, unpacked_size)))
-            if plain and check(parts[-1]) != check_sum:
-                raise ValueError("damaged: its check sum is another")
         at += size
     return b"".join(parts)

@@ -32,17 +32,16 @@ import numpy as np
 from scipy.integrate import cumulative_trapezoid
 
 from speckle3d.core.arrays import FloatArray
-from speckle3d.core.errors import FileError, InvalidInputError, naming
+from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.io.clarius.imu import SensorSamples, read_samples
 from speckle3d.io.clarius.package import find_files, is_package
 from speckle3d.io.clarius.raw import SAMPLES, open_frames, open_raw
-from speckle3d.io.clarius.sidecars import Description, yml_fields
+from speckle3d.io.clarius.sidecars import Description
 from speckle3d.io.clarius.spectrum import band_hz
 from speckle3d.io.frames import FileFrames
 from speckle3d.io.import_settings import SPEED_OF_SOUND_M_S, ImportSettings
 from speckle3d.io.readers import Reader
 from speckle3d.io.recordings import Facts, Recording, Value, step_of
-from speckle3d.io.toml import validated
 
 FORMAT = "Clarius raw package"
 
@@ -55,7 +54,6 @@ CONVEX = ("C3", "C7", "EC7", "PH", "PA2", "PA", "TV")
 BEFORE_DEPTH_S = 1e-6
 """Delay that is not depth; see above."""
 
-_ORDER = ("RF", "IQ", "envelope")
 _FACTS = (
     "type", "frames", "frame rate", "sampling rate", "delay samples", "transmit frequency", "imaging depth",
     "vsound", "speed of sound",
@@ -66,8 +64,6 @@ _YML = "its yml"
 def open_package(path: Path, settings: ImportSettings) -> Facts:
     """Read a package: RF is preferred, else I/Q, else the envelope. Times are of the scanner's clock."""
     files = find_files(path)
-    if path.suffix == ".tgc":  # which tells nothing without samples
-        files.require_samples()
     yield "recording", files.name or "without a name", ""
     sensor, remarks = None, list[str]()
     if "imu" in files.yml:
@@ -77,58 +73,60 @@ def open_package(path: Path, settings: ImportSettings) -> Facts:
             remarks += sensor.remarks
         except (InvalidInputError, FileError) as error:
             remarks.append(f"the sensor is left out: {error}")
-    fields = {kind: yml_fields(file.text(), file.where) for kind, file in files.yml.items() if kind != "imu"}
-    for kind, texts in fields.items():
-        facts = ((name, texts[name]) for name in _FACTS if texts.get(name))
+    ymls = {kind: Description.of(file) for kind, file in files.yml.items() if kind != "imu"}
+    for kind, yml in ymls.items():
+        facts = ((name, yml.fields[name]) for name in _FACTS if yml.fields.get(name))
         yield from ((f"{kind}: {name}", str(text)[:60], "") for name, text in facts)
-    files.require_samples()
-    descriptions = {kind: validated(fields[kind], files.yml[kind].where, Description) for kind in files.raw}
-    kind = min(files.raw, key=lambda kind: _ORDER.index(descriptions[kind].kind))
+    if (kinds := files.raw.keys() - ymls.keys()) or not files.raw:
+        start, suffix = f"{files.name}_" if files.name else "", "yml" if kinds else "raw"
+        lacks = " or ".join(f"{start}{kind}.{suffix}" for kind in sorted(kinds or ymls)) or "samples (.raw)"
+        raise InvalidInputError(f"{path}: expected {lacks} beside it, got none")
+    kind = min(files.raw, key=lambda kind: [*SAMPLES].index(ymls[kind].kind))
     yield "sweep is made from", kind, ""
-    yml = descriptions[kind]
-    member, turns = files.raw[kind], None
-    records = open_raw(member, yml)
-    with naming(files.yml[kind].where):
-        elements = _elements(yml)
-        per_line = step_of(elements, "lines (packets of a Doppler mode are no image): rx element")
+    yml, member, signal = ymls[kind], files.raw[kind], ymls[kind].kind
+    records = open_raw(member, signal)
+    shape = records["samples"].shape[:3]
+    elements = _elements(yml, shape[1])
     yield "first line at element", f"{elements[0]:g}, taken as the image's left", ""
 
-    rate_hz = settings.sampling_rate_hz or yml.rate_hz
-    speed_m_s = settings.speed_of_sound_m_s or yml.speed_m_s or SPEED_OF_SOUND_M_S
-    spacing_mm, first_mm = 1e3 * speed_m_s / (2.0 * rate_hz), None
-    # Less than a sample above the array is 0: the delay is a whole number of samples.
-    if yml.delay is not None and (after := yml.delay - BEFORE_DEPTH_S * rate_hz) > -1.0:
-        first_mm = max(after, 0.0) * spacing_mm
-    probe, pitch = settings.probe or yml.probe.model, _pitch(yml, per_line, settings)
-    spreading = _spreading(yml, elements[[0, -1]], per_line, pitch, probe)
+    yml_rate_hz, speed_m_s = (
+        yml.require("sampling rate"),
+        yml.number("vsound") or yml.number("speed of sound"),
+    )
+    rate_hz, transmit_hz = settings.sampling_rate_hz or yml_rate_hz, yml.number("transmit frequency")
+    spacing_mm = 1e3 * (settings.speed_of_sound_m_s or speed_m_s or SPEED_OF_SOUND_M_S) / (2.0 * rate_hz)
+    first_mm, model = None, _model(settings.probe or yml.model)
+    if (delay := yml.number("delay samples")) is not None:
+        first_mm = max(delay - BEFORE_DEPTH_S * rate_hz, 0.0) * spacing_mm
     values = {
         "first_sample_depth_mm": Value(first_mm, "delay samples, less 1 us before depth 0 (assumed)", _YML),
-        "vector_pitch_mm": pitch,
         "row_spacing_mm": Value(spacing_mm, f"of {rate_hz / 1e6:g} MHz", _YML),
-        "sampling_rate_hz": Value(yml.rate_hz, "", _YML),
-        "centre_frequency_hz": Value(yml.transmit_hz, "transmit frequency", _YML),
-        **({} if yml.speed_m_s is None else {"speed_of_sound_m_s": Value(yml.speed_m_s, "", _YML)}),
-        **spreading,
+        "sampling_rate_hz": Value(yml_rate_hz, "", _YML),
+        "centre_frequency_hz": Value(transmit_hz, "transmit frequency", _YML),
+        **({"speed_of_sound_m_s": Value(speed_m_s, "", _YML)} if speed_m_s else {}),
+        **_line_values(yml, elements, settings, model),
     }
-    shift_hz, start_mm = settings.demodulation_frequency_hz, first_mm or settings.first_sample_depth_mm or 0.0
-    if yml.kind == "IQ" and yml.receive is not None:
-        shallow_hz, deep_hz, filter_mm = yml.receive
-        depths_mm = start_mm + spacing_mm * np.arange(yml.size.samples, dtype=np.float64)
-        middle_hz, slide = _oscillator(yml.receive, depths_mm, rate_hz)
-        values["demodulation_frequency_hz"] = Value(middle_hz, "of the lines' middle", _YML)
-        if shift_hz is None and shallow_hz != deep_hz:
-            turns = np.exp(2j * np.pi * slide)
-            remarks.append(
-                f"demodulation frequency from its yml: {shallow_hz / 1e6:g} to {deep_hz / 1e6:g} MHz "
-                f"over {filter_mm:g} mm, turned to that of the line's middle"
+    shift_hz, turns = None, None
+    if signal == "IQ":
+        shift_hz, receive = settings.demodulation_frequency_hz, yml.receive
+        if receive is not None:
+            start_mm = first_mm or settings.first_sample_depth_mm or 0.0
+            middle_hz, slide = _oscillator(
+                receive, start_mm + spacing_mm * np.arange(shape[2], dtype=np.float64), rate_hz
             )
-        shift_hz = middle_hz if shift_hz is None else shift_hz
-    narrow = np.int16 if yml.kind == "IQ" and turns is None else None
-    source, shape = partial(open_frames, member, yml, turns), records["samples"].shape[:3]
-    frames = FileFrames(member.path, source, shape, SAMPLES[yml.kind][2], narrow)
-    centre_hz, band = settings.centre_frequency_hz or yml.transmit_hz, None
-    shift_hz = None if yml.kind == "RF" else shift_hz
-    has_spectrum = yml.kind == "RF" or (yml.kind == "IQ" and shift_hz is not None)
+            values["demodulation_frequency_hz"] = Value(middle_hz, "of the lines' middle", _YML)
+            if shift_hz is None and slide.any():
+                turns = np.exp(2j * np.pi * slide)
+                remarks.append(
+                    f"demodulation frequency from its yml: {receive[0] / 1e6:g} to {receive[1] / 1e6:g} MHz "
+                    f"over {receive[2]:g} mm, turned to that of the line's middle"
+                )
+            shift_hz = middle_hz if shift_hz is None else shift_hz
+    narrow = np.int16 if signal == "IQ" and turns is None else None
+    source = partial(open_frames, member, signal, turns)
+    frames = FileFrames(member.path, source, shape, SAMPLES[signal][2], narrow)
+    centre_hz = settings.centre_frequency_hz or transmit_hz
+    band, has_spectrum = None, signal == "RF" or shift_hz is not None
     if settings.bandwidth_hz is None and centre_hz and has_spectrum:
         band = band_hz(frames, rate_hz, centre_hz, shift_hz)
     if band is not None:
@@ -145,12 +143,12 @@ def open_package(path: Path, settings: ImportSettings) -> Facts:
         time_s=records["time"] / 1e9,
         orientation=None if sensor is None else sensor.orientation,
         # In one spelling, so that curves and calibrations of a probe are found to be of it.
-        probe=f"Clarius {_model(probe)}" if _model(probe) in ELEMENT_PITCH_MM else probe,
+        probe=f"Clarius {model}" if model in ELEMENT_PITCH_MM else settings.probe or yml.model,
         name=files.name or path.stem,
         substitutes=dict.fromkeys(
-            ("vector_pitch_mm", "column_pitch_mm"), "element_pitch_mm" if probe else "probe"
+            ("vector_pitch_mm", "column_pitch_mm"), "element_pitch_mm" if model else "probe"
         ),
-        assumptions=() if spreading else ("parallel lines of a linear array",),
+        assumptions=() if "array_radius_mm" in values else ("parallel lines of a linear array",),
         remarks=tuple(remarks),
     )
 
@@ -175,7 +173,7 @@ def package_files(path: Path) -> Sequence[Path]:
 
 
 def _oscillator(
-    receive: tuple[float, float, float], depths_mm: FloatArray, rate_hz: float
+    receive: tuple[float, ...], depths_mm: FloatArray, rate_hz: float
 ) -> tuple[float, FloatArray]:
     """Demodulation frequency at the lines' middle, and turns of each sample that lead to it.
 
@@ -191,46 +189,45 @@ def _oscillator(
     return middle_hz, cumulative_trapezoid(oscillator_hz - middle_hz, initial=0) / rate_hz
 
 
-def _elements(yml: Description) -> FloatArray:
+def _elements(yml: Description, count: int) -> FloatArray:
     """Elements at which the lines are received; lines that are steered are refused."""
-    elements, angle_deg = yml.places.T
+    elements, angle_deg = yml.places(count).T
     if (oblique := np.flatnonzero(angle_deg)).size:
         raise InvalidInputError(
-            f"lines[{oblique[0]}]: angle: expected 0 (lines that are not steered), got "
-            f"{angle_deg[oblique[0]]:g} deg, and {oblique.size} of {angle_deg.size} lines steered: record "
+            f"{yml.where}: lines[{oblique[0]}]: angle: expected 0 (lines that are not steered), got "
+            f"{angle_deg[oblique[0]]:g} deg, and {oblique.size} of {count} lines steered: record "
             "without steering and Doppler, or give another of its raw files"
         )
     return np.asarray(elements)
 
 
-def _pitch(yml: Description, per_line: float, settings: ImportSettings) -> Value:
-    """Distance between lines at the array, mm, by the element pitch: the option's, the yml's, the table's."""
-    model = _model(settings.probe or yml.probe.model)
+def _line_values(
+    yml: Description, elements: FloatArray, settings: ImportSettings, model: str
+) -> dict[str, Value]:
+    """Distance between lines at the array, by the element pitch of the option, the yml or the table.
+
+    Of a curved array its radius and the lines' angles, too, without values where they are not known.
+    """
+    per_line = step_of(elements, f"{yml.where}: lines (packets of a Doppler mode are no image): rx element")
     pitches = {
         "as given": settings.element_pitch_mm,
-        _YML: yml.probe.pitch,
+        _YML: yml.number("probe", "pitch"),
         f"the maker's table, {model}": ELEMENT_PITCH_MM.get(model),
     }
-    for source, element_mm in pitches.items():
+    pitch = Value(settings.vector_pitch_mm, "--vector-pitch-mm")  # also between columns of an envelope
+    for source, element_mm in reversed(pitches.items()):
         if element_mm is not None:
             words = f"{per_line:g} elements a line (yml) x {element_mm:g} mm ({source})"
-            return Value(element_mm * per_line, words, _YML)
-    return Value(settings.vector_pitch_mm, "--vector-pitch-mm")  # also between columns of an envelope
-
-
-def _spreading(
-    yml: Description, ends: FloatArray, per_line: float, pitch: Value, probe: str
-) -> dict[str, Value]:
-    """Radius and line angles of a curved array, without values where the radius is not known."""
-    radius_mm, elements = yml.probe.radius, yml.probe.elements
-    if not radius_mm and not _model(probe).startswith(CONVEX):
-        return {}
-    angles = Value()
+            pitch = Value(element_mm * per_line, words, _YML)
+    values = {"vector_pitch_mm": pitch}
+    radius_mm, count = yml.number("probe", "radius"), yml.number("probe", "elements")
+    if radius_mm or model.startswith(CONVEX):
+        values |= {"array_radius_mm": Value(radius_mm, "", _YML), "line_angles_deg": Value()}
     if radius_mm and pitch.value is not None:
-        off = ends - ((elements - 1) / 2 if elements else ends.mean())
-        degrees = np.rad2deg(off * pitch.value / per_line / radius_mm)
-        angles = Value(tuple(degrees.tolist()), f"of lines {pitch.source}", _YML)
-    return {"array_radius_mm": Value(radius_mm, "", _YML), "line_angles_deg": angles}
+        ends = elements[[0, -1]] - ((count - 1) / 2 if count else elements.mean())
+        degrees = np.rad2deg(ends * pitch.value / per_line / radius_mm)
+        values["line_angles_deg"] = Value(tuple(degrees.tolist()), f"of lines {pitch.source}", _YML)
+    return values
 
 
 def _model(probe: str) -> str:

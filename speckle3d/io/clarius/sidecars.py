@@ -14,15 +14,16 @@ from __future__ import annotations
 
 import math
 import re
-from typing import Annotated, Any, Literal
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-from pydantic import AliasChoices, BaseModel, BeforeValidator, Field
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.extras import extra_module
-from speckle3d.io.import_settings import LEAST_HZ
+from speckle3d.io.clarius.package import Member
+from speckle3d.io.hdf5 import reading
 
 _KINDS = {"rf": "RF", "iq": "IQ", "b pre-scan": "envelope", "envelope": "envelope", "b": "envelope"}
 _GAIN_LINE = re.compile(r"^tgc:.*(?:\n[ \t]+-.*)*$", re.MULTILINE)
@@ -32,115 +33,87 @@ _SIZES = {"khz": 1e3, "mhz": 1e6, "cm": 10.0, "um": 1e-3, "µm": 1e-3}
 _UNITS = {**dict.fromkeys(("", "hz", "mm", "m/s", "°", "deg"), 1.0), **_SIZES}
 
 
-def yml_fields(text: str, where: str) -> dict[str, Any]:
-    """Parse a YAML document of fields; their values are text, lists, or mappings.
+@dataclass(frozen=True)
+class Description:
+    """The yml of a raw file: fields that are text, lists, or mappings, and their place for messages."""
 
-    Raises
-    ------
-    InvalidInputError
-        If it is no YAML or holds other things, or PyYAML is not installed.
-    """
-    yaml = extra_module("yaml", "clarius", "a package of a Clarius scanner")
-    try:
-        document = yaml.load(_GAIN_LINE.sub("", text), Loader=getattr(yaml, "CBaseLoader", yaml.BaseLoader))
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise InvalidInputError(f"{where}: expected YAML, got an error: {error!s:.200}") from error
-    if not isinstance(document, dict):
-        raise InvalidInputError(f"{where}: expected fields, got a {type(document).__name__}")
-    return document
+    fields: dict[str, Any]
+    where: str
 
+    @classmethod
+    def of(cls, member: Member) -> Description:
+        """Parse a YAML document of fields.
 
-def _quantity(text: object) -> float | None:
-    """Parse text as ``60 MHz`` into Hz, mm, m/s or degrees; None if it is empty."""
-    if text in (None, "", "~"):
-        return None
-    parts = _NUMBER.fullmatch(str(text).replace(",", "."))
-    value = math.nan if parts is None else float(parts[1]) * _UNITS.get(parts[2].lower(), math.nan)
-    if not math.isfinite(value):
-        raise ValueError("expected a number and its unit")
-    return value
-
-
-Quantity = Annotated[float, BeforeValidator(_quantity)]
-Count = Annotated[int, BeforeValidator(_quantity)]
-Optional = Annotated[float | None, BeforeValidator(_quantity)]
-_OR_EMPTY = BeforeValidator(lambda value: value or [])
-
-
-class _Size(BaseModel):
-    lines: Count = Field(alias="number of lines")
-    samples: Count = Field(alias="samples per line")
-
-
-class _Line(BaseModel):
-    element: Quantity = Field(alias="rx element")
-    angle: Quantity
-
-
-class _Filter(BaseModel):
-    shallowfreq: Quantity
-    deepfreq: Quantity
-    filterdepth: Quantity
-
-
-class _Focus(BaseModel):
-    receive: Annotated[list[_Filter], _OR_EMPTY] = []
-
-
-class _Probe(BaseModel):
-    """Model of a probe, or its measures in mm."""
-
-    model: str = ""
-    radius: Optional = None
-    pitch: Optional = None
-    elements: Optional = None
-
-
-class Description(BaseModel):
-    """The yml of a raw file.
-
-    Attributes
-    ----------
-    kind : str
-        ``"RF"``, ``"IQ"`` or ``"envelope"``, by the field `type`, whatever the file is called.
-    """
-
-    kind: Annotated[
-        Literal["RF", "IQ", "envelope"],
-        BeforeValidator(lambda text: _KINDS.get(str(text).strip().lower(), text)),
-    ] = Field(alias="type")
-    compression: Literal["", "none"] = ""
-    frames: Count
-    size: _Size
-    lines: list[_Line]
-    rate_hz: Quantity = Field(alias="sampling rate", ge=LEAST_HZ)
-    delay: Optional = Field(None, alias="delay samples")
-    transmit_hz: Optional = Field(None, alias="transmit frequency")
-    speed_m_s: Optional = Field(None, validation_alias=AliasChoices("vsound", "speed of sound"))
-    focus: Annotated[list[_Focus], _OR_EMPTY] = []
-    probe: Annotated[
-        _Probe, BeforeValidator(lambda value: {"model": value} if isinstance(value, str) else value)
-    ] = _Probe()
+        Raises
+        ------
+        InvalidInputError
+            If it is no YAML or holds other things, or PyYAML is not installed.
+        """
+        yaml, where = extra_module("yaml", "clarius", "a package of a Clarius scanner"), member.where
+        text, loader = _GAIN_LINE.sub("", member.text()), getattr(yaml, "CBaseLoader", yaml.BaseLoader)
+        with reading(where, yaml.YAMLError, RecursionError):
+            fields = yaml.load(text, Loader=loader)
+        if not isinstance(fields, dict):
+            raise InvalidInputError(f"{where}: expected fields, got a {type(fields).__name__}")
+        return cls(fields, where)
 
     @property
-    def places(self) -> FloatArray:
+    def kind(self) -> str:
+        """Of samples: RF, IQ or envelope by the field `type`, whatever the file is called."""
+        packing, text = self.fields.get("compression"), str(self.fields.get("type"))
+        kind = _KINDS.get(text.strip().lower())
+        if kind is None or packing not in (None, "", "none"):
+            raise InvalidInputError(
+                f"{self.where}: type: expected {', '.join(_KINDS)}, not compressed, got {text}, {packing}"
+            )
+        return kind
+
+    @property
+    def model(self) -> str:
+        """The probe's."""
+        probe = self.fields.get("probe") or ""
+        return probe if isinstance(probe, str) else str(probe.get("model", ""))
+
+    def number(self, *place: str, of: Any = None) -> float | None:
+        """Number of nested fields, as ``60 MHz``, in Hz, mm, m/s or degrees; None where there is none."""
+        value = self.fields if of is None else of
+        for name in place:
+            value = value.get(name) if isinstance(value, dict) else None
+        if value in (None, "", "~"):
+            return None
+        parts = _NUMBER.fullmatch(str(value).replace(",", "."))
+        number = math.nan if parts is None else float(parts[1]) * _UNITS.get(parts[2].lower(), math.nan)
+        if not math.isfinite(number):
+            words = f"{self.where}: {': '.join(place)}"
+            raise InvalidInputError(f"{words}: expected a number and its unit, got {value!r:.40}")
+        return number
+
+    def require(self, *place: str, of: Any = None) -> float:
+        """Number of nested fields that must be there."""
+        if (number := self.number(*place, of=of)) is None:
+            raise InvalidInputError(f"{self.where}: {': '.join(place)}: expected a number, got none")
+        return number
+
+    def places(self, count: int) -> FloatArray:
         """Element where each line is received and its angle in degrees, shape (line, 2).
 
         Files may give the first and the last alone.
         """
-        rows = np.array([(line.element, line.angle) for line in self.lines]).reshape(-1, 2)
+        lines = self.fields.get("lines") or ()
+        rows = np.array([[self.require(name, of=line) for name in ("rx element", "angle")] for line in lines])
         if len(rows) == 2:
-            return np.asarray(np.linspace(rows[0], rows[1], self.size.lines))
-        if len(rows) != self.size.lines or not len(rows):
-            raise InvalidInputError(f"lines: expected {self.size.lines} lines, got {len(rows)}")
+            return np.linspace(rows[0], rows[1], count)
+        if len(rows) != count:
+            raise InvalidInputError(f"{self.where}: lines: expected {count} lines, got {len(rows)}")
         return rows
 
     @property
-    def receive(self) -> tuple[float, float, float] | None:
+    def receive(self) -> tuple[float, ...] | None:
         """Demodulation frequency at depth 0, Hz, at a depth, and that depth, mm; linear between [2]_.
 
         None in older files, and where it differs between foci or filters.
         """
-        filters = (part for focus in self.focus for part in focus.receive)
-        ends = {(part.shallowfreq, part.deepfreq, part.filterdepth) for part in filters}
+        filters = [part for focus in self.fields.get("focus") or () for part in focus.get("receive") or ()]
+        names = "shallowfreq", "deepfreq", "filterdepth"
+        ends = {tuple(self.require(name, of=part) for name in names) for part in filters}
         return ends.pop() if len(ends) == 1 else None
