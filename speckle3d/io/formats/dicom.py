@@ -33,6 +33,8 @@ FORMAT = "DICOM"
 _MARK, _MARK_BYTE = b"DICM", 128
 _FIRST_ELEMENT = b"\2\0\0\0UL"
 """Of files without the preamble that ends in the mark."""
+_SUFFIXES = (".dcm", ".dicom")
+"""Of files that may lack all that comes before the image's elements."""
 _TISSUE, _CM, _POLAR = [1.0, 1.0], [3.0, 3.0], [12.0, 3.0]
 """Region Spatial Format and Data Type of 2-D tissue; Physical Units of X and Y, cm, or degrees and cm."""
 _KIND = ("RegionSpatialFormat", "RegionDataType")
@@ -48,16 +50,15 @@ _EXPECTED = {
         "MONOCHROME1", "MONOCHROME2", "RGB", "YBR_FULL", "YBR_FULL_422", "YBR_ICT", "YBR_RCT",
     ),
     "BitsAllocated": (8,),
-    "PixelRepresentation": (0,),
 }  # fmt: skip
 _TAGS = (
-    *_MACHINE, *_RATES, *_EXPECTED, "NumberOfFrames", "FrameTimeVector", "Rows", "Columns", "PixelSpacing",
+    *_MACHINE, *_RATES, *_EXPECTED, "NumberOfFrames", "FrameTimeVector", "PixelSpacing",
     "LossyImageCompression", "SequenceOfUltrasoundRegions",
 )  # fmt: skip
 """All that is loaded."""
 
 
-def _frames(path: Path, part: tuple[slice, slice], invert: bool, spread: int) -> ReadFrame:
+def _frames(path: Path, part: tuple[slice, slice], invert: bool, spread: int, syntax: str) -> ReadFrame:
     """Decode grey frames of a region, (column, row), each from the file anew.
 
     Parameters
@@ -68,12 +69,14 @@ def _frames(path: Path, part: tuple[slice, slice], invert: bool, spread: int) ->
         Whether black is the highest level.
     spread : int
         Levels by which the colours of a grey pixel may differ.
+    syntax : str
+        UID of the transfer syntax, which the file may lack.
     """
     from pydicom.pixels.utils import pixel_array
 
     def frame(i: int) -> Any:
         with _reading(f"{path}: frame {i}"), open_regular(path) as stream:
-            image = np.asarray(pixel_array(stream, index=i))[part]
+            image = np.asarray(pixel_array(stream, index=i, transfer_syntax_uid=syntax))[part]
         if image.ndim == 3:
             colours = np.argwhere(np.ptp(image.astype(np.int16), axis=2) > spread)
             if len(colours):
@@ -90,27 +93,27 @@ def _frames(path: Path, part: tuple[slice, slice], invert: bool, spread: int) ->
 def open_dicom(path: Path, settings: ImportSettings) -> Facts:
     """Read grey images of eight bits; they stay in the file until they are asked for."""
     pydicom = extra_module("pydicom", "dicom", f"{path}: DICOM")
+    from pydicom import uid
+
     with _reading(str(path)), open_regular(path) as stream:
         header = pydicom.dcmread(stream, stop_before_pixels=True, force=True, specific_tags=list(_TAGS))
-        syntax = header.file_meta.TransferSyntaxUID.name
+        plain = uid.ImplicitVRLittleEndian if header.original_encoding[0] else uid.ExplicitVRLittleEndian
+        syntax = str(header.file_meta.get("TransferSyntaxUID", plain))
         for _ in header.iterall():  # elements are read from their bytes when first asked for
             pass
     machine = " ".join(str(header[name].value) for name in _MACHINE if name in header)
     yield "scanner", machine or "not named", ""
-    yield "transfer syntax", syntax, ""
     for name, expected in _EXPECTED.items():
         if (value := header.get(name)) not in expected:
             words = " or ".join(map(str, expected))
             raise InvalidInputError(f"{name}: expected {words}, got {value}")
-    count = int(_numbers(header, "NumberOfFrames")[0]) if "NumberOfFrames" in header else 1
-    if count < 2:
-        raise InvalidInputError("NumberOfFrames: expected several frames, got a single image")
+    count = int(header.get("NumberOfFrames") or 1)
     part, values = yield from _place(header)
     kind, is_lossy = header.PhotometricInterpretation, header.get("LossyImageCompression") == "01"
     if is_lossy:
         yield "pixels", "packed with loss, which smooths speckle", ""
     spread = _LOSSY_SPREAD if is_lossy or "YBR" in kind else 0
-    source = partial(_frames, path, part, kind == "MONOCHROME1", spread)
+    source = partial(_frames, path, part, kind == "MONOCHROME1", spread, syntax)
     read = source()
 
     def is_cut(i: int) -> bool:
@@ -144,9 +147,9 @@ def _place(header: Any) -> Generator[Row, None, tuple[tuple[slice, slice], dict[
     regions = header.get("SequenceOfUltrasoundRegions") or ()
     if not regions:
         yield "region read", "the whole image, taken for Cartesian tissue: the file names none", ""
-        spacing = _numbers(header, "PixelSpacing") if header.get("PixelSpacing") else []
-        sizes = zip(("row_spacing_mm", "column_pitch_mm"), spacing, strict=False)
-        return (slice(None), slice(None)), {name: Value(mm or None, "PixelSpacing") for name, mm in sizes}
+        sizes = zip(("row_spacing_mm", "column_pitch_mm"), header.get("PixelSpacing") or (), strict=False)
+        values = {name: Value(float(mm) or None, "PixelSpacing") for name, mm in sizes}
+        return (slice(None), slice(None)), values
     tissue = []
     for candidate in regions:
         kind, box = _numbers(candidate, *_KIND), [int(number) for number in _numbers(candidate, *_BOX)]
@@ -159,18 +162,11 @@ def _place(header: Any) -> Generator[Row, None, tuple[tuple[slice, slice], dict[
     if len(tissue) != 1:
         raise InvalidInputError(f"expected one region of 2-D tissue, got {len(tissue)} of {len(regions)}")
     region, (left, top, right, bottom) = tissue[0]
-    width, height = _numbers(header, "Columns", "Rows")
-    if not (0 <= left < right < width and 0 <= top < bottom < height):
-        raise InvalidInputError(
-            f"expected a region within {width:g} x {height:g} pixels, got columns {left} to {right}, rows "
-            f"{top} to {bottom}"
-        )
     units = _numbers(region, "PhysicalUnitsXDirection", "PhysicalUnitsYDirection")
     x_step, y_cm = _numbers(region, "PhysicalDeltaX", "PhysicalDeltaY")
-    if units not in (_CM, _POLAR) or not x_step * y_cm:
+    if units not in (_CM, _POLAR):
         raise InvalidInputError(
-            "PhysicalUnits and PhysicalDelta of X and Y: expected units 3 and 3 (cm), or 12 and 3 (degrees "
-            f"and cm), and steps other than 0, got {units} and {(x_step, y_cm)}"
+            f"PhysicalUnits of X and Y: expected 3 and 3 (cm), or 12 and 3 (degrees and cm), got {units}"
         )
     values = {"row_spacing_mm": Value(10.0 * abs(y_cm), "PhysicalDeltaY")}
     if units == _CM:
@@ -219,20 +215,17 @@ def _clock(header: Any, count: int) -> tuple[FloatArray | None, Value, tuple[str
 
 
 def _numbers(item: Any, *names: str) -> list[float]:
-    """Read the finite numbers of one or several elements."""
-    numbers = list[float]()
-    for name in names:
-        try:
-            numbers += np.ravel(np.asarray(item.get(name), dtype=float)).tolist()
-        except (TypeError, ValueError):
-            numbers.append(np.nan)
-        if not np.isfinite(numbers).all():
-            raise InvalidInputError(f"{name}: expected numbers, got {item.get(name)}")
-    return numbers
+    """Read the numbers of several elements."""
+    with _reading(", ".join(names)):
+        return [float(item[name].value) for name in names]
 
 
 READER = Reader(
     FORMAT,
-    lambda _, start: start[_MARK_BYTE:].startswith(_MARK) or start.startswith(_FIRST_ELEMENT),
+    lambda path, start: (
+        start[_MARK_BYTE:].startswith(_MARK)
+        or start.startswith(_FIRST_ELEMENT)
+        or path.suffix.lower() in _SUFFIXES
+    ),
     open_dicom,
 )
