@@ -27,8 +27,6 @@ from speckle3d.io.recordings import Recording, Row
 IMAGE = _IMAGES.format
 """Kind of MetaImage and NRRD files."""
 
-_VOLUMES = (".nii", ".nii.gz", ".hdr")
-
 SIZED = (sweeps.FORMAT, challenge.FORMAT)
 """Kinds that always say how large their pixels are."""
 
@@ -83,32 +81,27 @@ def open_recording(path: PathLike, settings: ImportSettings | None = None) -> Re
 
 
 def recording_of(reader: Reader, source: Any, settings: ImportSettings, path: Path) -> Recording:
-    """Open a recording that a reader claims, by its path or open file; its errors name the recording."""
+    """Open a recording that a reader claims, by its path or open file; its errors name the recording.
+
+    Where the reader fails, the facts that it told before are kept, and the error.
+    """
     if not reader.takes_settings and (file := settings_file(path)) is not None and file.stem == path.name:
         raise InvalidInputError(
             f"{file}: expected none beside a {reader.format}, which says all itself: it would not be read"
         )
-    with reading(path), naming(str(path)):
-        recording = _read(reader, source, settings, path)
-    return recording if isinstance(recording, Recording) else Recording(path, settings, ready=recording)
-
-
-def _read(reader: Reader, source: Any, settings: ImportSettings, path: Path) -> Sweep | Recording:
-    """Run a reader; if it fails, keep the facts it told before, and the error."""
-    facts = reader.read(source, settings)
-    if not isinstance(facts, Generator):
-        return facts
     rows = list[Row]()
-    try:
-        while True:
-            rows.append(next(facts))
-    except StopIteration as end:
-        recording: Recording = end.value
-        return replace(recording, rows=tuple(rows))
-    except (InvalidInputError, FileError) as error:
-        if not rows:
-            raise
-        return Recording(path, settings, fault=error, rows=tuple(rows))
+    with reading(path), naming(str(path)):
+        result = reader.read(source, settings)
+        try:
+            while isinstance(result, Generator):
+                rows.append(next(result))
+        except StopIteration as end:
+            result = replace(end.value, rows=tuple(rows))
+        except (InvalidInputError, FileError) as error:
+            if not rows:
+                raise
+            result = Recording(path, settings, fault=error, rows=tuple(rows))
+    return result if isinstance(result, Recording) else Recording(path, settings, ready=result)
 
 
 def load_landmarks(path: PathLike) -> Landmarks | None:
@@ -181,12 +174,9 @@ def family_format(path: PathLike, source: Path | h5py.File) -> str:
         content = f"HDF5 of another kind, with {', '.join(map(str, source)) or 'nothing'}"[:200]
     elif place.is_dir():
         content = "a folder that none of them is in"
-    elif place.name.lower().endswith(_VOLUMES):
-        content = "a volume (NIfTI)"
-    elif (start := first_bytes(path)).startswith((b"\x1f\x8b", b"PK\3\4")):
-        content = "a packed file: unpack it first"
     else:
-        content = "another file" if start else "an empty file"
+        is_packed = first_bytes(path).startswith((b"\x1f\x8b", b"PK\3\4"))
+        content = "a packed file: unpack it first" if is_packed else "another file"
     raise InvalidInputError(
         f"{path}: expected a recording ({formats}), got {content}. Logs of sensors are for "
         "`speckle3d imu info`, paths of poses for `speckle3d trajectory score`"
