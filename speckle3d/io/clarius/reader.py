@@ -80,7 +80,7 @@ def open_package(path: Path, settings: ImportSettings) -> Facts:
     if (kinds := files.raw.keys() - ymls.keys()) or not files.raw:
         start, suffix = f"{files.name}_" if files.name else "", "yml" if kinds else "raw"
         lacks = " or ".join(f"{start}{kind}.{suffix}" for kind in sorted(kinds or ymls)) or "samples (.raw)"
-        raise InvalidInputError(f"{path}: expected {lacks} beside it, got none")
+        raise InvalidInputError(f"{path}: expected {lacks} beside the rest, got none")
     kind = min(files.raw, key=lambda kind: [*SAMPLES].index(ymls[kind].kind))
     yield "sweep is made from", kind, ""
     yml, member, signal = ymls[kind], files.raw[kind], ymls[kind].kind
