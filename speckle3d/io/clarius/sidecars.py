@@ -51,7 +51,7 @@ class Description:
         """
         yaml, where = extra_module("yaml", "clarius", "a package of a Clarius scanner"), member.where
         text, loader = _GAIN_LINE.sub("", member.text()), getattr(yaml, "CBaseLoader", yaml.BaseLoader)
-        with reading(where, yaml.YAMLError, RecursionError):
+        with reading(where):
             fields = yaml.load(text, Loader=loader)
         if not isinstance(fields, dict):
             raise InvalidInputError(f"{where}: expected fields, got a {type(fields).__name__}")

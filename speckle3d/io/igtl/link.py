@@ -10,7 +10,6 @@ import queue
 import socket
 import threading
 import time
-from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Self
@@ -92,7 +91,10 @@ class End:
 
     def wait_connected(self, timeout_s: float) -> bool:
         """Wait for a peer; False if none came in time."""
-        return _until(lambda: self.state.peers > 0, timeout_s)
+        end_s = time.monotonic() + timeout_s
+        while not self.state.peers and time.monotonic() < end_s:
+            time.sleep(_LOOK_S)
+        return self.state.peers > 0
 
     def receive(self, timeout_s: float) -> list[Received]:
         """Take all messages in the order in which they came, waiting for the first one.
@@ -142,8 +144,8 @@ class End:
         self.state.peers += 1
         try:
             await self._read(reader)
-        except (OSError, MessageError) as error:
-            self.state.last_failure = str(error)
+        except (OSError, EOFError, MessageError) as error:
+            self.state.last_failure = str(error) or f"expected a whole message within {STALL_S:g} s"
         finally:
             self._writers.remove(writer)
             self.state.peers -= 1
@@ -151,14 +153,9 @@ class End:
 
     async def _read(self, reader: asyncio.StreamReader) -> None:
         while start := await reader.read(1):
-            try:
-                async with asyncio.timeout(STALL_S):
-                    start += await reader.readexactly(HEADER.size - 1)
-                    body = await reader.readexactly(body_bytes(start))
-            except EOFError as error:
-                raise ConnectionError("closed by the peer within a message") from error
-            except TimeoutError as error:
-                raise ConnectionError(f"expected a whole message within {STALL_S:g} s") from error
+            async with asyncio.timeout(STALL_S):
+                start += await reader.readexactly(HEADER.size - 1)
+                body = await reader.readexactly(body_bytes(start))
             self.state.heard_s = time.monotonic()
             try:
                 message = decode(start, body)
@@ -169,16 +166,6 @@ class End:
                 await asyncio.sleep(_LOOK_S)
             self._inbox.put_nowait(message)
         raise ConnectionError("closed by the peer")
-
-
-def _until(is_so: Callable[[], bool], timeout_s: float) -> bool:
-    """Wait until a condition holds; False if it did not in time."""
-    end_s = time.monotonic() + timeout_s
-    while not is_so():
-        if time.monotonic() > end_s:
-            return False
-        time.sleep(_LOOK_S)
-    return True
 
 
 class Connection(End):
