@@ -97,7 +97,7 @@ class ImportSettings(BaseModel):
     plus_config: str | None = Field(
         None,
         description="device set of PLUS, with the place of the image on the probe and the size of its "
-        "pixels; in TOML, a file of the same folder",
+        "pixels; in TOML, from the folder of that file",
     )
     image_to_probe: tuple[tuple[Number, ...], ...] | None = Field(
         None, description="image calibration of PLUS, pixels to mm, four rows of four numbers"
@@ -147,11 +147,8 @@ def settings_for(path: PathLike, options: ImportSettings | None = None) -> Impor
         return options
     settings = load_toml(ImportSettings, file)
     changes = options.model_dump(exclude_unset=True, exclude_none=True)
-    if (name := settings.plus_config) is not None:
-        config = file.parent / name
-        if not config.resolve().is_relative_to(file.parent.resolve()):
-            raise InvalidInputError(f"{file}: plus_config: expected a file of the same folder, got {name!r}")
-        changes = {"plus_config": str(config)} | changes
+    if settings.plus_config is not None:
+        changes = {"plus_config": str(file.parent / settings.plus_config)} | changes
     return settings.model_copy(update=changes)
 
 

@@ -65,13 +65,10 @@ class Value:
     ----------
     source : str
         As shown; begins with "assumed" if nobody says it.
-    said_by : str
-        Who says it, if it is not the recording.
     """
 
     value: Any = None
     source: str = ""
-    said_by: str = "the file"
 
     @property
     def is_assumption(self) -> bool:
@@ -194,7 +191,7 @@ class Recording:
             giver = f"given by {file.name}"
         if not number or value.is_assumption or text == number:
             return (words, f"{text} ({giver})", unit), ""
-        against = f"{value.said_by} says {number}"
+        against = f"the file says {number}"
         contradiction = f"{words} {text} {unit}, {giver}: {against}{source}"
         return (words, f"{text} ({giver}, {against})", unit), contradiction * differs(setting, value.value)
 

@@ -99,11 +99,11 @@ def open_package(path: Path, settings: ImportSettings) -> Facts:
     if (delay := yml.number("delay samples")) is not None:
         first_mm = max(delay - BEFORE_DEPTH_S * rate_hz, 0.0) * spacing_mm
     values = {
-        "first_sample_depth_mm": Value(first_mm, "delay samples, less 1 us before depth 0 (assumed)", _YML),
-        "row_spacing_mm": Value(spacing_mm, f"of {rate_hz / 1e6:g} MHz", _YML),
-        "sampling_rate_hz": Value(yml_rate_hz, "", _YML),
-        "centre_frequency_hz": Value(transmit_hz, "transmit frequency", _YML),
-        **({"speed_of_sound_m_s": Value(speed_m_s, "", _YML)} if speed_m_s else {}),
+        "first_sample_depth_mm": Value(first_mm, "delay samples, less 1 us before depth 0 (assumed)"),
+        "row_spacing_mm": Value(spacing_mm, f"of {rate_hz / 1e6:g} MHz"),
+        "sampling_rate_hz": Value(yml_rate_hz, _YML),
+        "centre_frequency_hz": Value(transmit_hz, "transmit frequency"),
+        **({"speed_of_sound_m_s": Value(speed_m_s, _YML)} if speed_m_s else {}),
         **_line_values(yml, elements, settings, model),
     }
     shift_hz, turns = None, None
@@ -114,7 +114,7 @@ def open_package(path: Path, settings: ImportSettings) -> Facts:
             middle_hz, slide = _oscillator(
                 receive, start_mm + spacing_mm * np.arange(shape[2], dtype=np.float64), rate_hz
             )
-            values["demodulation_frequency_hz"] = Value(middle_hz, "of the lines' middle", _YML)
+            values["demodulation_frequency_hz"] = Value(middle_hz, "of the lines' middle")
             if shift_hz is None and slide.any():
                 turns = np.exp(2j * np.pi * slide)
                 remarks.append(
@@ -130,7 +130,7 @@ def open_package(path: Path, settings: ImportSettings) -> Facts:
     if settings.bandwidth_hz is None and centre_hz and has_spectrum:
         band = band_hz(frames, rate_hz, centre_hz, shift_hz)
     if band is not None:
-        values["bandwidth_hz"] = Value(band, "measured at -6 dB in this recording", "the spectrum")
+        values["bandwidth_hz"] = Value(band, "measured at -6 dB in this recording")
         remarks.append(
             "the band is measured in this recording: recordings that share curves need "
             f"--bandwidth-hz {band[0]:.4g} {band[1]:.4g}"
@@ -218,15 +218,15 @@ def _line_values(
     for source, element_mm in reversed(pitches.items()):
         if element_mm is not None:
             words = f"{per_line:g} elements a line (yml) x {element_mm:g} mm ({source})"
-            pitch = Value(element_mm * per_line, words, _YML)
+            pitch = Value(element_mm * per_line, words)
     values = {"vector_pitch_mm": pitch}
     radius_mm, count = yml.number("probe", "radius"), yml.number("probe", "elements")
     if radius_mm or model.startswith(CONVEX):
-        values |= {"array_radius_mm": Value(radius_mm, "", _YML), "line_angles_deg": Value()}
+        values |= {"array_radius_mm": Value(radius_mm, _YML), "line_angles_deg": Value()}
     if radius_mm and pitch.value is not None:
         ends = elements[[0, -1]] - ((count - 1) / 2 if count else elements.mean())
         degrees = np.rad2deg(ends * pitch.value / per_line / radius_mm)
-        values["line_angles_deg"] = Value(tuple(degrees.tolist()), f"of lines {pitch.source}", _YML)
+        values["line_angles_deg"] = Value(tuple(degrees.tolist()), f"of lines {pitch.source}")
     return values
 
 

@@ -35,7 +35,6 @@ from speckle3d.io.hdf5 import (
     PathLike,
     find_member,
     has_member,
-    locate,
     open_hdf5,
     read_array,
     reading,
@@ -139,8 +138,6 @@ def read_challenge_calibration(path: PathLike) -> tuple[FloatArray, RigidTransfo
         raise InvalidInputError(f"{path}: expected eight rows of four finite numbers, got {len(rows)}")
     scale, pose = np.reshape(rows, (2, 4, 4))
     size = np.diag(scale)[:2].copy()
-    if not (size > 0).all():
-        raise InvalidInputError(f"{path}: expected a scaling from pixels to mm, got {size.tolist()}")
     tool_from_corner = transforms_from_matrices(pose[None], f"{path}: image to tool")[0]
     return size, tool_from_corner * RigidTransform.from_translation([*size, 0.0])
 
@@ -156,9 +153,6 @@ def read_landmarks(path: PathLike) -> Landmarks | None:
         if not has_member(file, scan.stem):
             return None
         rows = read_array(file, scan.stem, ("landmark", 3))
-        where = locate(file, scan.stem)
-    if not np.isfinite(rows).all() or (rows[:, 0] != np.abs(np.rint(rows[:, 0]))).any():
-        raise InvalidInputError(f"{where}: expected a frame and two finite coordinates in every row")
     points = np.column_stack([(rows[:, 1:] - 1.0) * size, np.zeros(len(rows))])
     return Landmarks(rows[:, 0].astype(np.int64), points)
 

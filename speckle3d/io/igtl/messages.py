@@ -182,10 +182,6 @@ def packed_status(device: str, time_s: float, text: str, code: int = _OK) -> byt
 
 
 def _pack(message: Any, device: str, time_s: float) -> bytes:
-    if len(device) > 20 or not device.isascii() or not 0 <= time_s < 2**32:
-        raise InvalidInputError(
-            f"device {device!r}, {time_s} s: expected at most 20 letters of ASCII and a time from 0 to 2^32 s"
-        )
     message.header_version = 2 if message.metadata else 1
     message.device_name, message.timestamp = device, time_s
     try:

@@ -38,7 +38,7 @@ from speckle3d.io.pose_paths import timed_poses
 from speckle3d.io.readers import Reader
 from speckle3d.io.recordings import Facts, Recording, Value, differs
 
-_DEVICE, _PIXELS = "the device set", ("column_pitch_mm", "row_spacing_mm")
+_PIXELS = ("column_pitch_mm", "row_spacing_mm")
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ class _Sequence:
         names, poses = self.device.names, self.poses
         image, tool = names.image, names.probe if poses is None else poses.tool
         if (matrix := self.settings.image_to_probe) is not None:
-            return Value(np.reshape(matrix, (4, 4)), "image_to_probe", "image_to_probe")
+            return Value(np.reshape(matrix, (4, 4)), "image_to_probe")
         if poses is not None and poses.pixels is not None:
             return Value(poses.pixels, f"{poses.chain[0]}Transform")
         for name in (f"{image}To{tool}", "Calibration"):  # the second is of Ibis
@@ -94,7 +94,7 @@ class _Sequence:
                 return Value(transform, f"{name}Transform")
         # The device set's is for the image that the machine shows, not for the lines it was made of.
         transform = None if self.layout.is_rf else self.device.transform(image, tool)
-        return Value(transform, f"{image}To{tool}", _DEVICE)
+        return Value(transform, f"{image}To{tool} of the device set")
 
     @cached_property
     def sizes(self) -> list[Value]:
@@ -104,7 +104,7 @@ class _Sequence:
             spacing = spacing[::-1]
         if place.value is not None:
             place = replace(place, value=pixel_axes(place.value, f"{self.header.path}: {place.source}"))
-        machine = Value(self.device.pixel_mm(self.header.size), "device set", _DEVICE)
+        machine = Value(self.device.pixel_mm(self.header.size), "device set")
         return [place, Value(spacing, "ElementSpacing"), machine]
 
     @cached_property
@@ -117,7 +117,7 @@ class _Sequence:
         pixel = next((size for size in sizes if size.value is not None), Value())
         across, down = (replace(pixel, value=size) for size in pixel.value or (None, None))
 
-        scan = partial(Value, source="ScanConversion of the device set", said_by=_DEVICE)
+        scan = partial(Value, source="ScanConversion of the device set")
         width_mm = self.device.scan("TransducerWidthMm")
         if self.device.is_curved and (layout.is_rf or layout.has_lines_in_rows):
             near, far = self.device.scan("RadiusStartMm", "RadiusStopMm") or (None, 0.0)
