@@ -198,7 +198,7 @@ def consistent_poses(motion: Motion, sweep: Sweep, settings: SensorSettings) -> 
     # The patches that most agree are those of the commonest distance, which is short of the mean where echoes
     # differ: the subset says which way frames turn, all patches how far apart they are.
     near, far = (p.offset_mm[firm & every_firm] for p in (planes, every))
-    factor = scale * (near @ far) / (near @ near) if near.any() else scale
+    factor = scale * float(near @ far / (near @ near)) if near.any() else scale
     # Slopes are the sensor's.
     planes.coefficients[:] *= [factor, 1.0, 1.0] * sign[:, None]
     planes.covariance[:] *= factor**2
