@@ -22,7 +22,7 @@ from speckle3d.examine.images import examine_echoes, examine_images, examine_pro
 from speckle3d.examine.sensors import examine_sensors
 from speckle3d.matching.frames import ImageSink, match_sweep
 from speckle3d.matching.matcher import FrameMatcher
-from speckle3d.matching.quality import placed_flags, require_placed
+from speckle3d.matching.quality import placed_flags
 from speckle3d.matching.schedule import PairSchedule
 from speckle3d.motion.estimate import estimate_motion, frame_pairs
 from speckle3d.motion.planes import MotionProblem
@@ -50,7 +50,7 @@ def track(
     doubts = examine_key(curves, matcher.laid, matcher.patches)
     matches = match_sweep(sweep, matcher, PairSchedule(settings.trajectory), progress, images)
     doubts += examine_echoes(matches)
-    require_placed(matches.flags)
+    placed_flags(matches.flags)
 
     tissue = tissue_curves(curves, matches.texture)
     problem = MotionProblem(

@@ -8,6 +8,7 @@ I/Q, may have been sampled more coarsely than that, and then the rate rises.
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -28,9 +29,6 @@ sampled at: one sweep then has the same patches and lengths as RF and as I/Q. In
 to that width, so twice the width is the least; half as many samples again let a parabola through its
 correlation at neighbouring samples be read between them. Documented accuracies were measured at this rate, a
 third of 66.7 MHz for echoes of 5 to 10 MHz."""
-
-_RATIO_TOLERANCE = 1e-4
-"""Of the rate; 4 um at 40 mm."""
 
 
 class IntensitySettings(BaseModel):
@@ -147,11 +145,9 @@ class IntensityExtractor:
         sides = (self.grid.vector_pitch_mm, self.grid.sample_spacing_mm)
         wide, high = (2 * int(self.settings.equalise_mm / 2 / side) + 1 for side in sides)
         mean, share = (
-            uniform_filter(intensity * counted, (wide, high), mode="nearest"),
-            np.ones_like(intensity),
+            uniform_filter(values, (wide, high), mode="nearest")
+            for values in (intensity * counted, counted.astype(np.float32))
         )
-        if not counted.all():
-            share = uniform_filter(counted.astype(np.float32), (wide, high), mode="nearest")
         # Less than half a sample is rounding: nothing counts near.
         share[share <= 0.5 / (wide * high)] = 0.0
         return np.divide(share, np.maximum(mean, np.finfo(np.float32).tiny), out=share)
@@ -180,17 +176,10 @@ def _plan_resampling(signal: RFSettings, samples: int, edge_fraction: float) -> 
 
 
 def _transform_lengths(samples: int, ratio: float) -> tuple[int, int]:
-    """Fast lengths of the two transforms, the first (even) `ratio` times the second.
-
-    The first fast pair is taken that has that ratio to `_RATIO_TOLERANCE`.
-    """
-    least = fft.next_fast_len(int(np.ceil(samples / ratio)))
-    for out_length in range(least, 2 * least + 1):
-        length = 2 * round(out_length * ratio / 2)
-        fast = all(n == fft.next_fast_len(n) for n in (length, out_length))
-        if fast and abs(length / (out_length * ratio) - 1) <= _RATIO_TOLERANCE:
-            return length, out_length
-    return 2 * round(least * ratio / 2), least
+    """First fast lengths of the two transforms, the first even and `ratio` times the second, rounded."""
+    out_lengths = itertools.count(int(np.ceil(samples / ratio)))
+    pairs = ((2 * round(out_length * ratio / 2), out_length) for out_length in out_lengths)
+    return next(pair for pair in pairs if all(n == fft.next_fast_len(n) for n in pair))
 
 
 def band_weights(frequency: FloatArray, low: float, high: float, edge: float) -> FloatArray:

@@ -185,14 +185,12 @@ class FrameMatcher:
         echoes = [echo for echo in echoes if np.isfinite(echo.intensity.sum()) and echo.intensity.any()]
         if not echoes:
             return
-        standing, patches = standing_samples(echoes), self.patches
+        standing = standing_samples(echoes)
         total = np.sum([echo.intensity for echo in echoes], axis=0)
-        still, power = (patches.tiles(part).sum(axis=(1, 2)) for part in (standing * total, total))
+        still, power = (self.patches.tiles(part).sum(axis=(1, 2)) for part in (standing * total, total))
         share = still / np.maximum(power, np.finfo(np.float32).tiny)
         self.overlaid = share > max(_OVERLAID, _OVER_SPECKLE * float(np.median(share)))
-        (wide, high), self._counted = patches.size, self.laid.region.copy()
-        for v, s in patches.first[self.overlaid]:
-            self._counted[v : v + wide, s : s + high] &= ~standing[v : v + wide, s : s + high]
+        self._counted = self.laid.region & ~(standing & self.overlaid.any())
 
     def ready(self, samples: npt.NDArray[Any]) -> ReadyFrame:
         """Make a frame, as read, ready to be matched; on any thread."""

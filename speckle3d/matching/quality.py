@@ -107,6 +107,10 @@ class FrameFeatures:
 
     mean: FloatArray
     """Mean intensity of each patch, shape (p,): a frame that repeats the one before has the same."""
+    contrast: FloatArray
+    """Standard deviation of intensity over its mean, shape (p,)."""
+    lateral: FloatArray
+    """Correlation of neighbouring vectors, shape (p,)."""
     clipped: float
     """Share of samples at the frame's own extremes, over the share at which it is saturated."""
     speckle_share: float
@@ -145,16 +149,15 @@ def inspect_frame(
     with np.errstate(divide="ignore", invalid="ignore"):  # Of flat patches.
         mean = tiles.mean(axis=(1, 2))
         tiles = tiles / mean[:, None, None] - np.float32(1.0)
-        contrast, alike = tiles.std(axis=(1, 2)), _correlation(tiles[:, :-1], tiles[:, 1:])
-        across = _correlation(tiles[:, :wide], tiles[:, -wide:])
-        along = _correlation(tiles[..., :high], tiles[..., -high:])
+        contrast, alike = tiles.std(axis=(1, 2)), correlation(tiles[:, :-1], tiles[:, 1:])
+        across = correlation(tiles[:, :wide], tiles[:, -wide:])
+        along = correlation(tiles[..., :high], tiles[..., -high:])
     # A sample that is not finite spoils its whole vector, and equalising then the others.
     echo = (contrast > s.least_contrast) & np.isfinite(intensity.sum())
     together = (alike > s.neighbour_correlation) | (patches.spacing_mm[0] > s.neighbour_pitch_mm)
     fine = (across < s.halves_correlation) & (along < s.halves_correlation)
     varies = patches.rows_of(contrast > _CONSTANT)
-    live = varies.any(axis=0) | ~varies.any()
-    countable = inside & np.repeat(live, len(varies))
+    countable = inside & np.repeat(varies.any(axis=0), len(varies))
 
     def share(mask: BoolArray) -> float:
         return float((echo & mask & countable).sum() / max(int(countable.sum()), 1))
@@ -163,11 +166,11 @@ def inspect_frame(
     if is_bmode:
         with np.errstate(divide="ignore"):  # Black patches have none.
             spread = np.log(patches.tiles(frame)[..., :: 4 * step].std(axis=(1, 2), dtype=np.float64))
-    clipping = _clipping(frame, is_bmode, s)
-    return FrameFeatures(mean, clipping, share(together & fine), share(~together), spread, usable)
+    shares = share(together & fine), share(~together)
+    return FrameFeatures(mean, contrast, alike, _clipping(frame, is_bmode, s), *shares, spread, usable)
 
 
-def _correlation(a: Float32Array, b: Float32Array) -> FloatArray:
+def correlation(a: Float32Array, b: Float32Array) -> FloatArray:
     """Pearson's coefficient of each patch, shape (p, v, s), with the same of `b`; NaN where flat."""
     a, b = (part - part.mean(axis=(1, 2), keepdims=True) for part in (a, b))
     product, power, others = (np.einsum("pvs,pvs->p", *pair) for pair in ((a, b), (a, a), (b, b)))
@@ -214,7 +217,7 @@ def flag_frames(features: Sequence[FrameFeatures], settings: QualitySettings | N
     return flags
 
 
-def placed_flags(flags: IntArray, loose: BoolArray) -> IntArray:
+def placed_flags(flags: IntArray, loose: BoolArray | bool = False) -> IntArray:
     """Flags of all frames, with those that no pair joins to earlier ones.
 
     Raises
@@ -223,18 +226,13 @@ def placed_flags(flags: IntArray, loose: BoolArray) -> IntArray:
         If too many frames have a flag.
     """
     flags = np.where(loose & (flags == 0), int(FrameFlag.UNMATCHED), flags)
-    require_placed(flags)
-    return flags
-
-
-def require_placed(flags: IntArray) -> None:
-    """Raise `InsufficientDataError` if too many frames have a flag."""
     count = int((flags != 0).sum())
     if count > LARGEST_LOSS * len(flags):
         raise InsufficientDataError(
             f"expected frames with speckle in common, got {count} of {len(flags)} that cannot be placed: "
             f"{'; '.join(describe(flags))}"
         )
+    return flags
 
 
 def describe(flags: npt.ArrayLike) -> list[str]:

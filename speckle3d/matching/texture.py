@@ -7,17 +7,17 @@ on what is scanned as long as it scatters as a phantom does; patches whose contr
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import fft
-from scipy.signal import welch
 
 from speckle3d.core.arrays import BoolArray, Complex64Array, Float32Array, FloatArray, IntArray
 from speckle3d.core.curves import EchoSpectra, SpeckleSize
 from speckle3d.core.images import spread_frames
 from speckle3d.core.sweep import BModeSettings, RFSettings, Sweep
 from speckle3d.matching.matcher import FrameMatcher, ReadyFrame
+from speckle3d.matching.quality import FrameFeatures, correlation
 
 FRAMES = 16
 """Frames looked at, evenly spread over the sweep: one in each 0.5 mm of 8 mm; nearer ones see the same
@@ -25,10 +25,6 @@ speckle."""
 CONTRAST = (0.75, 1.15)
 """Standard deviation over mean of intensity in patches that count: 1 for speckle, scattered by its 50 to 90
 cells. Coherent structure is above; its patches look coarser than speckle."""
-SEGMENT = 1024
-"""Samples of a transform of raw echoes: 65 kHz apart at 66.7 MHz."""
-LEAST_PATCHES = 8
-"""Patches, over all frames, that a row's size is taken from at least."""
 SPECKLE_SPREAD_DB = 8.19, 5.21
 """Distances of the 10th and the 90th percentile of an exponential variable's decibels from the median."""
 
@@ -85,14 +81,13 @@ class Texture:
         if echo.analytic is not None:
             # A vector of each column of patches; frames that are not finite are flagged.
             vectors = np.nan_to_num(ready.samples[np.unique(patches.first[:, 0])], posinf=0.0, neginf=0.0)
-            segment = min(SEGMENT, vectors.shape[1])
-            spectra = welch(vectors, nperseg=segment, return_onesided=False, detrend=False)[1]
-            sample_power, power = spectra.mean(axis=0), _powers(patches.tiles(echo.analytic))
+            sample_power = (np.abs(fft.fft(vectors)) ** 2).mean(axis=0)
+            power = _powers(patches.tiles(echo.analytic))
         elif usable.any():
             thinned = intensity[usable, :, ::4].reshape(int(usable.sum()), -1)
             level = np.log(np.percentile(thinned, [10, 50, 90], axis=1))
             step = float(np.median(np.diff(np.unique(ready.samples))))
-        size = _sizes(intensity, patches.spacing_mm)
+        size = _sizes(intensity, ready.features, patches.spacing_mm)
         size, power = (np.where(usable, values, np.nan) for values in (size, power))
         self._looks[number] = _Look(size, power, level, sample_power, _unit_echoes(local_tiles), step)
 
@@ -111,13 +106,10 @@ class Texture:
         Returns
         -------
         SpeckleSize
-            Of shape (r,); NaN where too few patches hold fully developed speckle.
+            Of shape (r,); NaN where no patch holds fully developed speckle.
         """
-        rows = np.moveaxis(self._rows("size"), 0, -1)
-        measured_rows = np.isfinite(rows).sum(axis=(2, 3)) >= LEAST_PATCHES
-        size = np.full(measured_rows.shape, np.nan)
-        size[measured_rows] = np.nanmedian(rows[measured_rows], axis=(1, 2))
-        return SpeckleSize(*size)
+        size = np.ma.median(self._rows("size"), axis=(0, 3))  # type: ignore[no-untyped-call]
+        return SpeckleSize(*size.filled(np.nan))
 
     def grey_step_db(self) -> float:
         """Between neighbouring grey levels, dB; 0 of echoes."""
@@ -145,18 +137,19 @@ class Texture:
         """
         if not (self._of_echo and isinstance(self.signal, RFSettings)):
             return None
-        rows = self._rows("power")
-        rows_seen = np.isfinite(rows).any(axis=(0, 1, 3))
-        if not rows_seen.any():
+        power = self._rows("power").mean(axis=(0, 3)).T
+        has_echo = ~np.ma.getmaskarray(power).any(axis=1)
+        if not has_echo.any():
             return None
-        power = np.nanmean(rows[:, :, rows_seen], axis=(0, 3)).T
         rate_hz = 1e3 * self.signal.speed_of_sound_m_s / (2.0 * self._patches.spacing_mm[1])
         low, high = self.signal.bandwidth_hz
         # The band's centre was shifted to zero.
         frequency = fft.fftshift(fft.fftfreq(power.shape[1], 1.0 / rate_hz)) + (low + high) / 2.0
         edge = self._edge_fraction * (high - low)
         band = (frequency > low - edge) & (frequency < high + edge)
-        return EchoSpectra(self._patches.row_depth_mm[rows_seen], frequency[band], power[:, band])
+        return EchoSpectra(
+            self._patches.row_depth_mm[has_echo], frequency[band], power.data[np.ix_(has_echo, band)]
+        )
 
     def sample_spectrum(self) -> tuple[FloatArray, FloatArray] | None:
         """Frequencies, Hz, increasing, and the power of the samples as read; None of grey levels."""
@@ -193,16 +186,19 @@ class Texture:
         common = echoes @ echoes.transpose(0, 2, 1)
         return np.asarray(np.median(common[:, *at.reshape(-1, 2).T], axis=1), dtype=float)
 
-    def _rows(self, name: str) -> FloatArray:
-        """Values of all frames by rows and columns, shape (n, k, r, c)."""
-        return self._patches.rows_of(np.stack([getattr(look, name) for look in self._looks.values()]))
+    def _rows(self, name: str) -> Any:
+        """Values of all frames by rows and columns, shape (n, k, r, c), masked where they are not usable."""
+        values = np.stack([getattr(look, name) for look in self._looks.values()])
+        return np.ma.masked_invalid(self._patches.rows_of(values))
 
 
 def measured_texture(sweep: Sweep, matcher: FrameMatcher) -> Texture:
-    """Read some frames of a sweep, and measure their texture."""
-    texture = Texture(matcher)
-    for number in spread_frames(len(sweep), FRAMES).tolist():
-        texture.keep(number, matcher.ready(sweep.frames[number]))
+    """Read some frames of a sweep, leave out of all what stands still in them, and measure their texture."""
+    texture, numbers = Texture(matcher), spread_frames(len(sweep), FRAMES).tolist()
+    frames = [sweep.frames[number] for number in numbers]
+    matcher.leave_out([matcher.extractor.echo(frame) for frame in frames])
+    for number, frame in zip(numbers, frames, strict=True):
+        texture.keep(number, matcher.ready(frame))
     return texture
 
 
@@ -222,26 +218,22 @@ def _powers(echo: Complex64Array) -> FloatArray:
     return fft.fftshift(power / np.maximum(power.sum(axis=0), 1e-30), axes=0)
 
 
-def _sizes(intensity: Float32Array, spacing_mm: FloatArray) -> FloatArray:
+def _sizes(intensity: Float32Array, features: FrameFeatures, spacing_mm: FloatArray) -> FloatArray:
     """Lateral and axial size of speckle, mm, shape (2, p), of patches of shape (p, v, s).
 
     NaN unless it is fully developed.
     """
     with np.errstate(all="ignore"):  # Flat patches come out as NaN.
-        varying = intensity / intensity.mean(axis=(1, 2), keepdims=True) - 1.0
-        contrast = varying.std(axis=(1, 2))
-        lateral, axial = varying[:, :-1] * varying[:, 1:], varying[..., :-1] * varying[..., 1:]
-        rho = np.stack([lateral.mean(axis=(1, 2)), axial.mean(axis=(1, 2))]) / contrast**2
+        rho = np.stack([features.lateral, correlation(intensity[..., :-1], intensity[..., 1:])])
         # The width of a Gaussian with this correlation one sample off.
         size = spacing_mm[:, None] / np.sqrt(-2.0 * np.log(np.clip(rho, 1e-3, 0.999)))
-    fair = (contrast > CONTRAST[0]) & (contrast < CONTRAST[1]) & np.isfinite(rho)
+        fair = (features.contrast > CONTRAST[0]) & (features.contrast < CONTRAST[1])
     return np.where(fair, size, np.nan)
 
 
 def _unit_echoes(tiles: Float32Array) -> Float32Array:
-    """Echo of each patch, shape (p, 2, v, s), or intensity less the mean, of unit power, shape (p, k)."""
+    """Echo of each patch, shape (p, 2, v, s), or intensity, less its mean and of unit power, shape (p, k)."""
     echoes = tiles.reshape(len(tiles), -1)
-    if tiles.ndim == 3:
-        echoes = echoes - echoes.mean(axis=1, keepdims=True)
+    echoes = echoes - echoes.mean(axis=1, keepdims=True)
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.asarray(echoes / np.linalg.norm(echoes, axis=1, keepdims=True))

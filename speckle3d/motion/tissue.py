@@ -43,10 +43,12 @@ over phantoms and tissue of two physics, by edge enhancement 0.1 to 0.3, by smoo
 3 x 3 samples 0.3 to 0.7."""
 SHORT_BY_SPREAD = 3.0
 """Length lost over what is lost of the spread: 2 to first order, simulated sweeps have 2 to 4."""
-STRUCTURE_BALANCE = 0.8
-"""Ratio of the distances of the 10th and the 90th percentile of decibels from their median, below which
-structure is seen in place of speckle. Simulated speckle has 1.4 to 1.6, smoothed by 5 x 5 samples 0.85 to 1;
-a sweep of muscle and bone has 0.43, and keeps half its correlation over 2.5 times what a sheet says."""
+STRUCTURE_BALANCE, LEAST_OF_SPECKLE = 0.8, 0.637
+"""Ratio of the distances of the 10th and the 90th percentile of decibels from their median: from which
+structure's is counted, and below which structure is seen in place of speckle. Simulated speckle has 1.4 to
+1.6, smoothed by 5 x 5 samples 0.85 to 1; means of many samples tend to the normal distribution's 1, maxima to
+Gumbel's 0.637. A sweep of muscle and bone has 0.43, and keeps half its correlation over 2.5 times what a
+sheet says."""
 LEAST_BALANCE = 0.1
 """Taken where it is less: zero where a tenth of the samples and the median have one grey level, as in images
 that are black for the most part, or of four levels. Lengths are then open by a factor of 64."""
@@ -89,7 +91,9 @@ def structure_openness(texture: Texture) -> float:
     Structure only stays alike for longer: the curves' width lies between once and twice this above speckle's.
     """
     dark, bright = texture.grey_spread_db()
-    return float(np.log(max(1.0, STRUCTURE_BALANCE * bright / max(dark, LEAST_BALANCE * bright, 1e-9))))
+    if dark >= LEAST_OF_SPECKLE * bright:
+        return 0.0
+    return float(np.log(STRUCTURE_BALANCE / max(dark / bright, LEAST_BALANCE)))
 
 
 def grey_error(signal: RFSettings | BModeSettings, texture: Texture) -> float:
