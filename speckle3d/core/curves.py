@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from itertools import chain
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal
 
 import numpy as np
 
@@ -100,9 +100,6 @@ class SpeckleSize:
 
     lateral_mm: FloatArray
     axial_mm: FloatArray
-
-
-ByDepth = TypeVar("ByDepth", TiltResponse, SpeckleSize)
 
 
 @dataclass(frozen=True)
@@ -234,7 +231,7 @@ class DecorrelationCurves:
         def interpolate(values: FloatArray) -> FloatArray:
             return np.interp(depth_mm, self.depth_mm, values)
 
-        def at_depths(fields: ByDepth | None) -> ByDepth | None:
+        def at_depths(fields: Any) -> Any:
             return fields and type(fields)(*map(interpolate, vars(fields).values()))
 
         roots = np.sqrt(-np.log(self.correlation))

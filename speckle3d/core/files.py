@@ -44,7 +44,7 @@ def open_regular(path: PathLike) -> BufferedReader:
 def cannot_write(path: PathLike, error: OSError, words: str = "cannot be written") -> FileError:
     """Error of one line for a file that the system refuses to write."""
     kind = NoSpaceError if error.errno in _NO_SPACE else FileError
-    reason = (error.strerror or str(error).strip() or type(error).__name__).splitlines()[0]
+    reason = (error.strerror or str(error) or type(error).__name__).splitlines()[0]
     return kind(f"{path}: {words}: {reason}")
 
 

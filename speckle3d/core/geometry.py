@@ -128,18 +128,17 @@ def transforms_from_matrices(matrices: npt.ArrayLike, where: str) -> RigidTransf
         Naming `where` and the first index that is not a proper rotation with translation.
     """
     m = require_rows(matrices, (4, 4), where)
-    exact = np.tile(np.eye(4), (len(m), 1, 1))
-    exact[:, :3] = np.concatenate([nearest_rotation(m[:, :3, :3]), m[:, :3, 3:]], axis=2)
-    for first in np.flatnonzero(np.abs(m - exact).max(axis=(1, 2)) > RIGID_TOLERANCE):
+    rotation = Rotation.from_matrix(nearest_rotation(m[:, :3, :3]))
+    rigid = RigidTransform.from_components(m[:, :3, 3], rotation)
+    for first in np.flatnonzero(np.abs(m - rigid.as_matrix()).max(axis=(1, 2)) > RIGID_TOLERANCE):
         raise InvalidInputError(f"{where}[{first}]: expected a rigid 4x4 matrix, got another")
-    return RigidTransform.from_matrix(exact)
+    return rigid
 
 
 def require_finite(values: npt.NDArray[np.floating], where: str) -> None:
     """Raise `InvalidInputError` naming the first entry of `values` that is NaN or infinite."""
-    for first in map(tuple, np.argwhere(~np.isfinite(values)).tolist()):
-        index = first if len(first) > 1 else first[0]
-        raise InvalidInputError(f"{where}[{index}]: expected a finite value, got {values.item(first)}")
+    for index in np.argwhere(~np.isfinite(values)).tolist():
+        raise InvalidInputError(f"{where}{index}: expected a finite value, got {values.item(*index)}")
 
 
 def require_increasing(times_s: npt.ArrayLike, where: str) -> FloatArray:

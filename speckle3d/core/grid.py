@@ -5,7 +5,6 @@ Positions are millimetres in the image: x lateral from the first vector, y axial
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -26,10 +25,6 @@ vectors then shows nothing of the pixels."""
 
 REGION_HELP = "'rectangle x0,y0 x1,y1', 'fan x,y angle,angle radius,radius' or 'polygon x,y x,y x,y ...'"
 """How a region is written: mm in the image, degrees from straight down, several joined by ' and '."""
-
-Pair = tuple[float, float]
-Shape = Callable[[FloatArray], BoolArray]
-"""Which places, mm, shape (..., 2), are in it."""
 
 
 @dataclass(frozen=True)
@@ -166,11 +161,6 @@ class ImageGrid:
         x = [along * across, beside * down, self.first_vector_mm]
         return np.array([x, [beside * across, along * down, depth_mm]])
 
-    def holds(self, place_mm: npt.ArrayLike) -> BoolArray:
-        """Mask of places in P, shape (..., 2), among the samples, the outermost included."""
-        sample, last = self.sample_at(place_mm), [self.vectors - 1, self.samples - 1]
-        return np.asarray((np.abs(sample - np.clip(sample, 0, last)) < _ROUNDING).all(axis=-1))
-
     @property
     def extent_mm(self) -> FloatArray:
         """Least and largest x and y of the samples in P, shape (2, 2), mm."""
@@ -221,8 +211,8 @@ class ImageGrid:
 def box_grid(fan: ImageGrid, pixel_mm: float) -> ImageGrid:
     """Grid of square pixels over the smallest box around a fan."""
     left, top = fan.extent_mm[0].tolist()
-    columns, rows = (int(count) + 1 for count in np.ceil(np.ptp(fan.extent_mm, axis=0) / pixel_mm - 1e-6))
-    return ImageGrid(columns, rows, pixel_mm, pixel_mm, top, first_vector_mm=left)
+    steps = np.ceil(np.ptp(fan.extent_mm, axis=0) / pixel_mm - _ROUNDING).astype(int).tolist()
+    return ImageGrid(steps[0] + 1, steps[1] + 1, pixel_mm, pixel_mm, top, first_vector_mm=left)
 
 
 class ScanConversion:
@@ -331,12 +321,11 @@ class Region:
         for part in self.text.split(" and "):
             try:
                 kind, *words = part.split()
-                shape = _SHAPES[kind](*((float(x), float(y)) for x, y in (word.split(",") for word in words)))
-            except (KeyError, TypeError, ValueError):
+                inside &= _shape_mask(places, kind, [list(map(float, word.split(","))) for word in words])
+            except ValueError as error:
                 raise InvalidInputError(
-                    f"region: expected {REGION_HELP}, joined by ' and ', got {self.text!r}"
+                    f"region: expected {REGION_HELP}, joined by ' and ', got {self.text!r}: {error}"
                 ) from None
-            inside &= shape(places)
         return inside
 
 
@@ -369,19 +358,18 @@ def polygon_mask(places: FloatArray, corners: npt.ArrayLike, name: str = "polygo
     return np.asarray(inside.reshape(places.shape[:2]))
 
 
-def _rectangle(low: Pair, high: Pair) -> Shape:
-    width, height = high[0] - low[0], high[1] - low[1]
-    return ImageGrid(2, 2, width, height, low[1], first_vector_mm=low[0]).holds
-
-
-def _fan(apex: Pair, angles_deg: Pair, radii: Pair) -> Shape:
-    first, last = np.radians(angles_deg).tolist()
-    fan = FanLines(apex, radii[0], first, last - first)
-    return ImageGrid(2, 2, 1.0, radii[1] - radii[0], fan=fan).holds
-
-
-def _polygon(*corners: Pair) -> Shape:
-    return lambda places: polygon_mask(places, corners)
-
-
-_SHAPES: dict[str, Callable[..., Shape]] = {"rectangle": _rectangle, "fan": _fan, "polygon": _polygon}
+def _shape_mask(places: FloatArray, kind: str, pairs: list[list[float]]) -> BoolArray:
+    """Mask of places in a shape, its sides included; `ValueError` if it is none."""
+    if kind == "polygon":
+        return polygon_mask(places, pairs)
+    if kind == "rectangle":
+        (left, top), (right, bottom) = pairs
+        grid = ImageGrid(2, 2, right - left, bottom - top, top, first_vector_mm=left)
+    elif kind == "fan":
+        (x, y), angles_deg, (nearest, farthest) = pairs
+        first, last = np.radians(angles_deg).tolist()
+        grid = ImageGrid(2, 2, 1.0, farthest - nearest, fan=FanLines((x, y), nearest, first, last - first))
+    else:
+        raise ValueError(kind)
+    sample = grid.sample_at(places)
+    return np.asarray((np.abs(sample - sample.clip(0, 1)) < _ROUNDING).all(axis=-1))

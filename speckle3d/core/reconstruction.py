@@ -19,8 +19,6 @@ if TYPE_CHECKING:
 
 MODES = ("image", "consistent-subset", "orientation", "pose", "crossed", "inertial", "fused")
 """Drift-correction modes a reconstruction may hold; `image` is uncorrected and always there."""
-REMOVED_MODES = {"inertial": "`fused` takes any sensor there is, `crossed` a second sweep across the first"}
-"""Modes that only older files hold, and what is there instead."""
 
 
 @shown
@@ -235,11 +233,6 @@ class Reconstruction:
             raise InvalidInputError(
                 f"expected mode image, and others among {', '.join(MODES)}, got {', '.join(self.poses)}"
             )
-        frames = {len(poses) for poses in self.poses.values()}
-        if self.trust is not None:
-            errors: list[Trust | ModeErrors] = [self.trust, *self.trust.modes.values()]
-            frames |= {len(self.trust.flags), *(len(part.covariance) for part in errors)}
-        if frames != {n}:
-            raise InvalidInputError(
-                f"expected a pose of each mode, flags and a covariance of each of {n} frames, got {frames}"
-            )
+        counts = {len(poses) for poses in self.poses.values()}
+        if counts != {n}:
+            raise InvalidInputError(f"poses: expected {n} of each mode, got {counts}")

@@ -8,6 +8,7 @@ from typing import Generic, TypeVar
 
 import numpy as np
 import numpy.typing as npt
+from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import RigidTransform, Rotation, Slerp
 
 from speckle3d.core.arrays import BoolArray, FloatArray
@@ -42,11 +43,9 @@ class TimedSamples(Generic[Samples]):
 
     def covers(self, times_s: npt.ArrayLike) -> BoolArray:
         """Whether each of `times_s` lies on a sample or between two that are close enough."""
-        t = np.asarray(times_s, dtype=float)
-        after = np.searchsorted(self.time_s, t).clip(max=len(self) - 1)
-        first, last = self.time_s[(after - 1).clip(0)], self.time_s[after]
-        between = (t > first) & (t < last) & (last - first <= self.max_gap_s)
-        return np.asarray(between | (t == last))
+        before, after = (np.searchsorted(self.time_s, times_s, side) for side in ("left", "right"))
+        gap_s = np.pad(np.diff(self.time_s), 1, constant_values=np.inf)
+        return np.asarray((before != after) | (gap_s[before] <= self.max_gap_s))
 
     def at(self, times_s: npt.ArrayLike) -> Samples:
         """Sample at each of `times_s`: slerp of the rotation, linear interpolation of the translation.
@@ -56,14 +55,13 @@ class TimedSamples(Generic[Samples]):
         InsufficientDataError
             If a time is outside the samples or in a gap longer than `max_gap_s`.
         """
-        t = self.require_covered(times_s)
-        samples = self.world_from_sensor
+        t, samples = self.require_covered(times_s), self.world_from_sensor
         if len(self) == 1:
             return samples[np.zeros(t.shape, dtype=int)]
         if not isinstance(samples, RigidTransform):
             return self._slerp(t)
-        moved = np.stack([np.interp(t, self.time_s, column) for column in samples.translation.T], axis=-1)
-        return RigidTransform.from_components(moved, self._slerp(t))
+        translation = make_interp_spline(self.time_s, samples.translation, k=1)(t)
+        return RigidTransform.from_components(translation, self._slerp(t))
 
     def require_covered(self, times_s: npt.ArrayLike) -> FloatArray:
         """Return `times_s` as an array if `at` can read them.

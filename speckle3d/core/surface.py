@@ -43,7 +43,6 @@ class Surface:
 
     def __post_init__(self) -> None:
         require_rows(self.vertices_mm, (3,), "vertices_mm")
-        require_rows(self.triangles, (3,), "triangles")
         if not np.isin(self.triangles, range(len(self.vertices_mm))).all():
             raise InvalidInputError(f"triangles: expected vertices 0 to {len(self.vertices_mm) - 1}")
 
@@ -83,8 +82,8 @@ class Surface:
 
     def parts(self) -> IntArray:
         """Number, from 0, of the connected part that each triangle belongs to, shape (m,)."""
-        n, edges = len(self.vertices_mm), self._edges()
-        graph = coo_array((np.ones(len(edges)), edges.T), shape=(n, n))
+        n, (first, second) = len(self.vertices_mm), self._edges().T
+        graph = coo_array((np.ones_like(first), (first, second)), shape=(n, n))
         part = connected_components(graph, directed=False)[1]
         return np.unique(part[self.triangles[:, 0]], return_inverse=True)[1]
 

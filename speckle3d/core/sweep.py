@@ -23,9 +23,6 @@ from speckle3d.core.text import shown
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_SHOWN_DB = 60.0
-"""Range of echoes that are drawn."""
-
 INERTIAL = ("accelerometer_m_s2", "gyroscope_rad_s", "magnetometer_au")
 """Vectors that an orientation sensor may measure beside its orientation, each of shape (m, 3)."""
 
@@ -378,8 +375,9 @@ class Sweep:
         image, label = np.asarray(self.frames[number]), "grey level"
         if not isinstance(self.signal, BModeSettings):
             echo = np.abs(image if np.iscomplexobj(image) else hilbert(image.astype(np.float32)))
-            below = np.maximum(echo / (echo.max() or 1.0), 10 ** (-_SHOWN_DB / 20))
-            image, label = 20 * np.log10(below), "dB below the maximum"
+            # Down to -60 dB.
+            image = 20 * np.log10(np.maximum(echo / (echo.max() or 1.0), 1e-3))
+            label = "dB below the maximum"
         if grid.fan is not None:
             picture = ScanConversion(grid)
             image, grid = picture(image), picture.grid

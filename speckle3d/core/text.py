@@ -6,7 +6,7 @@ import os
 import textwrap
 import unicodedata
 from collections.abc import Collection, Sequence
-from dataclasses import fields, is_dataclass
+from dataclasses import fields
 from itertools import count
 from math import prod
 from typing import Any, TypeVar
@@ -110,10 +110,6 @@ def _brief(value: Any) -> str:
         text = f"{value.dtype} {value.shape}"
     elif hasattr(value, "single"):
         text = type(value).__name__ + ("" if value.single else f" ({len(value)},)")
-    elif is_dataclass(value):
-        text = (
-            f"{type(value).__name__}: {', '.join(f'{k} {_brief(part)}' for k, part in vars(value).items())}"
-        )
     elif isinstance(value, dict | tuple):
         text = ", ".join(map(_brief, value)) if len(value) <= 4 else f"{len(value)}"
     else:

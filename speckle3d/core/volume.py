@@ -63,21 +63,10 @@ class Volume:
         n_i, n_j, n_k = self.voxels.shape
         return n_i, n_j, n_k
 
-    def to_napari(self, viewer: Any = None) -> tuple[Any, dict[str, Any], str]:
-        """Voxels as layer data of napari, added to a viewer if one is given (extra ``napari``)."""
-        place = {"name": "speckle3d", "affine": self.world_from_index, "units": ("mm", "mm", "mm")}
-        if viewer is not None:
-            viewer.add_image(self.voxels, **place)
-        return self.voxels, place, "image"
-
     @property
     def world_from_index(self) -> FloatArray:
         """Affine matrix from voxel indices to world mm, shape (4, 4)."""
         return self.world_from_grid.as_matrix() * [*self.spacing_mm, 1.0]
-
-
-LABEL_TYPES = ("uint8", "uint16")
-"""Types that labels may have; 0 is the background, which has no segment."""
 
 
 @dataclass(frozen=True)
@@ -153,8 +142,8 @@ class LabelMap(Volume):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.voxels.dtype.name not in LABEL_TYPES:
-            raise InvalidInputError(f"labels: expected {' or '.join(LABEL_TYPES)}, got {self.voxels.dtype}")
+        if self.voxels.dtype.kind != "u":
+            raise InvalidInputError(f"labels: expected uint8 or uint16, got {self.voxels.dtype}")
         labels, most = [segment.value for segment in self.segments], np.iinfo(self.voxels.dtype).max
         if len({*labels}) != len(labels) or max(labels, default=0) > most:
             raise InvalidInputError(f"segments: expected one for each label up to {most}, got {labels}")

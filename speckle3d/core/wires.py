@@ -46,9 +46,9 @@ class WirePhantom:
     def __post_init__(self) -> None:
         if not 0 < len(set(self.names)) == len(self.names):
             raise InvalidInputError(f"wires: expected different names, got {', '.join(self.names) or 'none'}")
-        length = np.linalg.norm(self.ends_mm[:, 1] - self.ends_mm[:, 0], axis=1)
-        for name in np.array(self.names)[~((length > 0) & (length < np.inf))]:
-            raise InvalidInputError(f"wire {name}: expected two different ends, got one")
+        for name, (begin, end) in zip(self.names, self.ends_mm, strict=True):
+            if not 0 < np.linalg.norm(end - begin) < np.inf:
+                raise InvalidInputError(f"wire {name}: expected two different ends, got one")
 
     @cached_property
     def points_mm(self) -> FloatArray:
@@ -58,7 +58,7 @@ class WirePhantom:
     @cached_property
     def directions(self) -> FloatArray:
         """Along each wire, of unit length, shape (k, 3)."""
-        along = self.ends_mm[:, 1] - self.ends_mm[:, 0]
+        along = np.diff(self.ends_mm, axis=1)[:, 0]
         return np.asarray(along / np.linalg.norm(along, axis=1, keepdims=True))
 
     def __len__(self) -> int:
@@ -87,11 +87,6 @@ class WirePhantom:
         ends = [crossing(n[1], outer) for n in self.n_shapes for outer in (n[0], n[2])]
         return np.reshape(ends, (-1, 2, 3))
 
-    @cached_property
-    def _normals(self) -> FloatArray:
-        """Two unit vectors square to each wire and to each other, shape (k, 2, 3)."""
-        return np.linalg.svd(self.directions[:, None])[2][:, 1:]
-
     def equations(self, wire: IntArray) -> tuple[FloatArray, FloatArray]:
         """Equations of positions in C on the wires with these numbers, shape (...).
 
@@ -101,5 +96,6 @@ class WirePhantom:
         offsets : ndarray, shape (..., 2)
             ``rows @ position - offsets`` are the two components, mm, of a position's distance from its wire.
         """
-        rows = self._normals[wire]
+        # Two unit vectors square to each wire and to each other.
+        rows = np.linalg.svd(self.directions[:, None])[2][wire, 1:]
         return rows, np.asarray((rows @ self.points_mm[wire][..., None])[..., 0])

@@ -9,7 +9,6 @@ from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, naming
-from speckle3d.core.reconstruction import REMOVED_MODES
 from speckle3d.core.sweep import OrientationSensor, Sweep, Tracker, image_orientation
 from speckle3d.correction.claims import length_sigma, orientation_errors, tracker_errors
 from speckle3d.correction.drift import DriftCorrection, DriftSettings, correct_orientation, correct_pose
@@ -18,6 +17,9 @@ from speckle3d.correction.settings import FusedSettings
 CUBIC_MODES = ("orientation", "pose")
 """The modes of Housden et al. 2008, which fit cubics."""
 DRIFT_MODES = (*CUBIC_MODES, "crossed", "fused")
+
+_REMOVED_MODES = {"inertial": "`fused` takes any sensor there is, `crossed` a second sweep across the first"}
+"""Modes that only older files hold, and what is there instead."""
 
 
 def require_modes(sweep: Sweep, modes: Sequence[str], crossing: bool = False) -> None:
@@ -36,8 +38,8 @@ def require_modes(sweep: Sweep, modes: Sequence[str], crossing: bool = False) ->
         If what it needs is missing, not calibrated to the image, or covers no frame.
     """
     for mode in modes:
-        if mode in REMOVED_MODES:
-            raise InvalidInputError(f"drift mode {mode} was removed: {REMOVED_MODES[mode]}")
+        if mode in _REMOVED_MODES:
+            raise InvalidInputError(f"drift mode {mode} was removed: {_REMOVED_MODES[mode]}")
         if mode not in DRIFT_MODES:
             raise InvalidInputError(f"expected a drift mode among {', '.join(DRIFT_MODES)}; got {mode!r}")
         where = f"{sweep.name}: drift mode {mode}"

@@ -37,7 +37,7 @@ def test_matrix_is_equation_2_of_housden_2008_and_angles_come_back(psi, phi, the
 def test_quaternions_are_scalar_first_and_a_bad_one_is_named():
     rotation = rotations_from_quaternions([[np.cos(0.1), np.sin(0.1), 0, 0]], "q")
     np.testing.assert_allclose(rotation.as_rotvec(), [[0.2, 0, 0]])
-    for value, index in ((0.5, r"q\[3\]"), (np.nan, r"q\[\(3, 0\)\]")):
+    for value, index in ((0.5, r"q\[3\]"), (np.nan, r"q\[3, 0\]")):
         q = np.tile([1.0, 0, 0, 0], (5, 1))
         q[3, 0] = value
         with pytest.raises(InvalidInputError, match=index):
@@ -53,7 +53,7 @@ def test_single_precision_is_rigid_enough_and_what_is_not_rigid_is_named(diagona
     transforms = transforms_from_matrices(matrices.astype(np.float32), "poses")
     np.testing.assert_allclose(transforms.as_matrix(), matrices, atol=1e-4)
     matrices[2] = np.diag(diagonal)
-    with pytest.raises(InvalidInputError, match=r"tracker\[\(?2"):
+    with pytest.raises(InvalidInputError, match=r"tracker\[2"):
         transforms_from_matrices(matrices, "tracker")
 
 

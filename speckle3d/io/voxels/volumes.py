@@ -15,7 +15,7 @@ from speckle3d.core.arrays import AnyArray, ByteArray, FloatArray
 from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.files import PathLike
 from speckle3d.core.geometry import transforms_from_matrices
-from speckle3d.core.volume import LABEL_TYPES, VOXEL_TYPES, LabelMap, Volume
+from speckle3d.core.volume import VOXEL_TYPES, LabelMap, Volume
 from speckle3d.io.hdf5 import reading
 from speckle3d.io.images.headers import is_image, mm_per, read_header
 from speckle3d.io.readers import first_bytes
@@ -155,7 +155,7 @@ def _right_handed(
 
 def _labels(voxels: AnyArray) -> AnyArray:
     """Labels as whole numbers of two bytes at most."""
-    if voxels.dtype.name in LABEL_TYPES:
+    if voxels.dtype.name in ("uint8", "uint16"):
         return voxels
     with np.errstate(invalid="ignore"):
         labels = voxels.astype(np.uint16)
