@@ -33,8 +33,8 @@ from .io.voxels.volumes import read_volume as read_volume
 from .phantom_curves import calibrate_curves as calibrate_curves
 from .scoring.lengths import ModeError as ModeError
 from .scoring.lengths import compare_modes as compare_modes
-from .simulation.presets import SimulationSettings as SimulationSettings
 from .simulation.presets import simulate as simulate
+from .simulation.settings import SimulationSettings as SimulationSettings
 from .study.images import grey_images as grey_images
 from .study.job import JobResult as JobResult
 from .study.job import run_job as run_job

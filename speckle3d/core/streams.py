@@ -43,7 +43,8 @@ class TimedSamples(Generic[Samples]):
 
     def covers(self, times_s: npt.ArrayLike) -> BoolArray:
         """Whether each of `times_s` lies on a sample or between two that are close enough."""
-        before, after = (np.searchsorted(self.time_s, times_s, side) for side in ("left", "right"))
+        t = np.asarray(times_s, dtype=float)
+        before, after = np.searchsorted(self.time_s, t), np.searchsorted(self.time_s, t, "right")
         gap_s = np.pad(np.diff(self.time_s), 1, constant_values=np.inf)
         return np.asarray((before != after) | (gap_s[before] <= self.max_gap_s))
 

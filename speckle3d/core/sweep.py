@@ -188,7 +188,7 @@ class _Sensor(Generic[Samples]):
 class OrientationSensor(_Sensor[Rotation]):
     """An orientation sensor's stream. A reading taken at t belongs to image time t + `time_offset_s`."""
 
-    label: ClassVar[str] = "orientation sensor"
+    label = "orientation sensor"
 
     readings: TimedRotations
     accelerometer_m_s2: FloatArray | None = None
@@ -209,7 +209,7 @@ class Tracker(_Sensor[RigidTransform]):
         volumes and pictures of the tracker's poses look at it.
     """
 
-    label: ClassVar[str] = "tracker"
+    label = "tracker"
 
     readings: TimedPoses
     image_skew_rad: float = 0.0

@@ -139,7 +139,17 @@ class WaterBath(TiledMedium):
             place = medium_from_image * level.image_from_sheet
             slid = float(place.translation @ place.rotation.as_matrix()[:, 0])
             image_from_sheet = level.image_from_sheet * RigidTransform.from_translation([-slid, 0.0, 0.0])
-        sheets = [((medium_from_image * image_from_sheet).apply(self._near(image_from_sheet, box)), 1.0)]
+
+        def sheet(image_from_sheet: RigidTransform, amplitude: float, roughness: float) -> Scatterers:
+            """Scatterers of the reflector, or of its mirror image, on tiles that may reach into the box."""
+            tiles = tiles_near(image_from_sheet.inv(), box)
+            position = np.concatenate([_sheet(self.entropy, tile) for tile in tiles]) * [1.0, roughness, 1.0]
+            if self.reflector == "bar":
+                position = position[np.abs(position[:, 2]) <= _BAR_MM / 2.0]
+            place = (medium_from_image * image_from_sheet).apply(position)
+            return place, np.full(len(place), amplitude * strength, np.float32)
+
+        sheets = [sheet(image_from_sheet, 1.0, 1.0)]
         # Virtual reflectors of the second and later round trips. Unfolding the path, the probe's face is
         # mirrored in the floor, the floor in that, and so on: from straight above these lie at twice and
         # three times the depth; elsewhere they seem turned further too.
@@ -148,19 +158,8 @@ class WaterBath(TiledMedium):
             before, level = level, before.mirrored_in(level)
             if level.normal[1] < _STEEPEST:
                 break
-            position = self._near(level.image_from_sheet, box) * [1.0, 0.0, 1.0]
-            place = medium_from_image * level.image_from_sheet
-            sheets.append((place.apply(position), _REVERBERATION**count))
-        return [
-            *super().scatterers(medium_from_image, box),
-            *((place, np.full(len(place), amplitude * strength, np.float32)) for place, amplitude in sheets),
-        ]
-
-    def _near(self, image_from_sheet: RigidTransform, box: Box) -> FloatArray:
-        """Scatterers of the reflector, in its sheet, on tiles that may reach into a box, shape (n, 3)."""
-        tiles = tiles_near(image_from_sheet.inv(), box)
-        position = np.concatenate([_sheet(self.entropy, tile) for tile in tiles])
-        return position if self.reflector == "wall" else position[np.abs(position[:, 2]) <= _BAR_MM / 2.0]
+            sheets.append(sheet(level.image_from_sheet, _REVERBERATION**count, 0.0))
+        return [*super().scatterers(medium_from_image, box), *sheets]
 
 
 def water_bath(entropy: int, reflector: Reflector) -> WaterBath:

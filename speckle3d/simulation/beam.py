@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import ClassVar
 
 import numpy as np
 
@@ -106,7 +105,7 @@ class BeamTable:
     reach: IntArray
     curvature_per_mm: FloatArray
 
-    depth_mm: ClassVar[FloatArray] = _DEPTH_MM
+    depth_mm = _DEPTH_MM
 
     @cached_property
     def field(self) -> FieldTable:
@@ -115,14 +114,10 @@ class BeamTable:
         return field_table(self.residual, self.reach, self.curvature_per_mm, steps, _PER_PITCH)
 
     @property
-    def lateral_extent_mm(self) -> float:
-        """Largest lateral distance from a vector at which the field is above the floor."""
-        return float(self.lateral_mm[np.flatnonzero(self.reach.any(axis=0))[-1]])
-
-    @property
-    def elevation_extent_mm(self) -> FloatArray:
-        """Largest distance from the image plane at which the field is above the floor, at each depth."""
-        return np.asarray(self.reach.max(axis=1) * _ELEVATION_MM[1])
+    def extent_mm(self) -> tuple[float, float]:
+        """Largest distances from a vector, lateral and elevational, at which the field is above the floor."""
+        lateral = self.lateral_mm[np.flatnonzero(self.reach.any(axis=0))[-1]]
+        return float(lateral), float(self.reach.max() * _ELEVATION_MM[1])
 
     def spectra(self, frequency_hz: FloatArray) -> ComplexArray:
         """Two-way pulse spectrum of each component, shape (component, frequency)."""
@@ -172,9 +167,9 @@ def tabulate_beam(probe: Probe = Probe(), attenuation_db_cm_mhz: float = 0.0) ->
     field /= np.abs(field[np.argmin(np.abs(_DEPTH_MM - probe.transmit_focus_mm)), 0, 0]).max()
     # Curvature of the two-way wavefront near the axis, lateral and elevational.
     middle, double = field[..., _NODES_HZ.size // 2], 2.0 * wavenumbers[_NODES_HZ.size // 2]
-    kx = np.array([_parabola(row, lateral, double) for row in middle[:, :, 0]])
-    kz = np.array([_parabola(row, _ELEVATION_MM, double) for row in middle[:, 0, :]])
-    depth, bend_x, bend_z = (values[:, None, None] for values in (_DEPTH_MM, kx, kz))
+    kx = [_parabola(row, lateral, double) for row in middle[:, :, 0]]
+    kz = [_parabola(row, _ELEVATION_MM, double) for row in middle[:, 0, :]]
+    depth, bend_x, bend_z = np.stack([_DEPTH_MM, kx, kz])[:, :, None, None]
     echo = depth + bend_x * lateral[:, None] ** 2 + bend_z * _ELEVATION_MM**2
     reach = _reach(np.abs(field).max(axis=-1))
     field *= np.exp(2j * echo[..., None] * wavenumbers)
@@ -184,15 +179,14 @@ def tabulate_beam(probe: Probe = Probe(), attenuation_db_cm_mhz: float = 0.0) ->
 
 def _sum_sources(probe: Probe, lateral: FloatArray, wavenumbers: FloatArray) -> ComplexArray:
     """Two-way field, shape (depth, lateral, elevation, node)."""
-    depth, step = _DEPTH_MM, probe.pitch_mm / _PER_PITCH
     widest = int(max(probe.transmit_elements, probe.receive_elements)) | 1
     across = np.repeat((np.arange(widest) - widest // 2) * probe.pitch_mm, _PER_PITCH)
     sent_mm, most_mm = probe.transmit_elements * probe.pitch_mm, probe.receive_elements * probe.pitch_mm
-    still = np.ones(depth.size)
+    still = np.ones(_DEPTH_MM.size)
     transmit = _focused(probe, across, sent_mm * still, probe.transmit_focus_mm * still, wavenumbers)
     # The dynamic receive aperture has at least four elements.
-    width = np.clip(depth / probe.receive_f_number, 4 * probe.pitch_mm, most_mm)
-    receive = _focused(probe, across, width, depth, wavenumbers)
+    width = np.clip(_DEPTH_MM / probe.receive_f_number, 4 * probe.pitch_mm, most_mm)
+    receive = _focused(probe, across, width, _DEPTH_MM, wavenumbers)
     # Sources lie half a step off the lateral grid: from each of its places two are each distance away.
     place, away = np.arange(lateral.size)[:, None], np.arange(lateral.size + across.size // 2)
     sources = place + across.size // 2 + away.size + np.stack([away, -1 - away])[:, None]
@@ -200,14 +194,13 @@ def _sum_sources(probe: Probe, lateral: FloatArray, wavenumbers: FloatArray) -> 
     # All elements share the field of one elevational line of strips behind the lens, shifted along the array.
     strip = ((np.arange(_STRIPS) + 0.5) / _STRIPS - 0.5) * probe.elevation_aperture_mm
     lens = probe.elevation_focus_mm - np.hypot(probe.elevation_focus_mm, strip)
-    out = np.empty((depth.size, lateral.size, _ELEVATION_MM.size, wavenumbers.size), dtype=complex)
-
+    out = np.empty((_DEPTH_MM.size, lateral.size, _ELEVATION_MM.size, wavenumbers.size), dtype=complex)
     line = np.empty((away.size, wavenumbers.size, _ELEVATION_MM.size, 2))
-    for iy in range(depth.size):
-        distance = np.hypot(depth[iy], (away + 0.5) * step)
+    for iy, depth in enumerate(_DEPTH_MM):
+        distance = np.hypot(depth, (away + 0.5) * probe.pitch_mm / _PER_PITCH)
         # Obliquity depth / r and spreading 1 / r of a source in a pressure-release plane.
         lens_fields(distance, _ELEVATION_MM, strip, lens, wavenumbers, 2, 0, away.size, line)
-        field = depth[iy] * line.view(complex)[..., 0].swapaxes(0, 1)
+        field = depth * line.view(complex)[..., 0].swapaxes(0, 1)
         transmission, reception = (way[iy][:, sources].sum(axis=1) @ field for way in ways)
         out[iy] = np.moveaxis(transmission * reception, 0, -1)
     return out
@@ -227,7 +220,7 @@ def _focused(
 def _parabola(profile: ComplexArray, across: FloatArray, wavenumber: float) -> float:
     """Least-squares `a` of path = a x^2 over the main lobe (a third of the axis), by energy."""
     below = np.flatnonzero(np.abs(profile) < np.abs(profile[0]) / 3.0)
-    lobe = slice(0, max(int(below[0]) if below.size else profile.size, 3))
+    lobe = slice(max(np.append(below, profile.size)[0], 3))
     path = -np.unwrap(np.angle(profile[lobe] * np.conj(profile[0]))) / wavenumber
     weight = np.abs(profile[lobe]) ** 2
     return float((weight * path * across[lobe] ** 2).sum() / (weight * across[lobe] ** 4).sum())

@@ -14,6 +14,7 @@ from itertools import product
 from typing import NamedTuple
 
 import numpy as np
+from numpy.random import Generator, default_rng
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray
@@ -56,10 +57,10 @@ def tiles_near(medium_from_image: RigidTransform, box: Box) -> list[Tile]:
     return list(product(range(i, last_i + 1), range(j, last_j + 1)))
 
 
-def tile_rng(tile: Tile, *seed: int) -> np.random.Generator:
+def tile_rng(tile: Tile, *seed: int) -> Generator:
     """Random numbers of a part of a tile."""
     # Seeds are not negative: remainders are distinct on either side of the origin.
-    return np.random.default_rng([*seed, *(number % 2**32 for number in tile)])
+    return default_rng([*seed, *(number % 2**32 for number in tile)])
 
 
 def tile_corner(tile: Tile, depth_mm: float = 0.0) -> FloatArray:
@@ -75,23 +76,11 @@ def wave_sum(waves: FloatArray, position_mm: FloatArray) -> FloatArray:
     return np.asarray(np.sin(position_mm @ waves[:, 1:4].T + waves[:, 4]) @ waves[:, 0])
 
 
-def random_waves(
-    rng: np.random.Generator, rms: float, waves_rad_mm: Sequence[float], count: int = 6
-) -> FloatArray:
+def random_waves(rng: Generator, rms: float, waves_rad_mm: Sequence[float], count: int = 6) -> FloatArray:
     """Draw `count` waves of given largest wave numbers, together of `rms`."""
-    rows = np.empty((count, 5))
-    rows[:, 0] = rms * np.sqrt(2.0 / count)
-    rows[:, 1:4] = rng.uniform(-1.0, 1.0, (count, 3)) * waves_rad_mm
-    rows[:, 4] = rng.uniform(0.0, 2.0 * np.pi, count)
-    return rows
-
-
-class Sphere(NamedTuple):
-    """A ball in which echo strengths are multiplied by `factor` (0: an anechoic cyst)."""
-
-    centre_mm: FloatArray
-    radius_mm: float
-    factor: float
+    amplitude = np.full(count, rms * np.sqrt(2.0 / count))
+    numbers = rng.uniform(-1.0, 1.0, (count, 3)) * waves_rad_mm
+    return np.column_stack([amplitude, numbers, rng.uniform(0.0, 2.0 * np.pi, count)])
 
 
 class Layer(NamedTuple):
@@ -110,8 +99,8 @@ class Layer(NamedTuple):
     top_mm: float
     undulation: FloatArray
     strength: float
-    fill: float = 1.0
     fascia: float = 0.0
+    fill: float = 1.0
 
     def covers(self, position_mm: FloatArray) -> BoolArray:
         """Whether positions, shape (n, 3), lie below the boundary."""
@@ -151,20 +140,6 @@ class Clusters(NamedTuple):
     wander_rad: float = 0.05
     coherent: bool = True
 
-    def draw(self, tile: Tile, *seed: int) -> Scatterers:
-        """Children of the parents in one tile; some lie outside it."""
-        rng, (top, bottom) = tile_rng(tile, *seed), self.depth_mm
-        n = rng.poisson(self.per_mm3 * (bottom - top) * TILE_MM**2)
-        parent = tile_corner(tile, top) + rng.random((n, 3)) * [TILE_MM, bottom - top, TILE_MM]
-        axis = np.asarray(self.direction) + self.wander_rad * rng.standard_normal((n, 3))
-        axis *= (self.length_mm * rng.uniform(0.25, 1.0, n) / np.linalg.norm(axis, axis=1))[:, None]
-        along = rng.random((n, self.children, 1)) - 0.5
-        across = self.spread_mm * np.clip(rng.standard_normal((n, self.children, 3)), -3.0, 3.0)
-        position = parent[:, None] + along * axis[:, None] + across
-        signs = rng.choice([-1.0, 1.0], (n, 1 if self.coherent else self.children))
-        strength = np.broadcast_to(self.strength * signs, (n, self.children))
-        return position.reshape(-1, 3), strength.ravel().astype(np.float32)
-
 
 @dataclass(frozen=True, eq=False)
 class TiledMedium:
@@ -180,8 +155,9 @@ class TiledMedium:
         From the skin down.
     texture : ndarray, optional
         Slow variation of the background's echo strength, in nepers.
-    clusters, spheres
-        Spheres multiply whatever lies in them.
+    clusters : sequence of Clusters
+    spheres : sequence of tuple
+        Centre and radius of balls, mm, and what they multiply echo strengths by (0: an anechoic cyst).
     objects : sequence of Scatterers
         In every box, wherever they lie.
     depth_mm : tuple of float
@@ -194,7 +170,7 @@ class TiledMedium:
     layers: Sequence[Layer] = ()
     texture: FloatArray | None = None
     clusters: Sequence[Clusters] = ()
-    spheres: Sequence[Sphere] = ()
+    spheres: Sequence[tuple[FloatArray, float, float]] = ()
     depth_mm: tuple[float, float] = (-3.0, 50.0)
     objects: Sequence[Scatterers] = ()
 
@@ -242,14 +218,16 @@ def _scatterers(medium: TiledMedium, tile: Tile) -> Scatterers:
     parts = [medium._background(tile)]
     parts += [medium._fascia(tile, layer, n) for n, layer in enumerate(medium.layers) if layer.fascia]
     # Children of a neighbouring tile's parents may lie in this tile.
-    for step in product((-1, 0, 1), repeat=2) if medium.clusters else ():
-        position, strength = _family(medium, (tile[0] + step[0], tile[1] + step[1]))
-        inside = (np.floor(position[:, [0, 2]] / TILE_MM) == tile).all(axis=1)
-        parts.append((position[inside], strength[inside]))
-    position, strength = _concatenate(parts)
-    for sphere in medium.spheres:
-        inside = ((position - sphere.centre_mm) ** 2).sum(axis=1) < sphere.radius_mm**2
-        strength[inside] *= sphere.factor
+    for step in product((-1, 0, 1), repeat=2):
+        for number, clusters in enumerate(medium.clusters, 1000):
+            near = tile[0] + step[0], tile[1] + step[1]
+            position, strength = _children(clusters, near, medium.entropy, number)
+            inside = (np.floor(position[:, [0, 2]] / TILE_MM) == tile).all(axis=1)
+            parts.append((position[inside], strength[inside]))
+    position, strength = map(np.concatenate, zip(*parts, strict=True))
+    for centre_mm, radius_mm, factor in medium.spheres:
+        inside = ((position - centre_mm) ** 2).sum(axis=1) < radius_mm**2
+        strength[inside] *= factor
     present = np.flatnonzero(strength)
     # By depth, so that neighbours meet the same part of the beam's table.
     depth = (position[present, 1] - medium.depth_mm[0]) / _DEPTH_BIN_MM
@@ -257,14 +235,20 @@ def _scatterers(medium: TiledMedium, tile: Tile) -> Scatterers:
     return position[present], strength[present]
 
 
-@lru_cache(_KEPT_TILES)
-def _family(medium: TiledMedium, tile: Tile) -> Scatterers:
-    """Children of all parents in a tile; some lie outside it."""
-    return _concatenate([kind.draw(tile, medium.entropy, 1000 + n) for n, kind in enumerate(medium.clusters)])
-
-
-def _concatenate(parts: Sequence[Scatterers]) -> Scatterers:
-    return np.concatenate([p for p, _ in parts]), np.concatenate([s for _, s in parts])
+@lru_cache(5 * _KEPT_TILES)
+def _children(clusters: Clusters, tile: Tile, *seed: int) -> Scatterers:
+    """Children of the parents in one tile; some lie outside it."""
+    rng, (top, bottom) = tile_rng(tile, *seed), clusters.depth_mm
+    n, children = rng.poisson(clusters.per_mm3 * (bottom - top) * TILE_MM**2), clusters.children
+    parent = tile_corner(tile, top) + rng.random((n, 3)) * [TILE_MM, bottom - top, TILE_MM]
+    axis = np.asarray(clusters.direction) + clusters.wander_rad * rng.standard_normal((n, 3))
+    axis *= (clusters.length_mm * rng.uniform(0.25, 1.0, n) / np.linalg.norm(axis, axis=1))[:, None]
+    along = rng.random((n, children, 1)) - 0.5
+    across = clusters.spread_mm * np.clip(rng.standard_normal((n, children, 3)), -3.0, 3.0)
+    position = parent[:, None] + along * axis[:, None] + across
+    signs = rng.choice([-1.0, 1.0], (n, 1 if clusters.coherent else children))
+    strength = np.broadcast_to(clusters.strength * signs, (n, children))
+    return position.reshape(-1, 3), strength.ravel().astype(np.float32)
 
 
 def fully_developed(entropy: int) -> TiledMedium:
@@ -274,9 +258,8 @@ def fully_developed(entropy: int) -> TiledMedium:
 
 def phantom(entropy: int, length_mm: float) -> TiledMedium:
     """Make a speckle phantom with spherical inclusions, brighter and darker by 6 to 12 dB."""
-    rng = np.random.default_rng([entropy, 1])
-    factors = (2.0, 0.5, 0.25, 3.0, 0.5)
-    spheres = [_sphere(rng, length_mm, (1.5, 4.0), factor) for factor in factors]
+    rng = default_rng([entropy, 1])
+    spheres = [_sphere(rng, length_mm, (1.5, 4.0), factor) for factor in (2.0, 0.5, 0.25, 3.0, 0.5)]
     return TiledMedium(entropy, _PER_MM3, 0.3, spheres=spheres)
 
 
@@ -286,38 +269,34 @@ def tissue(entropy: int, length_mm: float) -> TiledMedium:
     Fibres run mostly along the sweep and are longer than the beam is thick, more of them in some muscles
     than in others: there speckle is partly coherent and decorrelates too slowly.
     """
-    rng = np.random.default_rng([entropy, 1])
+    rng = default_rng([entropy, 1])
     tops = np.array([-3.0, 1.5, 6.5, 7.5, 15.0, 16.2, 23.0, 30.0])
     tops[2:] += rng.uniform(-0.5, 0.5)
     strengths = (0.9, 0.35, 0.7, 0.55, 0.9, 0.7, 0.45, 0.2)
-    fills = (1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 0.2)
     fascias = (0.0, 1.0, 1.6, 0.8, 2.0, 1.0, 1.6, 1.2)
     layers = [
         Layer(float(top), random_waves(rng, 0.25, (0.25, 0.0, 0.2)), *properties)
-        for top, *properties in zip(tops, strengths, fills, fascias, strict=True)
+        for top, *properties in zip(tops, strengths, fascias, strict=True)
     ]
+    layers[-1] = layers[-1]._replace(fill=0.2)
     texture = random_waves(rng, 0.25, (2.0, 2.0, 2.0), 12)
     cysts = [_sphere(rng, length_mm, (1.0, 2.5), 0.0) for _ in range(6)]
-    clusters = _tissue_clusters(rng, tops.tolist())
+    heading, dip = rng.normal(0.0, 0.1), rng.normal(0.0, 0.02)
+    along = (float(np.sin(heading)), float(np.sin(dip)), float(np.cos(heading)))
+    _, skin, _, first, second, third, fourth, deep = tops.tolist()
+    # Fibres in three muscles, in ever larger numbers with depth, crossing septa, and round clusters.
+    clusters = [
+        Clusters(0.5, 24, 0.05, (first, second), 6.0, 0.02, along),
+        Clusters(0.9, 24, 0.05, (third, fourth), 6.0, 0.02, along),
+        Clusters(1.3, 24, 0.05, (fourth, deep), 6.0, 0.02, along),
+        Clusters(0.12, 24, 0.06, (skin, deep), 5.0, 0.02, (1.0, 0.05, 0.1), 0.1),
+        Clusters(0.25, 12, 0.09, (skin, 42.0), spread_mm=0.12, coherent=False),
+    ]
     return TiledMedium(entropy, _PER_MM3, 0.4, layers, texture, clusters, cysts)
 
 
 def _sphere(
-    rng: np.random.Generator, length_mm: float, radius_mm: tuple[float, float], factor: float
-) -> Sphere:
+    rng: Generator, length_mm: float, radius_mm: tuple[float, float], factor: float
+) -> tuple[FloatArray, float, float]:
     centre = rng.uniform([3.0, 8.0, 0.0], [35.0, 34.0, length_mm])
-    return Sphere(centre, float(rng.uniform(*radius_mm)), factor)
-
-
-def _tissue_clusters(rng: np.random.Generator, tops: Sequence[float]) -> list[Clusters]:
-    """Fibres in three muscles, in ever larger numbers with depth, crossing septa, and round clusters."""
-    heading, dip = rng.normal(0.0, 0.1), rng.normal(0.0, 0.02)
-    along = (float(np.sin(heading)), float(np.sin(dip)), float(np.cos(heading)))
-    muscles = [(tops[3], tops[4]), (tops[5], tops[6]), (tops[6], tops[7])]
-    fibres = [
-        Clusters(density, 24, 0.05, depth, length_mm=6.0, spread_mm=0.02, direction=along)
-        for density, depth in zip((0.5, 0.9, 1.3), muscles, strict=True)
-    ]
-    septa = Clusters(0.12, 24, 0.06, (tops[1], tops[7]), 5.0, 0.02, (1.0, 0.05, 0.1), 0.1)
-    round_ones = Clusters(0.25, 12, 0.09, (tops[1], 42.0), spread_mm=0.12, coherent=False)
-    return [*fibres, septa, round_ones]
+    return centre, rng.uniform(*radius_mm), factor

@@ -8,9 +8,11 @@ References
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.random import Generator
 from scipy.interpolate import BSpline, make_interp_spline
 from scipy.spatial.transform import RigidTransform, Rotation
 
@@ -36,17 +38,14 @@ _WANDER = np.array([0.5, 0.5, 0.0, *np.deg2rad([0.6, 0.6, 0.6])])
 _PAUSE_S = 0.3
 """How long the hand stops, once in a sweep."""
 
-_FRAME_JITTER_S = 1e-3
-"""Of the frame clock, at most, either way."""
-
 _SWINGS = np.array([2.3, 3.7, 2.9, 6.5, 1.6, 4.3])
 """Swings of each column during a calibration scan: incommensurate, so that all combinations occur."""
 
 _YAW_ROLL_DEG = (90.0, 11.0)
 """How far either way a calibration scan turns about these axes."""
 
-_NEAREST_MM, _FARTHEST_MM = 12.0, 34.0
-"""Depth of the floor or the crossing in a calibration scan."""
+_LIFT_MM, _LIFT_REACH_MM = 23.0, 11.0
+"""Depth of the floor or the crossing in a calibration scan: the mean, and how far either way."""
 
 _ROAMING_MM = 15.0
 """How far either way the probe wanders over the floor."""
@@ -98,20 +97,21 @@ class Trajectory:
         return self.world_from_medium * self.medium_from_image(time_s)
 
 
-def frame_times(frames: int, rate_hz: float, rng: np.random.Generator) -> FloatArray:
-    """Frame clock with uniform jitter."""
-    jitter_s = min(_FRAME_JITTER_S, 0.2 / rate_hz)
-    return np.arange(frames) / rate_hz + rng.uniform(-jitter_s, jitter_s, frames)
-
-
 def _knot_times(duration_s: float) -> FloatArray:
     knots = round((duration_s + 2 * _LEAD_S) * _KNOT_RATE_HZ) + 1
     return np.linspace(-_LEAD_S, duration_s + _LEAD_S, knots)
 
 
-def _spline(time: FloatArray, columns: FloatArray) -> BSpline[np.float64]:
-    """Quintic, because an accelerometer feels the second derivative."""
-    spline = make_interp_spline(time, columns, k=5)
+def _curves(
+    time: FloatArray, slow: Iterable[FloatArray], rng: Generator, lift_mm: float = 0.0
+) -> BSpline[np.float64]:
+    """Slow motion of the six columns with tremor, the second raised; by quintics, as sensors feel forces."""
+    columns = [
+        column + tremor * _band_noise(time, _TREMOR_HZ, rng)
+        for column, tremor in zip(slow, _TREMOR, strict=True)
+    ]
+    columns[1] += lift_mm
+    spline = make_interp_spline(time, np.stack(columns, axis=1), k=5)
     spline.extrapolate = False
     return spline
 
@@ -121,7 +121,7 @@ def hand_sweep(
     duration_s: float,
     face_mm: float,
     world: RigidTransform,
-    rng: np.random.Generator,
+    rng: Generator,
     number: int = 0,
 ) -> Trajectory:
     """Sweep along the starting image's elevation, as a hand would.
@@ -135,28 +135,31 @@ def hand_sweep(
     number : int
         Of crossed sweeps.
     """
-    fan, turn, crossing = np.deg2rad([settings.fan_deg, settings.turn_deg, settings.crossing_deg]).tolist()
+    fan, turned, crossing = np.deg2rad([settings.fan_deg, settings.turn_deg, settings.crossing_deg]).tolist()
     time = _knot_times(duration_s)
     columns = np.zeros((time.size, 6))
     columns[:, 0] = face_mm / 2.0
     reverse = settings.preset == "reversal"
     columns[:, 2] += _progress(time, duration_s, reverse, rng) * settings.length_mm
     phase = np.clip(time / duration_s, 0.0, 1.0)
-    turned = phase * phase * (3.0 - 2.0 * phase)
+    share = phase * phase * (3.0 - 2.0 * phase)
     if settings.preset == "rotation":
-        columns[:, 3 if settings.turn_axis == "tilt" else 4] = turned * turn
+        columns[:, 3 if settings.turn_axis == "tilt" else 4] = share * turned
     elif settings.preset == "crossed":
-        columns[:, 3] = (turned - 0.5) * fan
-    for axis in range(6):
-        if _WANDER[axis] > 0:
-            columns[:, axis] += _WANDER[axis] * _band_noise(time, (0.0, 1.0 / duration_s), rng)
-        columns[:, axis] += _TREMOR[axis] * _band_noise(time, _TREMOR_HZ, rng)
-    start = _turned_about(np.array([face_mm / 2.0, 0.0, settings.length_mm / 2.0]), crossing * number)
-    return Trajectory(_spline(time, columns), "ZYX", np.ones(3), face_mm, world, start)
+        columns[:, 3] = (share - 0.5) * fan
+    slow = (
+        column + wander * _band_noise(time, (0.0, 1.0 / duration_s), rng) if wander > 0 else column
+        for column, wander in zip(columns.T, _WANDER, strict=True)
+    )
+    turn = Rotation.from_rotvec([0.0, crossing * number, 0.0])
+    # A crossing sweep is turned about the beam axis through the middle of the first.
+    centre_mm = np.array([face_mm / 2.0, 0.0, settings.length_mm / 2.0])
+    start = RigidTransform.from_components(centre_mm - turn.apply(centre_mm), turn)
+    return Trajectory(_curves(time, slow, rng), "ZYX", np.ones(3), face_mm, world, start)
 
 
 def calibration_scan(
-    settings: SimulationSettings, face_mm: float, world: RigidTransform, rng: np.random.Generator
+    settings: SimulationSettings, face_mm: float, world: RigidTransform, rng: Generator
 ) -> Trajectory:
     """Turn and lift the probe, all axes at once, as a hand would.
 
@@ -169,15 +172,15 @@ def calibration_scan(
     over_floor = settings.preset == "plane"
     across, off = (_ROAMING_MM, _ROAMING_MM) if over_floor else (_LATERAL_SHARE * face_mm, _OFF_POINT_MM)
     turns = np.deg2rad([settings.tilt_range_deg, *_YAW_ROLL_DEG])
-    reach = np.array([across, (_FARTHEST_MM - _NEAREST_MM) / 2.0, off, *turns])
+    reach = np.array([across, _LIFT_REACH_MM, off, *turns])
     time = _knot_times(settings.duration_s)
-    columns = np.empty((time.size, 6))
-    for axis in range(6):
-        columns[:, axis] = reach[axis] * _swings(time / settings.duration_s, _SWINGS[axis], rng)
-        columns[:, axis] += _TREMOR[axis] * _band_noise(time, _TREMOR_HZ, rng)
-    columns[:, 1] += (_NEAREST_MM + _FARTHEST_MM) / 2.0
+    swings = (
+        size * _swings(time / settings.duration_s, count, rng)
+        for size, count in zip(reach, _SWINGS, strict=True)
+    )
+    curves = _curves(time, swings, rng, _LIFT_MM)
     in_medium = np.array([1.0, 0.0, 1.0]) * over_floor
-    return Trajectory(_spline(time, columns), "YXZ", in_medium, face_mm, world, RigidTransform.identity())
+    return Trajectory(curves, "YXZ", in_medium, face_mm, world, RigidTransform.identity())
 
 
 def stepped_poses(steps: int, step_mm: float, blocks: int, gap_mm: float) -> RigidTransform:
@@ -186,19 +189,13 @@ def stepped_poses(steps: int, step_mm: float, blocks: int, gap_mm: float) -> Rig
     return RigidTransform.from_translation(np.outer(z.ravel(), [0.0, 0.0, 1.0]))
 
 
-def _turned_about(centre_mm: FloatArray, angle_rad: float) -> RigidTransform:
-    """Turn about the beam axis through `centre_mm`: where a crossing sweep starts."""
-    turn = Rotation.from_rotvec([0.0, angle_rad, 0.0])
-    return RigidTransform.from_components(centre_mm - turn.apply(centre_mm), turn)
-
-
 def world_from_medium(heading_rad: float) -> RigidTransform:
     """World with z up and x north; the medium's depth axis points down, its lateral axis to `heading_rad`."""
     down = Rotation.from_matrix([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
     return RigidTransform.from_rotation(Rotation.from_rotvec([0.0, 0.0, heading_rad]) * down)
 
 
-def _progress(time: FloatArray, duration_s: float, reverse: bool, rng: np.random.Generator) -> FloatArray:
+def _progress(time: FloatArray, duration_s: float, reverse: bool, rng: Generator) -> FloatArray:
     """Fraction of the length travelled: zero before the sweep, one (or zero again) after it."""
     inside = (time >= 0.0) & (time <= duration_s)
     duration = float(time[inside][-1])
@@ -210,16 +207,14 @@ def _progress(time: FloatArray, duration_s: float, reverse: bool, rng: np.random
     speed = np.where(inside, speed * (1.0 - np.clip(3.0 - 4.0 * away, 0.0, 1.0)), 0.0)
     if reverse:
         speed *= np.tanh((duration / 2.0 - time) / 0.25)
-        forward, back = speed.clip(0.0).sum(), -speed.clip(None, 0.0).sum()
-        speed = np.where(speed > 0.0, speed / forward, speed / back)
-    else:
-        speed /= speed.sum()
+    back = -min(speed.clip(max=0.0).sum(), -1e-300)
+    speed = np.where(speed > 0.0, speed / speed.clip(0.0).sum(), speed / back)
     # A hand accelerates over about a tenth of a second.
     start = np.hanning(13)[1:-1]
     return np.cumsum(np.convolve(speed, start / start.sum(), mode="same"))
 
 
-def _band_noise(time: FloatArray, band_hz: tuple[float, float], rng: np.random.Generator) -> FloatArray:
+def _band_noise(time: FloatArray, band_hz: tuple[float, float], rng: Generator) -> FloatArray:
     """Random smooth function of unit rms made of a dozen sinusoids in the band."""
     frequency = rng.uniform(*band_hz, 12)
     phase = rng.uniform(0.0, 2.0 * np.pi, 12)
@@ -227,7 +222,7 @@ def _band_noise(time: FloatArray, band_hz: tuple[float, float], rng: np.random.G
     return np.asarray(wave.sum(axis=1) / np.sqrt(6.0))
 
 
-def _swings(phase: FloatArray, count: float, rng: np.random.Generator) -> FloatArray:
+def _swings(phase: FloatArray, count: float, rng: Generator) -> FloatArray:
     """Nearly triangular wave between -1 and 1, about `count` periods per unit of phase, with rounded ends."""
     # The speed varies slowly against a swing.
     angle = count * rng.uniform(0.95, 1.05) * phase + 0.05 * _band_noise(phase, (0.0, 0.5 * count), rng)

@@ -6,17 +6,17 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.random import SeedSequence, default_rng
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.grid import ImageGrid
-from speckle3d.core.sweep import OrientationSensor, Sweep, Tracker
+from speckle3d.core.sweep import Sweep
 from speckle3d.core.text import shown
 from speckle3d.simulation.bath import crossed_threads, water_bath
 from speckle3d.simulation.beam import BeamTable, Probe, tabulate_beam
 from speckle3d.simulation.medium import TiledMedium, fully_developed, phantom, tissue
 from speckle3d.simulation.movement import (
     calibration_scan,
-    frame_times,
     hand_sweep,
     stepped_poses,
     world_from_medium,
@@ -29,9 +29,10 @@ from speckle3d.simulation.sensors import (
     simulate_orientation,
     simulate_tracker,
 )
-from speckle3d.simulation.settings import Preset, SimulationSettings
+from speckle3d.simulation.settings import SimulationSettings
 
-__all__ = ["Preset", "SimulatedSweep", "SimulationSettings", "simulate"]
+_FRAME_JITTER_S = 1e-3
+"""Of the frame clock, at most, either way."""
 
 _BATH_FRAMES = 150
 
@@ -61,8 +62,8 @@ class SimulatedSweep:
         values = self.settings.model_dump(mode="json")
         if self.sweep.tracker is not None and self.sweep.tracker.sensor_from_image is None:
             values["tracker_sensor_from_image"] = TRACKER_FROM_IMAGE.as_matrix().tolist()
-            wxyz = ORIENTATION_FROM_IMAGE.as_quat(scalar_first=True)
-            values["orientation_sensor_from_image_wxyz"] = wxyz.tolist()
+            wxyz = ORIENTATION_FROM_IMAGE.as_quat(scalar_first=True).tolist()
+            values["orientation_sensor_from_image_wxyz"] = wxyz
         return values
 
 
@@ -87,13 +88,13 @@ def simulate(settings: SimulationSettings) -> tuple[SimulatedSweep, ...]:
     >>> made.sweep.frames[0].shape  # doctest: +SKIP
     (8, 600)
     """
-    medium_seed, heading_seed, *sweep_seeds = np.random.SeedSequence(settings.seed).spawn(4)
-    world = world_from_medium(float(np.random.default_rng(heading_seed).uniform(-np.pi, np.pi)))
+    medium_seed, heading_seed, *sweep_seeds = SeedSequence(settings.seed).spawn(4)
+    world = world_from_medium(float(default_rng(heading_seed).uniform(-np.pi, np.pi)))
     if settings.preset in _BATH:
         world = RigidTransform.from_translation(_BATH_MM) * world
     medium = _medium(settings, _entropy(medium_seed))
     beam = tabulate_beam(attenuation_db_cm_mhz=medium.attenuation_db_cm_mhz)
-    numbers = (0, 1) if settings.preset == "crossed" else (0,)
+    numbers = range(1 + (settings.preset == "crossed"))
     return tuple(_sweep(settings, beam, medium, world, sweep_seeds[number], number) for number in numbers)
 
 
@@ -107,7 +108,7 @@ def _medium(settings: SimulationSettings, entropy: int) -> TiledMedium:
     return (tissue if settings.preset in _TISSUE else phantom)(entropy, settings.length_mm)
 
 
-def _entropy(seed: np.random.SeedSequence) -> int:
+def _entropy(seed: SeedSequence) -> int:
     return int(seed.generate_state(1, np.uint64)[0])
 
 
@@ -116,40 +117,42 @@ def _sweep(
     beam: BeamTable,
     medium: TiledMedium,
     world: RigidTransform,
-    seed: np.random.SeedSequence,
+    seed: SeedSequence,
     number: int,
 ) -> SimulatedSweep:
     """Sweep `number` of a preset: images and sensors along a trajectory of its own."""
     probe, in_bath = beam.probe, settings.preset in _BATH
     image = _image_grid(settings, probe)
-    tracker: Tracker | None = None
-    orientation: OrientationSensor | None = None
+    sensors: dict[str, Any] = {}
     if settings.preset == "stepped":
-        gap_mm = 2.0 * float(beam.elevation_extent_mm.max())
+        gap_mm = 2.0 * beam.extent_mm[1]
         poses = stepped_poses(settings.steps, settings.step_mm, settings.blocks, gap_mm)
         times = np.arange(len(poses)) / settings.frame_rate_hz
     else:
-        motion_seed, clock_seed, tracker_seed, orientation_seed, seed = seed.spawn(5)
+        *seeds, seed = seed.spawn(5)
+        motion, clock, tracker, orientation = map(default_rng, seeds)
         per_mm = 16 if settings.preset == "reversal" else 8
         frames = settings.frames or (_BATH_FRAMES if in_bath else round(per_mm * settings.length_mm))
         duration_s = settings.duration_s if in_bath else frames / settings.frame_rate_hz
-        times = frame_times(frames, frames / duration_s, np.random.default_rng(clock_seed))
-        motion_rng = np.random.default_rng(motion_seed)
+        rate_hz = frames / duration_s
+        jitter_s = min(_FRAME_JITTER_S, 0.2 / rate_hz)
+        times = np.arange(frames) / rate_hz + clock.uniform(-jitter_s, jitter_s, frames)
         if in_bath:
-            trajectory = calibration_scan(settings, image.width_mm, world, motion_rng)
+            trajectory = calibration_scan(settings, image.width_mm, world, motion)
         else:
-            trajectory = hand_sweep(settings, duration_s, image.width_mm, world, motion_rng, number)
+            trajectory = hand_sweep(settings, duration_s, image.width_mm, world, motion, number)
         poses, span = trajectory.medium_from_image(times), (-0.3, duration_s + 0.3)
         noise = settings.sensor_noise if in_bath else 1.0
-        tracker = simulate_tracker(trajectory, span, np.random.default_rng(tracker_seed), noise)
-        orientation = simulate_orientation(trajectory, span, np.random.default_rng(orientation_seed), noise)
+        sensors = {
+            "tracker": simulate_tracker(trajectory, span, tracker, noise),
+            "orientation": simulate_orientation(trajectory, span, orientation, noise),
+        }
         if in_bath or settings.uncalibrated:
-            tracker = replace(tracker, sensor_from_image=None)
-            orientation = replace(orientation, sensor_from_image=None)
+            sensors = {name: replace(sensor, sensor_from_image=None) for name, sensor in sensors.items()}
     rf = SimulatedFrames(beam, medium, poses, image, settings.snr_db, _entropy(seed))
     reflector = f"-{settings.reflector}" if settings.preset == "plane" else ""
     name = f"{settings.preset}{reflector}-{settings.seed}" + ("-crossing" if number else "")
-    sweep = Sweep(rf, image, probe.signal, times, orientation, tracker, world * poses, name=name)
+    sweep = Sweep(rf, image, probe.signal, times, truth=world * poses, name=name, **sensors)
     if settings.signal != "rf":
         range_db = settings.dynamic_range_db if settings.signal == "bmode" else None
         sweep = received(sweep, range_db, decimation=settings.decimation)
@@ -162,5 +165,5 @@ def _image_grid(settings: SimulationSettings, probe: Probe) -> ImageGrid:
     if settings.array == "linear":
         return ImageGrid(settings.vectors, settings.samples, probe.pitch_mm, spacing_mm)
     half = float(np.deg2rad(settings.sector_deg)) / 2
-    radius_mm = settings.radius_mm if settings.array == "curved" else 0.0
+    radius_mm = settings.radius_mm * (settings.array == "curved")
     return ImageGrid.of_fan(settings.vectors, settings.samples, spacing_mm, radius_mm, (-half, half))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -44,9 +44,8 @@ class ReceivedFrames:
     cycles_per_sample: float
     decimation: int
     dynamic_range_db: float | None = None
-    any_thread: ClassVar[bool] = True
-    computed: ClassVar[bool] = True
-    stored_dtype: ClassVar[np.dtype[Any]] = np.dtype(np.int16)
+    any_thread = computed = True
+    stored_dtype = np.dtype(np.int16)
 
     @property
     def dtype(self) -> np.dtype[Any]:
@@ -65,8 +64,7 @@ class ReceivedFrames:
         baseband = echoes * np.exp(-2j * np.pi * self.cycles_per_sample * np.arange(echoes.shape[1]))
         counts = filters.resample_poly(baseband, 1, self.decimation, axis=1, window=_WINDOW)
         if self.dynamic_range_db is None:
-            limits = np.iinfo(np.int16)
-            parts = np.clip(np.rint(counts.view(np.float64)), limits.min, limits.max)
+            parts = np.clip(np.rint(counts.view(np.float64)), -(2**15), 2**15 - 1)
             return parts.view(np.complex128).astype(np.complex64)
         # The envelope's square is twice the RF's.
         over_speckle = np.maximum(np.abs(counts) ** 2 / (2.0 * SPECKLE_RMS_COUNTS**2), 1e-12)

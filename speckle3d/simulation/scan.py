@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -27,7 +26,7 @@ SPECKLE_RMS_COUNTS = 350.0
 _NOISE_BAND_HZ = (2e6, 13e6)
 """The amplifier's pass band."""
 
-_MOST_GAIN_DB = 40.0
+_MOST_GAIN = 100.0
 """Most that time-gain compensation, which is fixed for a uniform medium, amplifies over the focus."""
 
 _GUARD_SAMPLES = 160
@@ -56,9 +55,8 @@ class SimulatedFrames:
     image: ImageGrid
     snr_db: float = 40.0
     noise_entropy: int = 0
-    any_thread: ClassVar[bool] = True
-    computed: ClassVar[bool] = True
-    dtype: ClassVar[np.dtype[Any]] = np.dtype(np.int16)
+    any_thread = computed = True
+    dtype = np.dtype(np.int16)
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -95,7 +93,8 @@ class SimulatedFrames:
         offsets = axes @ (middle[:2] - face_mm)[:, :, None]
         place = medium_from_face.inv().as_matrix(), np.concatenate([axes, offsets], axis=-1)
         low, high = np.pad(image.extent_mm, ((0, 0), (0, 1))) - middle
-        reach = np.array([*[self.beam.lateral_extent_mm] * 2, self.beam.elevation_extent_mm.max()])
+        lateral, elevation = self.beam.extent_mm
+        reach = np.array([lateral, lateral, elevation])
         for block in self.medium.scatterers(medium_from_face, (low - reach, high + reach)):
             scatter_echoes(*block, probe.pitch_mm, *place, self.beam.field, grid, out.view(np.float32))
         return out
@@ -120,7 +119,7 @@ class SimulatedFrames:
         """Bins of the pulse's band, and each component's pulse spectrum in them, shape (bin, component)."""
         spectra = self.beam.spectra(self._frequency_hz)
         band = np.flatnonzero(spectra.any(axis=0))
-        return band, np.ascontiguousarray(spectra[:, band].T).astype(np.complex64)
+        return band, spectra[:, band].T.astype(np.complex64, order="C")
 
     @cached_property
     def _levels(self) -> tuple[Float32Array, float]:
@@ -129,7 +128,7 @@ class SimulatedFrames:
         rms = np.sqrt(self.beam.echo_power(np.linspace(0.0, probe.signal.sampling_rate_hz / 2.0, 513)))
         depth = image.first_sample_depth_mm + np.arange(image.samples) * image.sample_spacing_mm
         focus = float(np.interp(probe.transmit_focus_mm, self.beam.depth_mm, rms))
-        quietest = focus * 10.0 ** (-_MOST_GAIN_DB / 20.0)
+        quietest = focus / _MOST_GAIN
         gain = SPECKLE_RMS_COUNTS / np.maximum(np.interp(depth, self.beam.depth_mm, rms), quietest)
         return gain.astype(np.float32), focus
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.random import Generator
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import FloatArray
@@ -28,10 +29,10 @@ _WANDER_S = 40.0
 """Slow errors of roll, pitch and heading: up to two tenths of a degree over a sweep of seconds."""
 _WHITE_RAD = np.deg2rad(0.03)
 """Noise of each orientation sample, as measured on static logs at 256 Hz."""
-_GYROSCOPE_RAD_S, _GYROSCOPE_BIAS_RAD_S = np.deg2rad([0.6, 0.3])
-_ACCELEROMETER_M_S2, _ACCELEROMETER_BIAS_M_S2 = 0.015, 0.03
-_MAGNETOMETER_AU = 0.004
-"""White noise per raw sample, and biases, which are drawn once per sweep."""
+_GYROSCOPE_RAD_S = np.deg2rad([0.3, 0.6])
+_ACCELEROMETER_M_S2 = (0.03, 0.015)
+_MAGNETOMETER_AU = (0.0, 0.004)
+"""Biases, which are drawn once per sweep, and white noise per raw sample."""
 _DIP_RAD = np.deg2rad(66.0)
 """The earth's field points north and this much down; its strength is one."""
 
@@ -41,7 +42,7 @@ _DERIVATIVE_S = 1e-3
 
 
 def simulate_tracker(
-    trajectory: Trajectory, span_s: tuple[float, float], rng: np.random.Generator, noise: float = 1.0
+    trajectory: Trajectory, span_s: tuple[float, float], rng: Generator, noise: float = 1.0
 ) -> Tracker:
     """Track the probe over `span_s` of image time; `noise` multiplies all errors but the clock's.
 
@@ -50,22 +51,21 @@ def simulate_tracker(
     clock = _clock(span_s, 50.0, 5e-4, rng)
     rng.random(clock.size)  # once for dropouts; what follows keeps its numbers
     true = trajectory.world_from_image(clock) * TRACKER_FROM_IMAGE.inv()
-    translation, rotation = true.as_components()
     jitter = Rotation.from_rotvec(noise * _JITTER_RAD * rng.standard_normal((clock.size, 3)))
-    place = translation + noise * _JITTER_MM * rng.standard_normal((clock.size, 3))
-    readings = TimedPoses(clock + _LATENCY_S, RigidTransform.from_components(place, rotation * jitter))
+    place = true.translation + noise * _JITTER_MM * rng.standard_normal((clock.size, 3))
+    readings = TimedPoses(clock + _LATENCY_S, RigidTransform.from_components(place, true.rotation * jitter))
     return Tracker(readings, TRACKER_FROM_IMAGE, -_LATENCY_S)
 
 
 def simulate_orientation(
-    trajectory: Trajectory, span_s: tuple[float, float], rng: np.random.Generator, noise: float = 1.0
+    trajectory: Trajectory, span_s: tuple[float, float], rng: Generator, noise: float = 1.0
 ) -> OrientationSensor:
     """Orientation and raw inertial readings over `span_s` of image time; `noise` as of the tracker."""
     clock = _clock(span_s, 100.0, 1e-4, rng)
     poses = [trajectory.world_from_image(clock + shift) for shift in (-_DERIVATIVE_S, 0.0, _DERIVATIVE_S)]
     before, rotation, after = (pose.rotation * ORIENTATION_FROM_IMAGE.inv() for pose in poses)
     path = [pose.apply(LEVER_MM) for pose in poses]
-    wander = _wander(clock, _WANDER_S, rng) * (noise * _SLOW_RAD)
+    wander = _wander(clock, rng) * (noise * _SLOW_RAD)
     white = Rotation.from_rotvec(noise * _WHITE_RAD * rng.standard_normal((clock.size, 3)))
     readings = Rotation.from_rotvec(wander) * rotation * white
     # At rest the specific force, acceleration minus gravity, points up.
@@ -82,23 +82,21 @@ def simulate_orientation(
         TimedRotations(clock - _OFFSET_S, readings),
         ORIENTATION_FROM_IMAGE,
         _OFFSET_S,
-        noisy(force, _ACCELEROMETER_BIAS_M_S2, _ACCELEROMETER_M_S2),
-        noisy(rate, _GYROSCOPE_BIAS_RAD_S, _GYROSCOPE_RAD_S),
-        noisy(field, 0.0, _MAGNETOMETER_AU),
+        noisy(force, *_ACCELEROMETER_M_S2),
+        noisy(rate, *_GYROSCOPE_RAD_S),
+        noisy(field, *_MAGNETOMETER_AU),
     )
 
 
-def _clock(
-    span_s: tuple[float, float], rate_hz: float, jitter_s: float, rng: np.random.Generator
-) -> FloatArray:
+def _clock(span_s: tuple[float, float], rate_hz: float, jitter_s: float, rng: Generator) -> FloatArray:
     first = span_s[0] + rng.uniform(0.0, 1.0 / rate_hz)
     n = int((span_s[1] - first) * rate_hz)
     return first + np.arange(n) / rate_hz + rng.uniform(-jitter_s, jitter_s, n)
 
 
-def _wander(time_s: FloatArray, correlation_s: float, rng: np.random.Generator) -> FloatArray:
+def _wander(time_s: FloatArray, rng: Generator) -> FloatArray:
     """First-order random wander of unit standard deviation in three axes, shape (m, 3)."""
-    keep = np.exp(-np.diff(time_s) / correlation_s)
+    keep = np.exp(-np.diff(time_s) / _WANDER_S)
     out = rng.standard_normal((time_s.size, 3))
     for i, k in enumerate(keep, start=1):
         out[i] = k * out[i - 1] + np.sqrt(1.0 - k * k) * out[i]

@@ -36,7 +36,8 @@ from speckle3d.io.sweep_writer import write_sweep
 from speckle3d.scoring.lengths import TRACKER, ModeError
 from speckle3d.scoring.references import error_rows, find_reference, tracker_alone
 from speckle3d.scoring.statistics import mean_interval
-from speckle3d.simulation.presets import SimulationSettings, simulate
+from speckle3d.simulation.presets import simulate
+from speckle3d.simulation.settings import SimulationSettings
 from speckle3d.study.compare import compare_sweeps
 from speckle3d.study.overall import number, with_interval, words_of
 from speckle3d.study.results import Study, SweepOutcome, json_text, write_texts
