@@ -16,9 +16,7 @@ from speckle3d.core.volume import LabelMap
 from speckle3d.io import calibrations, curves, reconstructions
 from speckle3d.io.calibrations import read_calibration
 from speckle3d.io.hdf5 import Source
-from speckle3d.io.import_settings import settings_for
-from speckle3d.io.load import family_format, recording_of
-from speckle3d.io.readers import claim
+from speckle3d.io.load import kind_of, open_recording
 from speckle3d.io.reconstructions import read_reconstruction
 from speckle3d.io.recordings import Row, number_row
 from speckle3d.io.voxels.volumes import is_volume, read_volume
@@ -44,25 +42,22 @@ def _rows(path: PathLike) -> Iterator[Row]:
         yield "format", "volume", ""
         yield from _volume_rows(path)
         return
-    with claim(path) as (reader, source):
-        if reader is None:
-            if (tell := _TELL.get(kind := family_format(path, source))) is None:
-                raise InvalidInputError(f"{path}: expected {' or '.join(_TELL)}, got {kind}")
-            yield "format", kind, ""
-            yield from tell(source)
-            return
-        recording = recording_of(reader, source, settings_for(path), Path(path))
-        facts = recording.describe()
-        yield "format", reader.format, ""
-        yield from facts
-        try:
-            sweep = recording.sweep
-        except (InvalidInputError, FileError) as error:
-            if not facts:
-                raise
-            yield "sweep", f"none: {error}", ""
-        else:
-            yield from _sweep_rows(sweep)
+    kind = kind_of(path)
+    yield "format", kind, ""
+    if kind in _TELL:
+        yield from _TELL[kind](path)
+        return
+    recording = open_recording(path)
+    facts = recording.describe()
+    yield from facts
+    try:
+        sweep = recording.sweep
+    except (InvalidInputError, FileError) as error:
+        if not facts:
+            raise
+        yield "sweep", f"none: {error}", ""
+    else:
+        yield from _sweep_rows(sweep)
 
 
 def _sweep_rows(sweep: Sweep) -> Iterator[Row]:

@@ -6,7 +6,6 @@ import hashlib
 from collections.abc import Generator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import h5py
 
@@ -68,40 +67,36 @@ def load_sweep(path: PathLike, settings: ImportSettings | None = None) -> Sweep:
 def open_recording(path: PathLike, settings: ImportSettings | None = None) -> Recording:
     """Open any recording that a reader claims: its sweep, what it says, and notes on how the sweep is made.
 
+    Where its reader fails, the facts that it told before are kept, and the error.
+
     Raises
     ------
     FileError, InvalidInputError
         As of `load_sweep`; what a recording lacks is asked for when its sweep is.
     """
+    place, rows = Path(path), list[Row]()
     with claim(path) as (reader, source):
         if reader is None:
             kind = family_format(path, source)
             raise InvalidInputError(f"{path}: expected format {sweeps.FORMAT!r}, got {kind!r}")
-        return recording_of(reader, source, settings_for(path, settings), Path(path))
-
-
-def recording_of(reader: Reader, source: Any, settings: ImportSettings, path: Path) -> Recording:
-    """Open a recording that a reader claims, by its path or open file; its errors name the recording.
-
-    Where the reader fails, the facts that it told before are kept, and the error.
-    """
-    if not reader.takes_settings and (file := settings_file(path)) is not None and file.stem == path.name:
-        raise InvalidInputError(
-            f"{file}: expected none beside a {reader.format}, which says all itself: it would not be read"
-        )
-    rows = list[Row]()
-    with reading(path), naming(str(path)):
-        result = reader.read(source, settings)
-        try:
-            while isinstance(result, Generator):
-                rows.append(next(result))
-        except StopIteration as end:
-            result = replace(end.value, rows=tuple(rows))
-        except (InvalidInputError, FileError) as error:
-            if not rows:
-                raise
-            result = Recording(path, settings, fault=error, rows=tuple(rows))
-    return result if isinstance(result, Recording) else Recording(path, settings, ready=result)
+        file = settings_file(path)
+        if not reader.takes_settings and file is not None and file.stem == place.name:
+            raise InvalidInputError(
+                f"{file}: expected none beside a {reader.format}, which says all itself: it would not be read"
+            )
+        settings = settings_for(path, settings)
+        with reading(path), naming(str(path)):
+            result = reader.read(source, settings)
+            try:
+                while isinstance(result, Generator):
+                    rows.append(next(result))
+            except StopIteration as end:
+                result = replace(end.value, rows=tuple(rows))
+            except (InvalidInputError, FileError) as error:
+                if not rows:
+                    raise
+                result = Recording(place, settings, fault=error, rows=tuple(rows))
+    return result if isinstance(result, Recording) else Recording(place, settings, ready=result)
 
 
 def load_landmarks(path: PathLike) -> Landmarks | None:

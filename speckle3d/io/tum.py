@@ -72,18 +72,16 @@ def read_tum(path: PathLike, length_unit: LengthUnit | None = None) -> TimedPose
     scalar_first = "qw" in heading and "qx" in heading[heading.index("qw") :]
     table = np.array([_eight(text) for text in lines if not text.startswith("#")]).reshape(-1, _COLUMNS)
     finite = np.isfinite(table).all(axis=1)
-    if 2 * (count := np.count_nonzero(finite)) <= len(table):
-        raise InvalidInputError(
-            f"{path}: expected lines of eight finite numbers (time x y z qx qy qz qw, blanks between), "
-            f"got {count} of {len(table)}"
-        )
     if unit != (length_unit or unit):
         raise InvalidInputError(f"{path}: expected lengths in {length_unit}, got a file that says {unit}")
     sound = np.abs(np.linalg.norm(table[:, 4:], axis=1) - 1.0) <= _UNIT_TOLERANCE
     words = np.where(finite, np.where(sound, "", "without a unit quaternion"), "that are not eight numbers")
     rows, notes = usable(f"{path}: poses", table[:, 0], words.tolist())
-    if not rows.size:
-        raise InvalidInputError(f"{path}: expected poses with a time and a unit quaternion, got none")
+    if not rows.size or 2 * (count := np.count_nonzero(finite)) <= len(table):
+        raise InvalidInputError(
+            f"{path}: expected lines of eight finite numbers (time x y z qx qy qz qw, blanks between) with a "
+            f"unit quaternion, got {count if rows.size else 0} of {len(table)}"
+        )
     for note in notes:
         warnings.warn(note, stacklevel=2)
     time_s, places, turns = np.split(table[rows], [1, 4], axis=1)

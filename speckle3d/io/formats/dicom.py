@@ -199,18 +199,20 @@ def _clock(header: Any, count: int) -> tuple[FloatArray | None, Value, tuple[str
     """Times of the frames where each has its own, else their rate; and what contradicts."""
     with _reading("frame times"):
         steps = np.ravel(np.asarray(header.get("FrameTimeVector") or [], dtype=float))
-        numbers = {name: float(header.get(name) or 0.0) for name in _RATES}
+        numbers = [float(header.get(name) or 0.0) for name in _RATES]
     rates = [
-        (1e3 / number if name == "FrameTime" else number, name)
-        for name, number in numbers.items()
-        if 0 < number < np.inf
+        Value(1e3 / number if name == "FrameTime" else number, name)
+        for name, number in zip(_RATES, numbers, strict=True)
+        if number > 0
     ]
-    rivals = [f"{name} says {rate:.4g}" for rate, name in rates[1:2] if differs(rates[0][0], rate)]
-    rate = Value(rates[0][0], ", ".join([rates[0][1], *rivals])) if rates else Value()
+    rate, *rivals = rates or [Value()]
+    if rivals and differs(rate.value, rivals[0].value):
+        words = f"{rate.source}, {rivals[0].source} says {rivals[0].value:.4g}"
+        rate = Value(rate.value, words)
     steps = steps[int(steps.size == count) :]  # the first of as many as there are frames is 0
-    if steps.size == count - 1 and np.isfinite(steps).all():
+    if steps.size == count - 1:
         return np.cumsum([0.0, *steps]) / 1e3, rate, ()
-    words = f"FrameTimeVector: {steps.size} steps for {count} frames, or some that are no numbers: not used"
+    words = f"FrameTimeVector: {steps.size} steps for {count} frames: not used"
     return None, rate, (words,) if steps.size else ()
 
 

@@ -18,7 +18,6 @@ from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 import pyigtl.messages
 from fastcrc.crc64 import ecma_182
 from pyigtl import ImageMessage, StringMessage, TransformMessage
@@ -128,7 +127,7 @@ def decode(start: bytes, body: bytes) -> Received:
         return Other(device, time_s, type_)
     fields = {"message_type": type_, "device_name": device, "timestamp": time_s, "header_version": version}
     try:
-        with np.errstate(all="ignore"):  # infinite matrices are refused below
+        with np.errstate(all="ignore"):  # of infinite matrices
             message = MessageBase.create_message(type_)
             message.unpack(fields, body)
             return _READ[type_](message)
@@ -192,12 +191,10 @@ def _pack(message: Any, device: str, time_s: float) -> bytes:
 
 
 def _image(message: Any) -> ImageReceived:
-    matrix = _finite(message.ijk_to_world_matrix)
+    matrix = message.ijk_to_world_matrix
     if message.world_coordinate_system == "lps":
         matrix = _RAS_FROM_LPS @ matrix
     by_slice: AnyArray = message.image
-    if not by_slice.size:
-        raise ValueError(f"expected pixels, got none: shape {by_slice.shape}")
     pixels = by_slice.transpose(2, 1, 0, *range(3, by_slice.ndim))
     if pixels.shape[2] == 1:
         pixels = pixels[:, :, 0]
@@ -208,18 +205,12 @@ def _image(message: Any) -> ImageReceived:
 
 def _transform(message: Any) -> TransformReceived:
     fields = message.metadata
-    valid = fields.get("TransformValid", "True") != "False" and fields.get("TransformStatus", "OK") == "OK"
-    return TransformReceived(message.device_name, message.timestamp, _finite(message.matrix), valid)
+    says_ok = fields.get("TransformValid", "True") != "False" and fields.get("TransformStatus", "OK") == "OK"
+    valid = says_ok and bool(np.isfinite(message.matrix).all())
+    return TransformReceived(message.device_name, message.timestamp, message.matrix, valid)
 
 
 _READ: dict[str, Callable[[Any], Received]] = {"IMAGE": _image, "TRANSFORM": _transform}
-
-
-def _finite(matrix: npt.ArrayLike) -> FloatArray:
-    values = np.asarray(matrix, dtype=np.float64)
-    if not np.isfinite(values).all():
-        raise ValueError("expected a finite matrix, got NaN or infinity")
-    return values
 
 
 def _text(raw: bytes) -> str:
