@@ -112,8 +112,8 @@ def fan_values(
 
 
 def text_of(value: Any) -> str:
-    """Convert a value of HDF5, or the first of several, to text; empty for None."""
-    first = next(iter(np.ravel("" if value is None else value)), "")
+    """Convert a value of HDF5, or the first of several, to text."""
+    first = np.ravel(value)[0]
     return printable(first.decode("utf-8", "replace") if isinstance(first, bytes) else str(first)).strip("\0")
 
 

@@ -30,8 +30,6 @@ _ARRAY = b"\x93NUMPY"
 _PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 _STACKS = (".gif", ".tif", ".tiff")
 _VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".wmv", ".m4v", ".mpg", *_STACKS)
-_NOTES = (".toml", ".txt", ".md", ".json", ".csv", ".db", ".ini")
-"""Of files that may lie among pictures."""
 
 
 def _open_pictures(paths: list[Path]) -> ReadFrame:
@@ -63,8 +61,7 @@ def _pictures(folder: Path) -> list[Path]:
 
 def _claims(path: Path, start: bytes) -> bool:
     if path.is_dir():
-        suffixes = {file.suffix.lower() for file in path.iterdir() if not file.name.startswith(".")}
-        return not suffixes <= {*_NOTES} and suffixes <= {*_PICTURES, *_NOTES}
+        return bool(_pictures(path))
     return start.startswith(_ARRAY) or path.suffix.lower() in (".npz", *_VIDEOS)
 
 

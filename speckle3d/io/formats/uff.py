@@ -60,7 +60,7 @@ def is_uff(file: h5py.File) -> bool:
 def _objects(file: h5py.File) -> dict[str, str]:
     """Classes of the root's groups, by their names."""
     nodes = {str(name): find_member(file, name) for name in file}
-    kinds = {name: text_of(node.attrs.get("class")) for name, node in nodes.items() if node is not None}
+    kinds = {name: text_of(node.attrs.get("class", "")) for name, node in nodes.items() if node is not None}
     return {name: kind for name, kind in kinds.items() if kind}
 
 
@@ -116,7 +116,7 @@ def _kind_of(frames: FileFrames) -> str:
 def _scan(group: h5py.Group, source: str) -> tuple[int, int, dict[str, Value]]:
     """Lines and samples of a scan, and where they lie."""
     scan, where = require_group(group, "scan"), locate(group, "scan")
-    kind = text_of(scan.attrs.get("class"))
+    kind = text_of(scan.attrs.get("class", ""))
     if kind == _LINEAR:
         x_mm, z_mm = 1e3 * flat(scan, "x_axis"), 1e3 * flat(scan, "z_axis")
         return x_mm.size, z_mm.size, grid_values(x_mm, z_mm, where, source)

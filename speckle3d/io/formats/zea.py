@@ -142,7 +142,7 @@ def open_zea(file: h5py.File, settings: ImportSettings) -> Facts:
         time_s=_times(file, group, scan if is_alone else "", shape[0]),
         tracker=tracker,
         chain=_POSES,
-        probe=settings.probe or text_of(file.attrs.get("probe_name", file.attrs.get("probe"))),
+        probe=settings.probe or text_of(file.attrs.get("probe_name", file.attrs.get("probe", ""))),
         assumptions=() if has_places else ("parallel lines",),
         remarks=tuple(remarks),
     )
