@@ -95,7 +95,7 @@ def without_faults(log: ImuLog) -> ImuLog:
         if name == _ORIENTATION:
             changes["oriented"] = log.oriented & ~wrong
         else:
-            rows = np.where(wrong[:, None], np.nan, rows) if counts else rows
+            rows = np.where(wrong[:, None], np.nan, rows)
             changes[name] = rows if finite_rows(rows).any() else None
     return replace(log, **changes, notes=(*log.notes, *notes))
 
@@ -120,7 +120,8 @@ def _bad(name: str, rows: FloatArray, force: FloatArray, rate: FloatArray) -> di
         beyond = size >= _ABSURD
     valid &= ~beyond
     repeats = np.zeros_like(valid)
-    repeats[valid] = _repeats(name, limits.change * unit, rows[valid], force[valid], rate[valid])
+    if valid.any():
+        repeats[valid] = _repeats(name, limits.change * unit, rows[valid], force[valid], rate[valid])
     valid &= ~repeats
     rows = np.where(valid[:, None], rows, np.nan)
     return {
@@ -158,32 +159,27 @@ def _repeats(name: str, change: float, rows: FloatArray, force: FloatArray, rate
     length = np.diff(np.append(start, len(rows)))
     middle, high = np.percentile(length, [50, 90]) if len(length) > 1 else (1, 1)
     usual = int(min(3.0 * middle, high))
-    long, repeats = length > max(2, 2 * usual), np.zeros(len(rows), dtype=bool)
-    if not long.any():
-        return repeats
-    start, length = start[long], length[long]
     steps = np.diff(rows, axis=0)
     step = np.pad(row_norms(steps), 1, constant_values=np.nan)
-    before, after, first = step[start], step[start + length], np.cumsum(length) - length
-    place = np.arange(length.sum()) - np.repeat(first, length)
-    at = np.repeat(start, length) + place
+    before, after = step[start], step[start + length]
     moves = (np.minimum(before, after) > _NOISY * _digit(steps)) | (after > change)
     moves |= np.isnan(after) & (start > 0)
     if name == VECTORS[1]:  # a resting one may read its bias, or zero
-        spread = np.fmax.reduceat(force[at], first) - np.fmin.reduceat(force[at], first)
+        spread = np.fmax.reduceat(force, start) - np.fmin.reduceat(force, start)
         still = ~(spread > _STEADY_M_S2).any(axis=1)
         drops = np.isnan(before) | np.isnan(after) | (before > _DROP_RAD_S)
         bias = still & drops & (row_norms(rows[start]) < _SLOW_RAD_S)
         bad = (moves & ~bias) | (np.isnan(after) & ~still)
     else:  # what is repeated to the log's end was left while the sensor turned
-        turn = np.add.reduceat(np.nan_to_num(row_norms(rate[at])), first)
+        turn = np.add.reduceat(np.nan_to_num(row_norms(rate)), start)
         bad = moves & (~np.isnan(after) | (turn > _TURNING_RAD_S * length))
+    bad &= length > max(2, 2 * usual)
+    # What readings jump to again and again is none, but a number that stands for none.
+    _, code, count = np.unique(rows[start[bad]], axis=0, return_inverse=True, return_counts=True)
     valid = np.full(len(start), usual)
-    if bad.any():  # what readings jump to again and again is none, but a number that stands for none
-        _, code, count = np.unique(rows[start[bad]], axis=0, return_inverse=True, return_counts=True)
-        valid[bad] *= (count[code] == 1) | ~(before[bad] > _NOISY * usual_step(step))
-    repeats[at] = np.repeat(bad, length) & (place >= np.repeat(valid, length))
-    return repeats
+    valid[bad] *= (count[code] == 1) | ~(before[bad] > _NOISY * usual_step(step))
+    place = np.arange(len(rows)) - np.repeat(start, length)
+    return np.asarray(np.repeat(bad, length) & (place >= np.repeat(valid, length)))
 
 
 def stuck_axes(rows: FloatArray, least: float = 0.0) -> BoolArray:
