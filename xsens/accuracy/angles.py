@@ -81,7 +81,17 @@ class AccuracyTable:
     @classmethod
     def of(cls, experiments: Mapping[str, PairErrors]) -> AccuracyTable:
         """Summarise the errors of every experiment, by its name."""
-        return cls({name: _statistics(errors.error_rad) for name, errors in experiments.items()})
+        statistics = {}
+        for name, errors in experiments.items():
+            by_calibration, all_errors = errors.error_rad, errors.error_rad.reshape(-1, 3)
+            statistics[name] = {
+                "mean": all_errors.mean(axis=0),
+                "standard deviation": all_errors.std(axis=0),
+                "RMS": np.sqrt(np.square(all_errors).mean(axis=0)),
+                "largest": np.abs(all_errors).max(axis=0),
+                "standard deviation with the calibration": np.sqrt(by_calibration.var(axis=0).mean(axis=0)),
+            }
+        return cls(statistics)
 
     def text(self) -> str:
         """Mean and standard deviation in degrees as an aligned table."""
@@ -99,17 +109,6 @@ class AccuracyTable:
             for statistic, radians in statistics.items()
             for angle, value in zip(ANGLES, np.rad2deg(radians), strict=True)
         )
-
-
-def _statistics(error_rad: FloatArray) -> dict[str, FloatArray]:
-    all_errors = error_rad.reshape(-1, 3)
-    return {
-        "mean": all_errors.mean(axis=0),
-        "standard deviation": all_errors.std(axis=0),
-        "RMS": np.sqrt(np.square(all_errors).mean(axis=0)),
-        "largest": np.abs(all_errors).max(axis=0),
-        "standard deviation with the calibration": np.sqrt(error_rad.var(axis=0).mean(axis=0)),
-    }
 
 
 def pair_errors(
@@ -256,8 +255,7 @@ def _nearest_turn(turns: FloatArray, reference: FloatArray) -> FloatArray:
     Near half a turn a small error changes which of the two is shorter.
     """
     angle = np.linalg.norm(turns, axis=-1, keepdims=True)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        opposite = np.where(angle > 0, turns * (1.0 - 2.0 * np.pi / angle), turns)
+    opposite = turns * (1.0 - 2.0 * np.pi / np.maximum(angle, 1e-12))
     nearer = np.linalg.norm(opposite - reference, axis=-1) < np.linalg.norm(turns - reference, axis=-1)
     return np.where(nearer[..., None], opposite, turns)
 

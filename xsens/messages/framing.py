@@ -214,15 +214,10 @@ def _without_overlaps(start: IntArray, end: IntArray) -> tuple[IntArray, IntArra
     if not start.size:
         return start, end
     opens = np.concatenate(([True], start[1:] >= np.maximum.accumulate(end)[:-1], [True]))
-    accepted = opens[:-1] & opens[1:]  # nearly all overlap no other
-    overlapping = np.flatnonzero(~accepted)
-    continued = (
-        start[np.minimum(np.searchsorted(start, end[overlapping]), start.size - 1)] == end[overlapping]
-    )
-    better = np.where(continued, start[overlapping], np.iinfo(np.int64).max)
-    better = np.minimum.accumulate(better[::-1])[::-1]  # the next that is followed
-    free = 0
-    for i in overlapping[continued | (better >= end[overlapping])].tolist():
-        if start[i] >= free:
+    accepted, free = opens[:-1] & opens[1:], 0  # nearly all overlap no other
+    continued = start[np.minimum(np.searchsorted(start, end), start.size - 1)] == end
+    for i in np.flatnonzero(~accepted).tolist():
+        rivals = continued[i + 1 : np.searchsorted(start, end[i])]
+        if start[i] >= free and (continued[i] or not rivals.any()):
             accepted[i], free = True, end[i]
     return start[accepted], end[accepted]
