@@ -2,9 +2,9 @@
 from .accuracy.angles import AccuracyTable as AccuracyTable
 from .accuracy.angles import PairErrors as PairErrors
 from .accuracy.angles import common_readings as common_readings
+from .accuracy.angles import compare_orientations as compare_orientations
 from .accuracy.angles import mounting_from_motion as mounting_from_motion
 from .accuracy.angles import pair_errors as pair_errors
-from .accuracy.comparison import compare_orientations as compare_orientations
 from .accuracy.figures import figure_turns as figure_turns
 from .accuracy.mechanism import MechanismSettings as MechanismSettings
 from .accuracy.mechanism import read_mechanism_csv as read_mechanism_csv

@@ -41,7 +41,6 @@ class Filter:
         self._filter["pause_s"] = pause_s
         self._heading.resume()
         self.last = np.zeros(0, kernel.STEP)  # whole increment
-        self._north = np.zeros((0, len(UNKNOWN)))  # as known then
 
     @property
     def start_force_m_s2(self) -> FloatArray:
@@ -85,20 +84,19 @@ class Filter:
             They are the last ones before a pause or the end.
         """
         rows, xyzw, _, _ = self.steps(samples, to_end)
-        north = np.tile(UNKNOWN, (len(rows), 1))
-        if self._settings.use_magnetometer:
-            north = self._heading.follow(rows, to_end)
+        rows["north"] = self._heading.follow(rows, to_end) if self._settings.use_magnetometer else UNKNOWN
         step_of_sample = np.searchsorted(rows["last"], np.arange(1, len(samples) + 1), side="right")
         step_of_sample = np.maximum(step_of_sample + len(self.last) - 1, 0)
-        steps, north = np.concatenate([self.last, rows]), np.concatenate([self._north, north])
-        self.last, self._north = steps[-1:], north[-1:]
+        steps = np.concatenate([self.last, rows])
+        self.last = steps[-1:]
         if not len(steps):
-            steps, north = np.zeros(1, kernel.STEP), np.array([UNKNOWN])
+            steps = np.zeros(1, kernel.STEP)
+            steps["north"] = UNKNOWN
         sd = steps["sd"][:, :3] * _CLAIMED_SHARES
         if self._settings.use_magnetometer:
-            sd[:, 2] = north[:, 1]
-        xyzw = turn_about_up(north[step_of_sample, 0], xyzw)
-        return _at_samples(samples, xyzw, sd, steps, north, step_of_sample)
+            sd[:, 2] = steps["north"][:, 1]
+        xyzw = turn_about_up(steps["north"][step_of_sample, 0], xyzw)
+        return _at_samples(samples, xyzw, sd, steps, step_of_sample)
 
 
 def smooth(samples: Samples, settings: FusionSettings) -> Estimate:
@@ -110,24 +108,24 @@ def smooth(samples: Samples, settings: FusionSettings) -> Estimate:
     variance = np.diagonal(covariance, axis1=1, axis2=2)[np.maximum(np.arange(n), first), :6]
     rows["sd"] = np.sqrt(np.maximum(variance, 0.0))
     rows["start"], rows["bias"] = nodes[:-1], biases[1:]
-    sd, north = rows["sd"][:, :3].copy(), np.tile(UNKNOWN, (n, 1))
+    sd, rows["north"] = rows["sd"][:, :3].copy(), UNKNOWN
     if settings.use_magnetometer:
         bins = averaged_bins(rows, settings)
         if bins["seen"].any():
             of_bins = HeadingFilter(settings, online=False).smooth(bins)
             ends_s, time_s = np.cumsum(bins["span_s"]), np.append(0.0, np.cumsum(rows["duration_s"]))
             nodes = turn_about_up(np.interp(time_s, ends_s, np.unwrap(of_bins[:, 0])), nodes)
-            north = of_bins[np.arange(n) // steps_per_bin(settings)]
-            north[:, 1] = np.interp(time_s[1:], ends_s, of_bins[:, 1])
-        sd[:, 2] = north[:, 1]
+            rows["north"] = of_bins[np.arange(n) // steps_per_bin(settings)]
+            rows["north"][:, 1] = np.interp(time_s[1:], ends_s, of_bins[:, 1])
+        sd[:, 2] = rows["north"][:, 1]
     xyzw, rates = np.empty((len(samples), 4)), np.ascontiguousarray(samples.rate_rad_s)
     orient_samples(samples.step_s, rates, rows, nodes, biases, xyzw)
     of_step = np.repeat(np.arange(n), np.diff(rows["last"], prepend=0))
-    return _at_samples(samples, xyzw, sd, rows, north, of_step)
+    return _at_samples(samples, xyzw, sd, rows, of_step)
 
 
 def _at_samples(
-    samples: Samples, xyzw: FloatArray, sd_rad: FloatArray, steps: Any, north: FloatArray, of_sample: IntArray
+    samples: Samples, xyzw: FloatArray, sd_rad: FloatArray, steps: Any, of_sample: IntArray
 ) -> Estimate:
     """Estimate of each sample by the step that it belongs to.
 
@@ -136,6 +134,6 @@ def _at_samples(
     bias_rad_s = steps["bias"][of_sample]
     rates = Rotation.from_quat(xyzw).apply(samples.rate_rad_s - bias_rad_s)
     late_rad = 0.5 * float(np.median(samples.step_s)) * rates
-    _, _, distrust, stray, iron = north[of_sample].T
+    _, _, distrust, stray, iron = steps["north"][of_sample].T
     sd_rad = np.sqrt(np.square(sd_rad)[of_sample] + late_rad**2)
     return Estimate(xyzw, sd_rad, bias_rad_s, distrust > 0.0, steps["resting"][of_sample], stray, iron)

@@ -175,10 +175,10 @@ def _require_readings(step_s: npt.ArrayLike, *vectors: npt.ArrayLike | None) -> 
     if any(rows.shape != shape for rows in readings):
         raise MismatchError(f"expected readings of shape {shape}, got {[rows.shape for rows in readings]}")
     rate, force, field = readings
-    fast = row_norms(np.nan_to_num(rate)).max(initial=0.0)
-    if fast > FASTEST_RAD_S:
+    if (fast := np.nanmax(row_norms(rate), initial=0.0)) > FASTEST_RAD_S:
         raise InvalidInputError(f"gyroscope_rad_s: expected rad/s, got a reading of {fast:.3g}: in deg/s?")
-    force[~force.any(axis=1) | ~(np.abs(force) < LIMITS[VECTORS[0]].largest).all(axis=1)] = np.nan
+    size = row_norms(force)
+    force[~((size > 0.0) & (size < LIMITS[VECTORS[0]].largest))] = np.nan
     field[~field.any(axis=1)] = np.nan
     rate[~rate.any(axis=1) & np.isnan(force[:, 0])] = np.nan
     return [step, *readings]

@@ -13,7 +13,7 @@ from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.streams import TimedRotations
 from speckle3d.core.text import shown
 from xsens.fusion.readings import PAUSE_S, Estimate, Samples, usable_samples
-from xsens.fusion.settings import DEFAULT_METHOD, FusionSettings, Method
+from xsens.fusion.settings import FusionSettings, Method
 from xsens.logs.samples import ImuLog, finite_rows
 
 _FORESEEN = 3
@@ -69,7 +69,7 @@ class Orientation:
 
 
 def orient(
-    log: ImuLog, settings: FusionSettings | None = None, method: Method | str = DEFAULT_METHOD
+    log: ImuLog, settings: FusionSettings | None = None, method: Method | str = Method.smoother
 ) -> Orientation:
     """Estimate the orientation of a log.
 

@@ -117,7 +117,3 @@ class Method(StrEnum):
     def is_vqf(self) -> bool:
         """Whether VQF finds the orientation, not this package's filter."""
         return self in (Method.vqf, Method.vqf_online)
-
-
-DEFAULT_METHOD = Method.smoother
-"""The engine of those who name none."""

@@ -83,6 +83,7 @@ STEP = np.dtype(
         ("bias", "f8", 3),
         ("noise", "f8", SIZE),  # diagonal
         ("sd", "f8", 6),  # of attitude and bias
+        ("north", "f8", 5),  # filled by the heading's filters, as `xsens.fusion.heading.UNKNOWN` has it
         ("last", "i8"),  # sample after its last one
         ("resting", "?"),
         ("started", "?"),

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from speckle3d.core.streams import TimedRotations
-from xsens.accuracy.comparison import compare_orientations
+from xsens.accuracy.angles import compare_orientations
 
 TIME_S = np.arange(0.0, 5.0, 0.05)
 
