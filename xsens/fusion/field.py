@@ -150,4 +150,4 @@ def field_now(state: OnlineState, disbelieved: float) -> FieldFound:
 
 def dip_rad(field_in_world: FloatArray) -> FloatArray:
     """Angle of fields in the world, shape (m, 3), below the horizontal."""
-    return np.asarray(np.arctan2(-field_in_world[:, 2], row_norms(field_in_world[:, :2])))
+    return np.arctan2(-field_in_world[:, 2], row_norms(field_in_world[:, :2]))

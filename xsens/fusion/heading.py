@@ -162,7 +162,7 @@ class HeadingFilter:
             north = np.concatenate([north, _combine(estimates, weights, best, bins, unsteady)])
         self._north = north[-1:]
         north = north if len(north) else np.array([UNKNOWN])
-        return np.asarray(north[np.clip(bin_of_row, 0, len(north) - 1)])
+        return north[np.clip(bin_of_row, 0, len(north) - 1)]
 
     def smooth(self, bins: Any) -> FloatArray:
         """North over a whole stretch, smoothed backward; the stray at first is the recording's."""

@@ -150,7 +150,7 @@ def lost_variance(time_s: FloatArray, rate_rad_s: FloatArray, usual_s: float) ->
     """
     step_s = np.diff(time_s)
     gap = (step_s > LOST * usual_s) & (step_s <= PAUSE_S)
-    return np.asarray(gap * (step_s * row_norms(np.diff(rate_rad_s, axis=0))) ** 2)
+    return gap * (step_s * row_norms(np.diff(rate_rad_s, axis=0))) ** 2
 
 
 def _interpolated_means(

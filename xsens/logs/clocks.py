@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -125,8 +124,10 @@ def timeline(stamps: Stamps, readings: Sequence[FloatArray] = ()) -> Timeline:
     anew = _new_starts(values, stamps)
     if anew.any():
         steps = np.where(anew[1:], 0.0, np.diff(values))
-        pauses = _pauses(stamps.computer_s, anew, _running_sums(steps))
-        certain = np.isfinite(pauses)
+        clock_s = np.full(len(values), np.nan) if stamps.computer_s is None else stamps.computer_s
+        behind = clock_s - _running_sums(steps)  # constant while the sensor runs, and larger by each pause
+        pauses = np.diff(behind[np.append(0, np.flatnonzero(anew))])
+        certain = pauses > 0.0
         steps[anew[1:]] = np.where(certain, pauses, UNKNOWN_PAUSE_S)
         values = values[0] + _running_sums(steps)
         notes.append(
@@ -214,7 +215,7 @@ def _sample_numbers(counter: IntArray, extras: IntArray | None) -> FloatArray:
     numbers = counter if extras is None else counter - extras
     usual, often = np.unique(np.diff(numbers), return_counts=True)
     stride = int(np.gcd.reduce(np.maximum(usual[often >= max(_RARE * numbers.size, 1.0)], 0))) or 1
-    return np.asarray(numbers / stride)
+    return numbers / stride
 
 
 def _new_starts(values: FloatArray, stamps: Stamps) -> BoolArray:
@@ -236,14 +237,3 @@ def _new_starts(values: FloatArray, stamps: Stamps) -> BoolArray:
         anew |= np.isfinite(stamps.computer_s)
     anew[0] = False
     return anew
-
-
-def _pauses(computer_s: FloatArray | None, anew: BoolArray, running_s: FloatArray) -> FloatArray:
-    """Pause before each new start by the computer's clock; NaN where that is not known."""
-    pauses = np.full(anew.size, np.nan)
-    if computer_s is not None:
-        behind = computer_s - running_s  # constant while the sensor runs, and larger by each pause
-        for before, after in pairwise(np.flatnonzero(np.isfinite(behind))):
-            if anew[before + 1 : after + 1].sum() == 1 and behind[after] > behind[before]:
-                pauses[after] = behind[after] - behind[before]
-    return pauses[anew]

@@ -179,7 +179,7 @@ def _repeats(name: str, change: float, rows: FloatArray, force: FloatArray, rate
     valid = np.full(len(start), usual)
     valid[bad] *= (count[code] == 1) | ~(before[bad] > _NOISY * usual_step(step))
     place = np.arange(len(rows)) - np.repeat(start, length)
-    return np.asarray(np.repeat(bad, length) & (place >= np.repeat(valid, length)))
+    return np.repeat(bad, length) & (place >= np.repeat(valid, length))
 
 
 def stuck_axes(rows: FloatArray, least: float = 0.0) -> BoolArray:
@@ -214,7 +214,7 @@ def _spikes(rows: FloatArray, height: float) -> BoolArray:
     neighbours = np.pad(rows, ((1, 1), (0, 0)), mode="reflect")
     before, after = neighbours[:-2], neighbours[2:]
     away = row_norms(rows - 0.5 * (before + after))
-    return np.asarray((away > height) & (row_norms(after - before) < 0.2 * away))
+    return (away > height) & (row_norms(after - before) < 0.2 * away)
 
 
 def _require_one_sensor(readings: dict[str, FloatArray]) -> None:

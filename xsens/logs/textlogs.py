@@ -175,7 +175,7 @@ def _stamps(
     if "time" not in columns and "utc_s" in columns:
         hour, minute, nano = (columns.get(f"utc_{part}", 0.0) for part in ("hour", "minute", "nano"))
         seconds = 3600.0 * hour + 60.0 * minute + columns["utc_s"] + 1e-9 * nano
-        columns["time"] = unwrap_column(np.asarray(seconds))
+        columns["time"] = unwrap_column(seconds)
     clocks = [np.abs(columns[key]) < _LARGEST for key in ("time", "counter") if key in columns]
     timely = np.all(clocks, axis=0)
     if not timely.any():

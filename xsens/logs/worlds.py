@@ -88,7 +88,7 @@ def quaternions_of(numbers: FloatArray) -> FloatArray:
     if numbers.shape[1] == 4:
         return np.where((np.abs(row_norms(numbers) - 1.0) < _WORST_NORM)[:, None], numbers, np.nan)
     if numbers.shape[1] == 3:
-        good = np.asarray((np.abs(numbers) <= _WORST_ANGLE_DEG).all(axis=1))
+        good = (np.abs(numbers) <= _WORST_ANGLE_DEG).all(axis=1)
         turns = Rotation.from_euler("xyz", numbers[good], degrees=True)
     else:
         good = are_rotations(numbers)

@@ -114,18 +114,18 @@ class Frames:
     @cached_property
     def bid(self) -> ByteArray:
         """Bus ids, shape (n,)."""
-        return np.asarray(self.data[self.start + 1])
+        return self.data[self.start + 1]
 
     @cached_property
     def mid(self) -> ByteArray:
         """Message ids, shape (n,)."""
-        return np.asarray(self.data[self.start + 2])
+        return self.data[self.start + 2]
 
     @cached_property
     def payload_start(self) -> IntArray:
         """First bytes of the payloads, shape (n,)."""
         head = np.where(self.data[self.start + 3] == _LONG_LENGTH, 6, 4)
-        return np.asarray(self.start + head)
+        return self.start + head
 
     @cached_property
     def payload_size(self) -> IntArray:

@@ -33,9 +33,9 @@ The second is over 2**20; the third a 48-bit integer over 2**32, its fraction be
 def as_floats(numbers: npt.NDArray[Any]) -> FloatArray:
     """Float64 of numbers of one of the types in `REAL`, or of unsigned whole numbers."""
     if numbers.dtype == REAL[1]:
-        return np.asarray(numbers / 2.0**20)
+        return numbers / 2.0**20
     if numbers.dtype == np.dtype(REAL[2]):
-        return np.asarray(numbers["f1"] + numbers["f0"] / 2.0**32)
+        return numbers["f1"] + numbers["f0"] / 2.0**32
     with np.errstate(invalid="ignore"):  # signalling NaNs, which damage can make
         return numbers.astype(np.float64)
 
