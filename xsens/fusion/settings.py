@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from enum import StrEnum
 
 from scipy.constants import g
@@ -90,10 +90,9 @@ class FusionSettings:
     use_magnetometer: bool = True
 
     def __post_init__(self) -> None:
-        for entry in fields(self):
-            value = getattr(self, entry.name)
+        for name, value in vars(self).items():
             if not isinstance(value, bool) and not (math.isfinite(value) and value > 0.0):
-                raise InvalidInputError(f"{entry.name}: expected a positive number, got {value!r}")
+                raise InvalidInputError(f"{name}: expected a positive number, got {value!r}")
 
 
 class Method(StrEnum):

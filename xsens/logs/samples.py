@@ -15,7 +15,6 @@ from scipy.spatial.transform import Rotation
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
 from speckle3d.core.geometry import require_increasing
-from speckle3d.core.streams import DEFAULT_MAX_GAP_S
 from speckle3d.core.streams import TimedRotations as TimedRotations
 from speckle3d.core.text import shown
 
@@ -161,7 +160,7 @@ class ImuLog:
         oblique = self.world_from_sensor.inv().apply([1.0, 1.0, 1.0])
         return np.where(self.oriented[:, None], oblique, np.nan)
 
-    def rotations(self, max_gap_s: float = DEFAULT_MAX_GAP_S) -> TimedRotations:
+    def rotations(self) -> TimedRotations:
         """The sensor's own orientation as a stream of the samples that have it.
 
         Raises
@@ -173,5 +172,4 @@ class ImuLog:
             raise InsufficientDataError(
                 f"{self.source or 'log'}: expected samples with the sensor's own orientation, got none"
             )
-        rotations = self.world_from_sensor[self.oriented]
-        return TimedRotations(self.time_s[self.oriented], rotations, max_gap_s)
+        return TimedRotations(self.time_s[self.oriented], self.world_from_sensor[self.oriented])

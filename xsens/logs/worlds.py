@@ -8,7 +8,8 @@ may disturb some samples. The dip of the field has no part in it: it points up i
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -54,8 +55,7 @@ _EVIDENCE = {"NWU": (1.0, 0.0), "ENU": (1.0, 90.0), "NED": (-1.0, 0.0)}
 """Direction of the acceleration along z, and degrees from x to north, in each world."""
 
 
-@dataclass(frozen=True)
-class Claim:
+class Claim(NamedTuple):
     """World named, and by whom in words.
 
     `final` if nothing outweighs it; `by_default` if nobody said so, which is always noted.

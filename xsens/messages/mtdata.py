@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import IntFlag
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -190,23 +190,21 @@ def kind_of(identifier: int) -> Field | None:
     return general if general and not general.whole and identifier & 0xC != 0xC else KINDS.get(identifier)
 
 
-class Items(NamedTuple):
-    """Numbers of m messages by name, shape (m, count), NaN where missing.
-
-    `world` is that of the orientations, "" without; `is_sample` marks messages with more than time stamps,
-    `damage` those whose last item claims more bytes than there are: of them nothing is read.
-    """
-
-    values: Values
-    world: str
-    is_sample: BoolArray
-    damage: BoolArray
-
-
-def read_items(frames: Frames) -> Items:
+def read_items(frames: Frames) -> tuple[Values, str, BoolArray, BoolArray]:
     """Take all messages apart side by side: their first items, their second ones, and so on.
 
     Orientations in another world than the first are left out.
+
+    Returns
+    -------
+    mapping of str to ndarray, shape (m, count)
+        Numbers of the m messages by name, NaN where missing.
+    str
+        World of the orientations, "" without.
+    ndarray of bool, shape (m,)
+        Messages with more than time stamps.
+    ndarray of bool, shape (m,)
+        Damage: those whose last item claims more bytes than there are. Of them nothing is read.
     """
     values: Values = {}
     world = ""
@@ -241,4 +239,4 @@ def read_items(frames: Frames) -> Items:
         values["matrix"] = values["matrix"].reshape(-1, 3, 3).swapaxes(1, 2).reshape(-1, 9)
     for column in values.values():
         column[damage] = np.nan
-    return Items(values, world, is_sample, damage)
+    return values, world, is_sample, damage
