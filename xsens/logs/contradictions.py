@@ -63,7 +63,12 @@ def contradictions(log: ImuLog) -> dict[str, str]:
             f"expected a gyroscope in rad/s, got one in a hundred over {fast:.3g}: in deg/s?"
         )
     for name, direction in directions.items():
-        if rate is None or direction is None or not (turns := _turns(log.time_s, rate, direction)):
+        if rate is None or direction is None:
+            continue
+        if dead := _dead_axis(rate, direction):
+            sentences[name] = f"the {name}'s {dead} axis reads the same while the gyroscope turns it"
+            continue
+        if not (turns := _turns(log.time_s, rate, direction)):
             continue
         sentences["gyroscope"] = sentences["gyroscope"] or _still_axis(name, *turns)
         sentences[name] = _against_gyroscope(name, *turns[:2])
@@ -137,6 +142,17 @@ def _without_iron(time_s: FloatArray, rate: FloatArray, field: FloatArray) -> Fl
     off = np.diff(seen, axis=0) - np.cross(0.5 * (seen[1:] + seen[:-1]), turn)
     by_axis = np.cross(turn[:, None], np.eye(3)).swapaxes(1, 2)
     return field - np.linalg.lstsq(by_axis.reshape(-1, 3), off.ravel())[0]
+
+
+def _dead_axis(rate: FloatArray, direction: FloatArray) -> str:
+    """Axis in which a direction never changes, although it turns in the sensor's axes; empty if none."""
+    valid = finite_rows(rate) & finite_rows(direction)
+    rows, change = direction[valid], np.cross(direction[valid], rate[valid])
+    for axis, column, turned in zip("xyz", rows.T, change.T, strict=True):
+        still = len(rows) > _FEWEST and (column == column[0]).all()
+        if still and _rms(turned[:, None]) > _MOVING_RAD_S * median_norm(rows):
+            return axis
+    return ""
 
 
 def _still_axis(name: str, turns: FloatArray, change: FloatArray, arms: FloatArray, same: BoolArray) -> str:

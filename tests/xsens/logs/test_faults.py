@@ -175,8 +175,10 @@ def test_a_gyroscope_in_another_unit_rate_or_axes_or_a_dead_one_raises(mixing):
         orient(with_rows(log, [VECTORS[1]], lambda rows: rows @ mixing))
 
 
-def test_a_magnetometer_on_other_axes_is_left_out():
+def test_a_magnetometer_on_other_axes_is_left_out_and_a_dead_accelerometer_refused():
     log, _ = swinging(20.0)
+    with pytest.raises(InvalidInputError, match="accelerometer's z axis"):
+        orient(with_rows(log, [VECTORS[0]], lambda rows: rows * [1.0, 1.0, 0.0]))
     orientation = orient(with_rows(log, [VECTORS[2]], lambda rows: rows[:, [1, 0, 2]] * [1, 1, -1]))
     assert not orientation.magnetic
     assert "magnetometer" in orientation.notes[0]
