@@ -79,10 +79,18 @@ def legacy_samples(frames: Frames, indices: IntArray) -> Parts:
     configuration = _last(frames, frames.mid == MessageId.CONFIGURATION, Configuration.from_message)
     blocks = (frames.mid == MessageId.EMTS) & (frames.payload_size == BLOCK_SIZE)
     calibration = _last(frames, blocks, RawCalibration.from_message)
-    layout, notes = _layout(frames[indices], configuration), []
+    units = (configuration and configuration.units) or [(OutputMode.MT9, 0)]
+    if len(units) > 1:
+        raise InvalidInputError(f"expected the log of one unit, got that of a master of {len(units)}")
+    layout, notes = DataLayout(*units[0]), list[str]()
     fits = frames.payload_size[indices] == layout.size
-    if not fits.any():
-        raise InvalidInputError(f"expected data messages of {layout.size} bytes, as configured, got none")
+    if not fits.any() or (configuration is None and 2 * fits.sum() <= fits.size):
+        whose = (
+            "as configured" if configuration else "as an MT9-B's raw counts, or a configuration before them"
+        )
+        raise InvalidInputError(
+            f"expected data messages of {layout.size} bytes, {whose}, got {fits.sum()} of {fits.size}"
+        )
     if not fits.all():
         notes.append(f"{(~fits).sum()} data messages were not as long as configured: left out")
         indices = indices[fits]
@@ -112,21 +120,6 @@ def _last(frames: Frames, indices: BoolArray, read: Callable[[Message], Any]) ->
         with suppress(InvalidInputError):
             return read(frames.message(i))
     return None
-
-
-def _layout(data: Frames, configuration: Configuration | None) -> DataLayout:
-    """Layout as configured, or else that of the MT9-B, which sends raw counts after its counter."""
-    units = configuration.units if configuration is not None else ()
-    if len(units) > 1:
-        raise InvalidInputError(f"expected the log of one unit, got that of a master of {len(units)}")
-    if units:
-        return DataLayout(units[0].output_mode, units[0].output_settings)
-    layout = DataLayout(OutputMode.MT9)
-    if 2 * (data.payload_size == layout.size).sum() <= len(data):
-        raise InvalidInputError(
-            "expected a configuration before data messages that are not an MT9-B's raw counts, got none"
-        )
-    return layout
 
 
 # -- MTData2
