@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import time
+from collections import deque
 from dataclasses import dataclass, replace
+from itertools import groupby
 from threading import Lock
 from typing import TYPE_CHECKING, Any
 
@@ -23,8 +25,9 @@ if TYPE_CHECKING:
     from speckle3d.core.arrays import FloatArray
     from xsens.fusion.online import OnlineFilter, OnlineState
 
-_MOST_PENDING = 1 << 14
-"""Messages kept until the state is asked for, as many as eight seconds bring at most."""
+_MOST_PENDING = 1 << 12
+"""Pieces kept until the state is asked for: a minute or more."""
+
 _NAN = float("nan")
 _DATA = (MessageId.MT_DATA, MessageId.MT_DATA2)
 
@@ -44,7 +47,7 @@ class LiveState:
     interruptions : int
         How often the connection was lost.
     rate_hz : float
-        Samples received per second since the sensor was last connected.
+        Samples per second as the sensor takes them; 0 until two have come.
     world_from_sensor : Rotation, optional
         The sensor's own orientation, or the on-line filter's.
     field : float
@@ -99,64 +102,51 @@ class LiveState:
 
 
 class Monitor:
-    """Count what a recording thread receives; decode it when asked for the state."""
+    """Gather what a recording thread receives; decode it when asked for the state."""
 
     def __init__(self) -> None:
-        self._lock = Lock()
-        self._since_s = time.monotonic()
+        self._lock, self._since_s, self._events = Lock(), time.monotonic(), deque[Any]()
         self._now = LiveState(False, 0.0, 0, 0, 0, 0.0, None, _NAN, _NAN, "")
-        self._begin(())
 
-    def _begin(self, header: tuple[Message, ...]) -> None:
-        self._header = b"".join(map(encode, header))
-        self._framer, self._pending = Framer(), list[Message]()
-        self._begun_s, self._before = time.monotonic(), self._now.samples
-        self._counter: int | None = None
-        self._filter: OnlineFilter | None = None
-        self._step_s = _NAN
+    def take(self, event: bytes | tuple[Message, ...] | str) -> None:
+        """Take in bytes as received, the header of a sensor that begins to measure, or why it is lost."""
+        self._events.append(event)
+        if len(self._events) > _MOST_PENDING:  # nobody has asked for a while
+            self.state()
+
+    def state(self) -> LiveState:
+        """The state now."""
+        digest: dict[type, Any] = {bytes: self._digest, tuple: self._begin, str: self._interrupt}
+        with self._lock:
+            events = [self._events.popleft() for _ in range(len(self._events))]
+            for kind, group in groupby(events, type):
+                pieces = list(group)
+                digest[kind](b"".join(pieces) if kind is bytes else pieces[-1])
+            return replace(self._now, elapsed_s=time.monotonic() - self._since_s)
 
     def _set(self, **changes: Any) -> None:
         self._now = replace(self._now, **changes)
 
-    def begin(self, header: tuple[Message, ...]) -> None:
-        """Note that the sensor begins to measure; its counter may start anywhere."""
-        with self._lock:
-            self._digest()
-            self._begin(header)
-            self._set(connected=True)
+    def _begin(self, header: tuple[Message, ...]) -> None:
+        """Begin to measure; the sensor's counter may start anywhere."""
+        self._header, self._framer = b"".join(map(encode, header)), Framer()
+        self._counter: int | None = None
+        self._filter: OnlineFilter | None = None
+        self._set(connected=True)
 
-    def take(self, data: bytes) -> None:
-        """Take in received bytes, in pieces of any size."""
-        with self._lock:
-            messages = [message for message in self._framer.feed(data) if message.mid in _DATA]
-            self._set(samples=self._now.samples + len(messages))
-            self._pending += messages
-            if len(self._pending) > _MOST_PENDING:  # nobody has asked for a while
-                self._digest()
-
-    def interrupt(self, reason: str) -> None:
+    def _interrupt(self, reason: str) -> None:
         """Note that the connection is lost, or still is."""
-        with self._lock:
-            self._digest()
-            count = self._now.interruptions + self._now.connected
-            self._set(connected=False, interruptions=count, world_from_sensor=None, fused=None, note=reason)
+        count = self._now.interruptions + self._now.connected
+        self._set(connected=False, interruptions=count, world_from_sensor=None, fused=None, note=reason)
 
-    def state(self) -> LiveState:
-        """The state now."""
-        with self._lock:
-            self._digest()
-            now_s = time.monotonic()
-            rate_hz = (
-                self._now.connected * (self._now.samples - self._before) / (now_s - self._begun_s or 1.0)
-            )
-            return replace(self._now, elapsed_s=now_s - self._since_s, rate_hz=rate_hz)
-
-    def _digest(self) -> None:
-        data, self._pending = b"".join(map(encode, self._pending)), []
-        if not data:
+    def _digest(self, data: bytes) -> None:
+        """Decode bytes, of which a message's end may follow later."""
+        messages = [message for message in self._framer.feed(data) if message.mid in _DATA]
+        if not messages:
             return
+        self._set(samples=self._now.samples + len(messages))
         try:
-            log = parse_stream(self._header + data, Hints(as_stated=True))
+            log = parse_stream(self._header + b"".join(map(encode, messages)), Hints(as_stated=True))
         except Speckle3DError as error:
             self._set(note=str(error))
             return
@@ -165,6 +155,8 @@ class Monitor:
             if self._counter is not None:
                 missing = int(log.counter[0] - self._counter - 1) % (1 << 16)
             self._counter = int(log.counter[-1])
+        if len(log) > 1:
+            self._set(rate_hz=log.rate_hz)
         fused = self._follow(log, missing)
         world_from_sensor = None if fused is None else fused.world_from_sensor
         if log.world_from_sensor is not None and log.oriented.any():
@@ -182,16 +174,13 @@ class Monitor:
 
     def _follow(self, log: ImuLog, missing: int) -> OnlineState | None:
         """Filter some samples, with the number of those missing before them."""
-        steps = np.diff(log.time_s)
-        if steps.size:
-            self._step_s = float(np.median(steps))
         gyroscope, accelerometer = log.gyroscope_rad_s, log.accelerometer_m_s2
-        if gyroscope is None or accelerometer is None or not np.isfinite(self._step_s):
+        if gyroscope is None or accelerometer is None or not self._now.rate_hz:
             return None
         from xsens.fusion.online import OnlineFilter  # which loads numba
 
         self._filter = self._filter or OnlineFilter()
-        steps = np.append(self._step_s * (1 + missing), steps)
+        steps = np.append((1 + missing) / self._now.rate_hz, np.diff(log.time_s))
         try:
             self._filter.push(steps, gyroscope, accelerometer, log.magnetometer_au)
         except InvalidInputError:  # damaged readings: the recording keeps them, the displayed filter restarts

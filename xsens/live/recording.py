@@ -142,7 +142,7 @@ class Recorder:
                     with closing(device or self._prepare()) as device:
                         self._measure(device)
                 except (DeviceError, InvalidInputError) as error:  # and no others: a full disk stays full
-                    self._monitor.interrupt(str(error))
+                    self._monitor.take(str(error))
                     device = None
                     self._stop.wait(RETRY_S)
         except Speckle3DError as error:
@@ -150,7 +150,7 @@ class Recorder:
 
     def _measure(self, device: Device) -> None:
         self._file.append(b"".join(map(encode, (*self._info.header, utc_message()))))
-        self._monitor.begin(self._info.header)
+        self._monitor.take(self._info.header)
         device.tap = self._take
         device.request(MessageId.GO_TO_MEASUREMENT)
         heard = time.monotonic()

@@ -28,7 +28,7 @@ def stream_of(indices, iron=0.0) -> bytes:
 @pytest.fixture
 def monitor():
     monitor = Monitor()
-    monitor.begin(HEADER)
+    monitor.take(HEADER)
     return monitor
 
 
