@@ -154,10 +154,12 @@ class HeadingFilter:
             bins = averaged_bins(rows[:whole], self._settings)
             estimates = self._run(bins)
             weights, best = self._weights(estimates)
-            # A walk at random: its variance grows with time, by the mean of the minutes so far.
-            walks = self._walks + np.cumsum(self._unsteady(estimates, best, bins)) / _STEADY
+            # A walk at random: its variance grows with time, by the mean of the minutes so far. By that of sizes
+            # (normal ones), not of squares: a single jump, as where iron is left behind, is no walk.
+            sizes = np.sqrt(0.5 * np.pi * self._unsteady(estimates, best, bins))
+            walks = self._walks + np.cumsum(sizes) / _STEADY
             minutes = (self._bins + 1.0 + np.arange(len(bins))) / _STEADY
-            unsteady = walks / np.maximum(minutes - 1.0, 1.0 / _STEADY) * minutes
+            unsteady = (walks / np.maximum(minutes - 1.0, 1.0 / _STEADY)) ** 2 * minutes
             self._walks, self._bins = float(walks[-1]), self._bins + len(bins)
             north = np.concatenate([north, _combine(estimates, weights, best, bins, unsteady)])
         self._north = north[-1:]
