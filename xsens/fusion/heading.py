@@ -154,8 +154,8 @@ class HeadingFilter:
             bins = averaged_bins(rows[:whole], self._settings)
             estimates = self._run(bins)
             weights, best = self._weights(estimates)
-            # A walk at random: its variance grows with time, by the mean of the minutes so far. By that of sizes
-            # (normal ones), not of squares: a single jump, as where iron is left behind, is no walk.
+            # A walk at random: its variance grows with time, by the mean of the minutes so far. It is that of
+            # sizes (normal ones), not of squares: a single jump, as where iron is left behind, is no walk.
             sizes = np.sqrt(0.5 * np.pi * self._unsteady(estimates, best, bins))
             walks = self._walks + np.cumsum(sizes) / _STEADY
             minutes = (self._bins + 1.0 + np.arange(len(bins))) / _STEADY
