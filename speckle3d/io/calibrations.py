@@ -25,7 +25,6 @@ from speckle3d.core.sweep import BModeSettings, Sweep
 from speckle3d.core.text import written_path
 from speckle3d.io.hdf5 import (
     PathLike,
-    Source,
     locate,
     open_family,
     read_array,
@@ -70,12 +69,12 @@ def write_calibration(path: PathLike, calibration: Calibration) -> None:
         put(file, "frames", counts | {"given": frames.given, "reason": list(frames.dropped.values())})
 
 
-def read_calibration(path: Source) -> Calibration:
+def read_calibration(path: PathLike) -> Calibration:
     """Read a calibration, and check it.
 
     Parameters
     ----------
-    path : path or open file
+    path : path
         HDF5 file of `speckle3d calibrate`.
 
     Returns

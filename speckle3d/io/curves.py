@@ -9,7 +9,7 @@ import numpy as np
 from speckle3d.core.curves import CurveKey, DecorrelationCurves
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import RFSettings
-from speckle3d.io.hdf5 import PathLike, Source, open_family, read_text
+from speckle3d.io.hdf5 import PathLike, open_family, read_text
 from speckle3d.io.records import put, put_fields, read_record, written
 from speckle3d.io.sweeps import read_signal
 
@@ -61,12 +61,12 @@ def write_curves(path: PathLike, curves: DecorrelationCurves) -> None:
         put(file, "signal", "rf" if isinstance(signal, RFSettings) else "bmode")
 
 
-def read_curves(path: Source) -> DecorrelationCurves:
+def read_curves(path: PathLike) -> DecorrelationCurves:
     """Read decorrelation curves, and check them.
 
     Parameters
     ----------
-    path : path or open file
+    path : path
         HDF5 file of `speckle3d calibrate curves`.
 
     Returns

@@ -15,7 +15,6 @@ from speckle3d.core.sweep import BModeSettings, RFSettings, Sweep, stored_dtype
 from speckle3d.core.volume import LabelMap
 from speckle3d.io import calibrations, curves, reconstructions
 from speckle3d.io.calibrations import read_calibration
-from speckle3d.io.hdf5 import Source
 from speckle3d.io.load import kind_of, open_recording
 from speckle3d.io.reconstructions import read_reconstruction
 from speckle3d.io.recordings import Row, number_row
@@ -107,7 +106,7 @@ def _rate_rows(name: str, times: FloatArray, unit: str) -> Iterator[Row]:
     yield f"{name}rate", f"{(times.size - 1) / span:.2f}" if span else "", unit
 
 
-def _reconstruction_rows(path: Source) -> Iterator[Row]:
+def _reconstruction_rows(path: PathLike) -> Iterator[Row]:
     result = read_reconstruction(path)
     pairs, times = result.pairs, result.frame_time_s
     yield "frames", str(times.size), ""
@@ -127,7 +126,7 @@ def _source_rows(source: Any) -> Iterator[Row]:
     yield "package version", source.package_version, ""
 
 
-def _calibration_rows(path: Source) -> Iterator[Row]:
+def _calibration_rows(path: PathLike) -> Iterator[Row]:
     calibration = read_calibration(path)
     yield from calibration.rows()
     yield from _source_rows(calibration.source)
@@ -156,7 +155,7 @@ def _volume_rows(path: PathLike) -> Iterator[Row]:
         yield "levels found", f"{levels.min():g} to {levels.max():g}" if levels.size else "none", ""
 
 
-def _curves_rows(path: Source) -> Iterator[Row]:
+def _curves_rows(path: PathLike) -> Iterator[Row]:
     record = curves.read_curves(path)
     half = [np.interp(-0.5, -row, record.distance_mm) for row in record.correlation]
     yield "probe", record.key.probe or "not named", ""
@@ -172,7 +171,7 @@ def _curves_rows(path: Source) -> Iterator[Row]:
     yield "lengths read with them, 95 %", f"+- {196 * record.scale_sigma:.1f}", "%"
 
 
-_TELL: dict[str, Callable[[Source], Iterator[Row]]] = {
+_TELL: dict[str, Callable[[PathLike], Iterator[Row]]] = {
     reconstructions.FORMAT: _reconstruction_rows,
     curves.FORMAT: _curves_rows,
     calibrations.FORMAT: _calibration_rows,

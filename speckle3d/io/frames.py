@@ -51,10 +51,9 @@ class FileFrames:
         numbers: Sequence[int] | None = None,
     ) -> None:
         self.path, self.open_file = Path(path).absolute(), open_file
-        self._arguments = open_file, shape, dtype, stored_dtype
-        self.numbers = range(shape[0]) if numbers is None else [int(i) for i in numbers]
+        self.numbers = range(shape[0]) if numbers is None else numbers
         self.shape, self.dtype = (len(self.numbers), *shape[1:]), np.dtype(dtype)
-        self.stored_dtype = self.dtype if stored_dtype is None else np.dtype(stored_dtype)
+        self.stored_dtype = np.dtype(dtype if stored_dtype is None else stored_dtype)
         self._read: ReadFrame | None = None
         self._lock = threading.Lock()
 
@@ -80,10 +79,13 @@ class FileFrames:
 
     def take(self, rows: AnyArray, axis: int = 0) -> FileFrames:
         """Subset of the frames, as by `numpy.take`."""
-        return FileFrames(self.path, *self._arguments, [self.numbers[i] for i in rows.tolist()])
+        kind, (*others, numbers) = self.__reduce__()
+        part: FileFrames = kind(*others, [numbers[i] for i in rows.tolist()])
+        return part
 
-    def __reduce__(self) -> tuple[Any, ...]:
-        return type(self), (self.path, *self._arguments, self.numbers)
+    def __reduce__(self) -> tuple[Any, tuple[Any, ...]]:
+        own = self.path, self.open_file, self.shape, self.dtype, self.stored_dtype, self.numbers
+        return FileFrames, own
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ import ctypes
 import hashlib
 import os
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -22,9 +22,6 @@ from speckle3d.core.files import cannot_write, open_regular, whole_file
 from speckle3d.core.geometry import transforms_from_matrices
 
 Node: TypeAlias = h5py.Group | h5py.Dataset
-Source: TypeAlias = PathLike | h5py.File
-"""A file by its path, or open."""
-
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 """First bytes of an HDF5 file without a user block."""
 
@@ -68,10 +65,8 @@ def require_target(path: PathLike) -> Path:
     target = Path(path).resolve()
     if target.exists() and not target.is_file():
         raise FileError(f"{path}: expected an ordinary file to write, got a folder or device")
-    if not target.parent.is_dir():
-        raise FileError(f"{path}: expected an existing folder, got {target.parent}")
-    if not os.access(target.parent, os.W_OK):
-        raise FileError(f"{path}: cannot be written: {target.parent} is read-only")
+    if not target.parent.is_dir() or not os.access(target.parent, os.W_OK):
+        raise FileError(f"{path}: expected an existing folder, not read-only, got {target.parent}")
     return target
 
 
@@ -153,19 +148,13 @@ def reading(where: PathLike) -> Iterator[None]:
 
 
 @contextmanager
-def open_family(source: Source, format_name: str, versions: Sequence[int] = (1,)) -> Iterator[h5py.File]:
-    """Open an HDF5 file of the family for reading and require its format and one of the versions.
-
-    A file that is open stays so after the block.
-    """
-    path = source.filename if isinstance(source, h5py.File) else source
-    file_context: Any = nullcontext(source) if isinstance(source, h5py.File) else open_hdf5(source)
-    with reading(path), file_context as file, naming(str(path)):
+def open_family(path: PathLike, format_name: str, versions: Sequence[int] = (1,)) -> Iterator[h5py.File]:
+    """Open an HDF5 file of the family for reading and require its format and one of the versions."""
+    with reading(path), open_hdf5(path) as file, naming(str(path)):
         if (kind := file_format(file)) != format_name:
             raise InvalidInputError(f"expected format {format_name!r}, got {kind or 'none'!r}")
         if (version := read_attribute(file, "version")) not in versions:
-            numbers = " or ".join(map(str, versions))
-            raise InvalidInputError(f"expected {format_name} version {numbers}, got {version:g}")
+            raise InvalidInputError(f"expected {format_name} version in {versions}, got {version:g}")
         yield file
 
 

@@ -15,9 +15,9 @@ from speckle3d.core.geometry import nearest_rotation
 from speckle3d.core.streams import TimedPoses
 from speckle3d.core.sweep import Sweep
 
-ROUNDING_TOLERANCE = 2e-3
-"""How far R^T R of a pose may be from the identity before it is made rigid. An electromagnetic tracker that
-rounds its own output was measured at 4.6e-4; six written digits alone give 2e-6."""
+ROUNDING_TOLERANCE = 1e-3
+"""How far a rotation's numbers may be from the nearest rotation's before it is made rigid. An electromagnetic
+tracker that rounds its own output was measured at 2.3e-4; six written digits alone give 1e-6."""
 
 _FASTEST_MM_S, _SLACK_MM = 300.0, 3.0
 """Of a point of the probe between two readings. The fastest path at hand, a motor's, has 255 mm/s, freehand
@@ -100,17 +100,14 @@ def timed_poses(
 
 def rigid(matrices: FloatArray) -> tuple[FloatArray, list[str]]:
     """Make rounded rotations exact; a matrix farther off becomes the identity, with the reason."""
-    r, is_near = matrices[:, :3, :3], (np.abs(matrices) < _FARTHEST_MM).all(axis=(1, 2))
-    with np.errstate(over="ignore", invalid="ignore"):
-        gram = np.abs(r.transpose(0, 2, 1) @ r - np.eye(3)).max(axis=(1, 2))
-        bottom = np.abs(matrices[:, 3] - [0.0, 0.0, 0.0, 1.0]).max(axis=1)
-        is_proper = np.linalg.det(r) > 0
-    near = is_near & is_proper & (np.maximum(gram, bottom) < ROUNDING_TOLERANCE)
-    exact = np.tile(np.eye(4), (len(r), 1, 1))
-    exact[near, :3, 3] = matrices[near, :3, 3]
-    exact[near, :3, :3] = nearest_rotation(r[near])
+    is_near = (np.abs(matrices) < _FARTHEST_MM).all(axis=(1, 2))
+    exact = np.tile(np.eye(4), (len(matrices), 1, 1))
+    exact[is_near, :3, 3] = matrices[is_near, :3, 3]
+    exact[is_near, :3, :3] = nearest_rotation(matrices[is_near, :3, :3])
+    is_rigid = (np.abs(exact - matrices) < ROUNDING_TOLERANCE).all(axis=(1, 2))
+    exact[~is_rigid] = np.eye(4)
     reasons = np.where(is_near, "whose pose is not rigid", "whose pose is not within 100 m")
-    return exact, np.where(near, "", reasons).tolist()
+    return exact, np.where(is_rigid, "", reasons).tolist()
 
 
 def _loss(noun: str, total: int, reasons: Mapping[str, int], time_s: FloatArray) -> list[str]:
@@ -169,18 +166,15 @@ def _without_jumps(readings: TimedPoses) -> tuple[TimedPoses, list[str]]:
         return np.asarray(np.maximum(shift_mm, _LEVER_MM * motion.rotation.magnitude()))
 
     def is_jump(i: IntArray, k: IntArray) -> BoolArray:
-        return step_mm(i, k) > _SLACK_MM + _FASTEST_MM_S * np.abs(time_s[i] - time_s[k])
+        return step_mm(i, k) > _SLACK_MM + _FASTEST_MM_S * (time_s[k] - time_s[i])
 
     jumps = numbers[1:][is_jump(numbers[:-1], numbers[1:])]
     if not jumps.size:
         return readings, []
-    # Places of a lost tool count for nothing: the identity, one again and again.
-    is_lost = (poses.as_matrix() == np.eye(4)).all(axis=(1, 2))
-    places = np.unique(poses.as_matrix(), axis=0, return_inverse=True)[1].ravel()
-    pieces = np.split(numbers, jumps)
-    constants = Counter(places[piece[0]] for piece in pieces if np.ptp(places[piece]) == 0)
-    is_lost |= [constants[place] > 1 for place in places]
-    pieces = [piece for piece in pieces if not is_lost[piece].all()] or pieces
+    # Places of a lost tool, one again and again, count for nothing.
+    _, places, counts = np.unique(poses.as_matrix(), axis=0, return_inverse=True, return_counts=True)
+    pieces, places = np.split(numbers, jumps), places.ravel()
+    pieces = [piece for piece in pieces if np.ptp(places[piece]) or counts[places[piece[0]]] == 1] or pieces
     largest = int(np.argmax([piece.size for piece in pieces]))
     rows = pieces[largest]
     for piece in (*pieces[largest + 1 :], *pieces[:largest][::-1]):
@@ -203,7 +197,7 @@ def _repeats(readings: TimedPoses, sweep: Sweep, frame_time_s: FloatArray) -> li
     runs = np.split(readings.time_s, changes)
     longest, usual = max(runs, key=len), float(np.median([run.size for run in runs]))
     inside = np.flatnonzero((frame_time_s >= longest[0]) & (frame_time_s <= longest[-1]))
-    if not changes.size or longest.size <= max(_MOST_ALIKE, _MOST_TIMES * usual) or inside.size < 2:
+    if len(runs) == 1 or longest.size <= max(_MOST_ALIKE, _MOST_TIMES * usual) or inside.size < 2:
         return []
     first, last = (sweep.frames[int(i)] for i in inside[[0, -1]])
     if np.array_equal(first, last):

@@ -8,7 +8,7 @@ import h5py
 import numpy as np
 
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.core.geometry import require_finite, require_increasing
+from speckle3d.core.geometry import require_increasing
 from speckle3d.core.grid import ImageGrid
 from speckle3d.core.reconstruction import (
     MODES,
@@ -24,7 +24,6 @@ from speckle3d.core.reconstruction import (
 )
 from speckle3d.io.hdf5 import (
     PathLike,
-    Source,
     locate,
     open_family,
     read_array,
@@ -81,14 +80,14 @@ def write_reconstruction(path: PathLike, result: Reconstruction, pairs: Sequence
             put(file, "pairs", rows | {"patch_centre_mm": parts[0].patch_centre_mm})
 
 
-def read_reconstruction(path: Source, with_pairs: bool = True) -> Reconstruction:
+def read_reconstruction(path: PathLike, with_pairs: bool = True) -> Reconstruction:
     """Read a reconstruction file.
 
     Parameters
     ----------
     with_pairs : bool
         Whether to read the frame pairs, by far the larger part.
-    path : path or open file
+    path : path
         ``reconstruction.h5`` of a results folder.
 
     Returns
@@ -136,8 +135,6 @@ def _read_trust(file: h5py.File, frames: int) -> Trust | None:
         return None
     group = require_group(file, "pose_covariance")
     covariances = {mode: read_array(group, mode, (frames, 6, 6)) for mode in MODES if mode in group}
-    for mode, values in covariances.items():
-        require_finite(values, locate(group, mode))
     covariance, flags = covariances.pop("image"), read_array(file, "frame_flags", (frames,), np.int64)
     modes = {
         mode: ModeErrors(values, read_attribute(group[mode], "length_sigma"))

@@ -28,15 +28,12 @@ from speckle3d.core.sweep import BModeSettings, OrientationSensor, RFSettings, S
 from speckle3d.core.threads import ahead
 from speckle3d.io.hdf5 import PathLike, atomic_path, open_family, require_target
 from speckle3d.io.meanings import label
-from speckle3d.io.records import put, reserve, trim, written
+from speckle3d.io.records import put, put_fields, reserve, trim, written
 from speckle3d.io.sweeps import (
-    FAN_VERSION,
     FORMAT,
     GROWING,
-    IQ_VERSION,
     SAMPLE_TYPES,
     SENSORS,
-    VERSION,
     VERSIONS,
     require_sample_type,
 )
@@ -57,11 +54,9 @@ def _create_frames(
     compression: Compression,
 ) -> h5py.Dataset:
     """Data set ``/rf``, ``/iq`` or ``/bmode`` of a new file, without frames, and what describes them."""
-    name, version = "bmode", VERSION
-    sizes = {"column_pitch_mm": grid.vector_pitch_mm, "row_spacing_mm": grid.sample_spacing_mm}
+    name, sizes = "bmode", {"column_pitch_mm": grid.vector_pitch_mm, "row_spacing_mm": grid.sample_spacing_mm}
     if isinstance(signal, RFSettings):
-        name, version = ("iq", IQ_VERSION) if signal.are_complex else ("rf", VERSION)
-        sizes = {"vector_pitch_mm": grid.vector_pitch_mm}
+        name, sizes = "iq" if signal.are_complex else "rf", {"vector_pitch_mm": grid.vector_pitch_mm}
     kind = np.dtype(dtype or SAMPLE_TYPES[name][0])
     require_sample_type(name, kind, f"/{name}")
     shape = (grid.vectors, grid.samples, *((2,) if name == "iq" and kind == np.int16 else ()))
@@ -69,11 +64,11 @@ def _create_frames(
         name, (0, *shape), kind, maxshape=(None, *shape), chunks=(1, *shape), compression=compression,
         compression_opts=_GZIP_LEVEL if compression == "gzip" else None, shuffle=compression is not None,
     )  # fmt: skip
-    values = {**vars(signal), **sizes, "first_sample_depth_mm": grid.first_sample_depth_mm}
-    values["first_vector_mm"] = grid.first_vector_mm or None
-    node.attrs.update({name: value for name, value in values.items() if value is not None})
+    put_fields(node, signal)
+    first_mm = {"first_sample_depth_mm": grid.first_sample_depth_mm, "first_vector_mm": grid.first_vector_mm}
+    node.attrs.update(sizes | first_mm)
     put(file, "fan", grid.fan)
-    file.attrs["version"] = version if grid.fan is None else FAN_VERSION
+    file.attrs["version"] = 3 if grid.fan else 2 if name == "iq" else 1
     return node
 
 

@@ -13,12 +13,7 @@ import numpy.typing as npt
 
 from speckle3d.core.arrays import AnyArray, FloatArray
 from speckle3d.core.errors import InvalidInputError, naming
-from speckle3d.core.geometry import (
-    require_finite,
-    require_increasing,
-    rotations_from_quaternions,
-    transforms_from_matrices,
-)
+from speckle3d.core.geometry import rotations_from_quaternions, transforms_from_matrices
 from speckle3d.core.grid import FanLines, ImageGrid
 from speckle3d.core.streams import TimedPoses, TimedRotations
 from speckle3d.core.sweep import INERTIAL, BModeSettings, OrientationSensor, RFSettings, Sweep, Tracker
@@ -26,7 +21,6 @@ from speckle3d.core.text import printable
 from speckle3d.io.frames import FileFrames, HDF5Slices
 from speckle3d.io.hdf5 import (
     Node,
-    Source,
     file_format,
     locate,
     open_family,
@@ -44,7 +38,7 @@ from speckle3d.io.recordings import Recording
 from speckle3d.io.records import read_record
 
 FORMAT = "speckle3d.sweep"
-VERSIONS = VERSION, IQ_VERSION, FAN_VERSION = 1, 2, 3
+VERSIONS = (1, 2, 3)
 """Of files of parallel vectors without and with I/Q, and of a fan of vectors."""
 
 GROWING = "unfinished"
@@ -65,9 +59,9 @@ def from_pairs(pairs: npt.NDArray[np.int16]) -> npt.NDArray[np.complex64]:
     return pairs.astype(np.float32).view(np.complex64)[..., 0]
 
 
-def open_sweep(source: Source, _: ImportSettings | None = None) -> Recording:
+def open_sweep(source: h5py.File, _: ImportSettings) -> Recording:
     """Read a sweep file; its frames stay on disk until they are asked for."""
-    with open_family(source, FORMAT, VERSIONS) as file:
+    with open_family(source.filename, FORMAT, VERSIONS) as file:
         path, times_s, is_growing = Path(file.filename), _times(file, "frame_time_s"), _is_growing(file)
         if not times_s.size:
             raise InvalidInputError(f"{path}: expected a frame, got none so far")
@@ -102,7 +96,7 @@ def _times(group: h5py.Group, name: str = "time_s") -> FloatArray:
     times = read_array(group, name, ("row",))
     if _is_growing(group.file):
         times = times[: np.argmax(np.isnan([*times, np.nan]))]
-    return require_increasing(times, locate(group, name))
+    return times
 
 
 def _shape(file: h5py.File, count: int, *row: int | str) -> tuple[int | str, ...]:
@@ -179,8 +173,6 @@ def _read_sensor(file: h5py.File, name: str) -> Any:
         if name == "tracker":
             return Tracker(TimedPoses(times_s[valid], world_from_sensor), place, offset_s, skew_rad)
         vectors = {key: _rows(group, key, count, 3)[valid] for key in INERTIAL if key in group}
-        for key, vector in vectors.items():
-            require_finite(vector, locate(group, key))
         return OrientationSensor(
             TimedRotations(times_s[valid], world_from_sensor), place, offset_s, **vectors
         )

@@ -264,7 +264,13 @@ def read_header(path: PathLike) -> SequenceHeader:
         spacing = None if axes is None else (*np.linalg.norm(axes, axis=1)[sides].tolist(),)
         if spacing is not None and (not all(0 < step < math.inf for step in spacing) or spacing == (1, 1)):
             spacing = None  # PLUS and ITK write 1 where nobody told them
-        fields, frames = _frame_fields(words)
+        fields: dict[str, str] = {}
+        frames: dict[int, dict[str, str]] = defaultdict(dict)
+        for name, value in words.items():
+            if match := _FRAME_FIELD.fullmatch(name):
+                frames[int(match[1])][match[2]] = value
+            elif isinstance(value, str):
+                fields[name] = value
         if 0 not in frames and (*size, 1)[2] in frames:  # of a writer that counts from 1
             frames = {number - 1: frame for number, frame in frames.items()}
         if (encoding := _ENCODINGS.get(words["encoding"].lower()[:2])) is None:
@@ -350,17 +356,6 @@ def _meta_words(stream: BinaryIO) -> dict[str, Any]:
     return fields | words
 
 
-def _frame_fields(words: Mapping[str, Any]) -> tuple[dict[str, str], dict[int, dict[str, str]]]:
-    """Texts of the file, and of frames by their numbers."""
-    fields, frames = dict[str, str](), defaultdict[int, dict[str, str]](dict)
-    for name, value in words.items():
-        if match := _FRAME_FIELD.fullmatch(name):
-            frames[int(match[1])][match[2]] = value
-        elif isinstance(value, str):
-            fields[name] = value
-    return fields, dict(frames)
-
-
 def _number_type(word: str, is_big: bool) -> np.dtype[Any]:
     """Type of numbers by a word of either format, as ``MET_UCHAR`` or ``unsigned char``."""
     plain = word.lower().removeprefix("met_").removesuffix("_t").replace("unsigned ", "u")
@@ -419,7 +414,7 @@ def _data_file(path: Path, name: str) -> Path:
     """Path of a data file, which lies in the header's folder: a stranger's header names no other."""
     folder = path.parent.resolve()
     data = (folder / name).resolve()
-    if name.startswith("LIST") or re.search(r"%.* ", name) or not data.is_relative_to(folder):
+    if not data.is_relative_to(folder):
         raise InvalidInputError(f"expected pixels in one file in the header's own folder, got {name!r}")
     return data
 

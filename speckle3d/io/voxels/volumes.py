@@ -174,14 +174,14 @@ def _read_image(path: PathLike) -> tuple[AnyArray, FloatArray, dict[str, str]]:
     header, matrix = read_header(path), np.eye(4)
     axes = np.eye(3) if header.axes_mm is None else header.axes_mm
     origin = np.zeros(3) if header.origin_mm is None else header.origin_mm
-    if header.channels > 1 or len(header.size) != 3 or axes.shape != (3, 3) or origin.size != 3:
+    if axes.shape != (3, 3) or origin.size != 3:
         raise InvalidInputError(
-            f"{path}: expected a grey image of three axes in space, got axes {header.file_size}, "
-            f"{header.channels} number(s) a pixel, origin of {origin.size} numbers"
+            f"{path}: expected three axes in space, got {axes.shape}, and an origin of {origin.size} numbers"
         )
     matrix[:3, :3], matrix[:3, 3] = axes.T, origin
     # The first axis runs fastest in a file; a mapped file may be replaced while voxels are used.
-    return np.array(header.numbers()).reshape(header.size[::-1]).T, matrix, header.fields
+    shape = (*header.size[::-1], *[header.channels] * (header.channels > 1))
+    return np.array(header.numbers()).reshape(shape).T, matrix, header.fields
 
 
 def _read_nifti(path: Path) -> tuple[AnyArray, FloatArray, dict[str, str], bool]:
