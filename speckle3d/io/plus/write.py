@@ -9,7 +9,7 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -38,6 +38,17 @@ Offset = 0 0 0
 TransformMatrix = 1 0 0 0 1 0 0 0 1
 CenterOfRotation = 0 0 0
 AnatomicalOrientation = RAI"""
+_NRRD_AXES = """space dimension: 2
+space directions: ({0},0) (0,{1}) none
+kinds: domain domain list
+space origin: (0,0)"""
+_SLICER_AXES = """space: right-anterior-superior
+space directions: ({0},0,0) (0,{1},0) (0,0,1) none
+kinds: domain domain domain list
+labels: "" "" "" "time"
+units: "" "" "" "s"
+space origin: (0,0,0)"""
+"""Of images that are one pixel thick in space; transforms count pixels from its origin."""
 _NRRD_NAMES = {name: nrrd for nrrd, name in NRRD_NAMES.items()}
 
 _PREFIX = "Speckle3D_"
@@ -101,25 +112,21 @@ def write_sequence(
         raise InvalidInputError(
             f"{path}: expected parallel vectors, got a fan's, which a sequence does not hold: write .h5"
         )
-    fields = _standard_fields(sweep) | _time_fields(sweep.frame_time_s)
+    fields = _standard_fields(sweep) | _column("Timestamp", map(number_text, sweep.frame_time_s))
     omissions = [*_add_sensors(fields, sweep)]
     for transform, matrices in (transforms or {}).items():
-        _add(fields, transform, matrices)
-        fields["ElementSpacing"] = "1 1 1"
-    dtype, is_nrrd = sweep.frames.dtype, suffix.endswith(".nrrd")
+        fields |= {"ElementSpacing": "1 1 1", **_transform(transform, matrices)}
+    dtype = sweep.frames.dtype
     if dtype.kind == "c":
         dtype = np.dtype(np.int16 if stored_dtype(sweep.frames) == np.int16 else np.float32)
     shape, axes = (*_pixels(sweep.frames[0]).shape[::-1], len(sweep)), _META_AXES
-    if is_nrrd:
+    if suffix.endswith(".nrrd"):
         fields = {_NRRD_NAMES.get(name, name): value for name, value in fields.items()}
-        x, y, _ = fields.pop("ElementSpacing").split()
-        axes = f"""space dimension: 2
-space directions: ({x},0) (0,{y}) none
-kinds: domain domain list
-space origin: (0,0)"""
+        spacing, axes = fields.pop("ElementSpacing").split(), _NRRD_AXES
         if suffix == _OF_SLICER:
-            shape, axes = (*shape[:2], 1, shape[2]), _slicer_axes(x, y)
+            shape, axes = (*shape[:2], 1, shape[2]), _SLICER_AXES
             fields |= _slicer_fields(sweep.frame_time_s)
+        axes = axes.format(*spacing)
 
     def planes() -> Iterator[AnyArray]:
         for i in range(len(sweep)):
@@ -155,30 +162,31 @@ def write_transforms(path: PathLike, times_s: FloatArray, transforms: Mapping[st
     FileError
         If the file cannot be written.
     """
-    fields = {"ElementSpacing": "1 1 1", **_time_fields(times_s)}
+    fields = {"ElementSpacing": "1 1 1", **_column("Timestamp", map(number_text, times_s))}
     for name, matrices in transforms.items():
-        _add(fields, name, matrices)
+        fields |= _transform(name, matrices)
     with atomic_path(path) as part:
         write_image(part, (), (0, 0, times_s.size), np.dtype(np.uint8), _META_AXES, fields)
 
 
-def _time_fields(times_s: FloatArray) -> dict[str, str]:
-    """Fields of frames with their times."""
-    return {f"Seq_Frame{i:04d}_Timestamp": number_text(time) for i, time in enumerate(times_s)}
+def _column(name: str, texts: Iterable[str]) -> dict[str, str]:
+    """A field of each frame."""
+    return {f"Seq_Frame{i:04d}_{name}": text for i, text in enumerate(texts)}
 
 
-def _add(fields: dict[str, str], name: str, matrices: FloatArray, valid: BoolArray | None = None) -> None:
-    """Give each frame a transform, shape (n, 4, 4), by a name as ``ProbeToTracker``."""
-    for i, matrix in enumerate(matrices):
-        fields[f"Seq_Frame{i:04d}_{name}Transform"] = number_text(matrix)
-        is_valid = valid is None or valid[i]
-        fields[f"Seq_Frame{i:04d}_{name}TransformStatus"] = "OK" if is_valid else "INVALID"
+def _transform(name: str, matrices: FloatArray, valid: BoolArray | None = None) -> dict[str, str]:
+    """Fields of each frame's transform, shape (n, 4, 4), by a name as ``ProbeToTracker``."""
+    statuses = ["OK"] * len(matrices) if valid is None else np.where(valid, "OK", "INVALID")
+    return {
+        **_column(f"{name}Transform", map(number_text, matrices)),
+        **_column(f"{name}TransformStatus", statuses),
+    }
 
 
 def _add_sensors(fields: dict[str, str], sweep: Sweep) -> Iterator[str]:
     """Give each frame the sensors' poses, and tell what a sequence does not hold of the sweep."""
     times, grid, count = sweep.frame_time_s, sweep.grid, len(sweep)
-    fields |= {f"Seq_Frame{i:04d}_ImageStatus": "OK" for i in range(count)}
+    fields |= _column("ImageStatus", ["OK"] * count)
     for name, tool, world in (("tracker", "Probe", "Tracker"), ("orientation", ORIENTATION, "World")):
         if (sensor := getattr(sweep, name)) is None:
             continue
@@ -186,7 +194,7 @@ def _add_sensors(fields: dict[str, str], sweep: Sweep) -> Iterator[str]:
         reach, matrices = sensor.readings.covers(at), np.tile(np.eye(4), (count, 1, 1))
         if reach.any():
             matrices[reach] = _rigid(sensor.readings.at(at[reach])).as_matrix()
-        _add(fields, f"{tool}To{world}", matrices, reach)
+        fields |= _transform(f"{tool}To{world}", matrices, reach)
         if name == "orientation" or not np.array_equal(sensor.readings.time_s, at[reach]):
             yield (
                 f"the {sensor.label}'s {len(sensor.readings)} readings with all that it measured: "
@@ -197,7 +205,7 @@ def _add_sensors(fields: dict[str, str], sweep: Sweep) -> Iterator[str]:
             sizes = grid.vector_pitch_mm, grid.sample_spacing_mm, grid.first_sample_depth_mm
             skew_rad = getattr(sensor, "image_skew_rad", 0.0)
             pixels = image_matrix(_rigid(mounting) * first, *sizes, skew_rad)
-            _add(fields, f"{IMAGE}To{tool}", np.tile(pixels, (count, 1, 1)))
+            fields |= _transform(f"{IMAGE}To{tool}", np.tile(pixels, (count, 1, 1)))
     if sweep.truth is not None:
         yield "the true poses"
 
@@ -231,16 +239,6 @@ def _standard_fields(sweep: Sweep) -> dict[str, str]:
         "ElementSpacing": number_text((*spacing, 1.0)),
         **{_PREFIX + name: text for name, text in texts.items()},
     }
-
-
-def _slicer_axes(x: str, y: str) -> str:
-    """Axes of images that are one pixel thick in space; transforms count pixels from its origin."""
-    return f"""space: right-anterior-superior
-space directions: ({x},0,0) (0,{y},0) (0,0,1) none
-kinds: domain domain domain list
-labels: "" "" "" "time"
-units: "" "" "" "s"
-space origin: (0,0,0)"""
 
 
 def _slicer_fields(times_s: FloatArray) -> dict[str, str]:
