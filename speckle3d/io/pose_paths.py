@@ -89,25 +89,22 @@ def usable(noun: str, time_s: FloatArray, faults: Sequence[str] | None = None) -
 def timed_poses(
     time_s: FloatArray, matrices: FloatArray, faults: Sequence[str] | None = None
 ) -> tuple[TimedPoses | None, list[str]]:
-    """Usable poses among matrices, shape (n, 4, 4), in mm, or None, and a line of the others."""
-    exact, deviations = rigid(matrices)
-    reasons = [fault or deviation for fault, deviation in zip(faults or deviations, deviations, strict=True)]
-    rows, notes = usable("poses", time_s, reasons)
-    if not rows.size:
-        return None, notes
-    return TimedPoses(time_s[rows], RigidTransform.from_matrix(exact[rows])), notes
+    """Usable poses among matrices, shape (n, 4, 4), in mm, or None, and a line of the others.
 
-
-def rigid(matrices: FloatArray) -> tuple[FloatArray, list[str]]:
-    """Make rounded rotations exact; a matrix farther off becomes the identity, with the reason."""
+    Rotations that are rounded are made exact.
+    """
     is_near = (np.abs(matrices) < _FARTHEST_MM).all(axis=(1, 2))
     exact = np.tile(np.eye(4), (len(matrices), 1, 1))
     exact[is_near, :3, 3] = matrices[is_near, :3, 3]
     exact[is_near, :3, :3] = nearest_rotation(matrices[is_near, :3, :3])
     is_rigid = (np.abs(exact - matrices) < ROUNDING_TOLERANCE).all(axis=(1, 2))
-    exact[~is_rigid] = np.eye(4)
-    reasons = np.where(is_near, "whose pose is not rigid", "whose pose is not within 100 m")
-    return exact, np.where(is_rigid, "", reasons).tolist()
+    deviations = np.where(is_near, "whose pose is not rigid", "whose pose is not within 100 m")
+    reasons = np.array(faults or [""] * len(matrices), dtype=object)
+    reasons = np.where((reasons == "") & ~is_rigid, deviations, reasons)
+    rows, notes = usable("poses", time_s, reasons.tolist())
+    if not rows.size:
+        return None, notes
+    return TimedPoses(time_s[rows], RigidTransform.from_matrix(exact[rows])), notes
 
 
 def _loss(noun: str, total: int, reasons: Mapping[str, int], time_s: FloatArray) -> list[str]:

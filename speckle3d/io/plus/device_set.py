@@ -196,13 +196,14 @@ def _open(path: Path, _: ImportSettings) -> Facts:
     yield "content", content, ""
     if root.tag == "TemporalCalibrationResults":  # whose sign is the other way round: a lag is negative there
         yield "time offset of the tracker", f"{-vector(root, 'TrackerLagSec', 1)[0]:+.4f}", "s"
-    if use == _CONFIG:
-        transducer = f"{device.text('TransducerName')} {device.geometry}"
-        yield "transforms", ", ".join(f"{a}To{b}" for a, b in device.transforms) or "none", ""
-        yield "pixel", "unknown" if pixel is None else " x ".join(f"{mm:.5f} mm" for mm in pixel), ""
-        yield "transducer", transducer.strip() or "not said", ""
-        if root.find(".//PhantomDefinition/Geometry/Pattern/Wire") is not None:
-            use += ", --phantom of calibrate wires"
+    if pixel is not None:
+        yield "pixel", " x ".join(f"{mm:.5f} mm" for mm in pixel), ""
+    if device.transforms:
+        yield "transforms", ", ".join(f"{a}To{b}" for a, b in device.transforms), ""
+    if name := device.text("TransducerName"):
+        yield "transducer", f"{name} {device.geometry}".strip(), ""
+    if root.find(".//PhantomDefinition/Geometry/Pattern/Wire") is not None:
+        use += ", --phantom of calibrate wires"
     yield "for", use, ""
     raise InvalidInputError(f"{path}: expected a recording, got {content} of PLUS, which is for {use}")
 
