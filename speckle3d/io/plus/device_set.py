@@ -147,9 +147,7 @@ class DeviceSet:
             # PLUS moves both halves a pixel towards the middle.
             outline[:, 0] -= (1 - _HAIR) * np.sign(outline[:, 0])
             outlines.append(apex + outline)
-        matrix = grid.image_from_sample[:2]
-        polygons = (pixels @ matrix[:, :2].T + matrix[:, 2] for pixels in outlines)
-        texts = (" ".join(f"{x:.6f},{y:.6f}" for x, y in polygon) for polygon in polygons)
+        texts = (" ".join(f"{x:.6f},{y:.6f}" for x, y in grid.mm(*outline.T)) for outline in outlines)
         return " and ".join(f"polygon {text}" for text in texts) or None
 
     def transform(self, start: str, end: str) -> FloatArray | None:

@@ -16,6 +16,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.geometry import nearest_rotation
+from speckle3d.core.grid import ImageGrid
 from speckle3d.io.images.headers import SequenceHeader
 from speckle3d.io.text import numbers
 
@@ -118,7 +119,7 @@ def tracked_poses(
         widths = np.linalg.norm(matrices[:, :3, 0], axis=1)[is_valid]
         usual = matrices[is_valid][np.argsort(widths)[widths.size // 2]]
         _, skew_rad = sensor_from_image(usual, 0.0, where)  # refuses what is no calibration
-        pixels = image_matrix(RigidTransform.identity(), *pixel_axes(usual, where), 0.0, skew_rad)
+        pixels = pixel_matrix(ImageGrid(1, 1, *pixel_axes(usual, where), skew_rad=skew_rad))
         for pose in (matrices, pixels):  # a third column may be anything
             pose[..., :3, 2] = np.cross(pose[..., :3, 0], pose[..., :3, 1])
         # Where a frame's pixels are others, its pose is not rigid.
@@ -202,22 +203,13 @@ def sensor_from_image(
     return RigidTransform.from_components(place, Rotation.from_matrix(rotation)), float(np.arcsin(cosine))
 
 
-def image_matrix(
-    sensor_from_image: RigidTransform,
-    column_mm: float,
-    row_mm: float,
-    first_sample_depth_mm: float,
-    skew_rad: float = 0.0,
-) -> FloatArray:
-    """Transform of pixels to mm that `sensor_from_image` reads back, shape (4, 4).
+def pixel_matrix(grid: ImageGrid) -> FloatArray:
+    """Transform of an image's pixels to mm in it, shape (4, 4).
 
     The third axis, of which a plane has no pixels, has the mean length, as in PLUS's own calibrations.
     """
-    pixels = np.diag([column_mm, row_mm, (column_mm + row_mm) / 2, 1.0])
-    half = skew_rad / 2
-    pixels[:2, :2] = np.array([[np.cos(half), np.sin(half)], [np.sin(half), np.cos(half)]]) @ pixels[:2, :2]
-    pixels[1, 3] = first_sample_depth_mm
-    return np.asarray(sensor_from_image.as_matrix() @ pixels)
+    slice_mm = (grid.vector_pitch_mm + grid.sample_spacing_mm) / 2
+    return np.insert(grid.image_from_sample, 2, [0.0, 0.0, slice_mm, 0.0], axis=1)
 
 
 def ends(name: str) -> tuple[str, str]:

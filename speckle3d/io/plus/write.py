@@ -10,6 +10,7 @@ References
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -24,7 +25,7 @@ from speckle3d.io.hdf5 import atomic_path, require_suffix
 from speckle3d.io.images.headers import NRRD_NAMES
 from speckle3d.io.images.image_writer import write_image
 from speckle3d.io.import_settings import ImportSettings
-from speckle3d.io.plus.transforms import IMAGE, ORIENTATION, image_matrix
+from speckle3d.io.plus.transforms import IMAGE, ORIENTATION, pixel_matrix
 from speckle3d.io.text import number_text, numbers
 
 SUFFIXES = (".mha", ".nrrd")
@@ -185,7 +186,7 @@ def _transform(name: str, matrices: FloatArray, valid: BoolArray | None = None) 
 
 def _add_sensors(fields: dict[str, str], sweep: Sweep) -> Iterator[str]:
     """Give each frame the sensors' poses, and tell what a sequence does not hold of the sweep."""
-    times, grid, count = sweep.frame_time_s, sweep.grid, len(sweep)
+    times, count = sweep.frame_time_s, len(sweep)
     fields |= _column("ImageStatus", ["OK"] * count)
     for name, tool, world in (("tracker", "Probe", "Tracker"), ("orientation", ORIENTATION, "World")):
         if (sensor := getattr(sweep, name)) is None:
@@ -201,10 +202,8 @@ def _add_sensors(fields: dict[str, str], sweep: Sweep) -> Iterator[str]:
                 f"{np.count_nonzero(reach)} interpolated ones are at the times of {count} frames"
             )
         if (mounting := sensor.sensor_from_image) is not None:
-            first = RigidTransform.from_translation([grid.first_vector_mm, 0.0, 0.0])
-            sizes = grid.vector_pitch_mm, grid.sample_spacing_mm, grid.first_sample_depth_mm
-            skew_rad = getattr(sensor, "image_skew_rad", 0.0)
-            pixels = image_matrix(_rigid(mounting) * first, *sizes, skew_rad)
+            grid = replace(sweep.grid, skew_rad=getattr(sensor, "image_skew_rad", 0.0))
+            pixels = _rigid(mounting).as_matrix() @ pixel_matrix(grid)
             fields |= _transform(f"{IMAGE}To{tool}", np.tile(pixels, (count, 1, 1)))
     if sweep.truth is not None:
         yield "the true poses"

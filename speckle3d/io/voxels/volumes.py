@@ -174,9 +174,10 @@ def _read_image(path: PathLike) -> tuple[AnyArray, FloatArray, dict[str, str]]:
     header, matrix = read_header(path), np.eye(4)
     axes = np.eye(3) if header.axes_mm is None else header.axes_mm
     origin = np.zeros(3) if header.origin_mm is None else header.origin_mm
-    if axes.shape != (3, 3) or origin.size != 3:
+    if len(header.size) != 3 or axes.shape != (3, 3) or origin.size != 3:
+        lengths = " x ".join(map(str, header.size))
         raise InvalidInputError(
-            f"{path}: expected three axes in space, got {axes.shape}, and an origin of {origin.size} numbers"
+            f"{path}: expected three axes in space, got {lengths}, an origin of {origin.size} numbers"
         )
     matrix[:3, :3], matrix[:3, 3] = axes.T, origin
     # The first axis runs fastest in a file; a mapped file may be replaced while voxels are used.
