@@ -169,8 +169,11 @@ def attach_orientation(path: PathLike, sensor: OrientationSensor) -> None:
     InvalidInputError
         If it is no sweep file.
     """
-    with open_family(path, FORMAT, VERSIONS):
-        pass
+    with open_family(path, FORMAT, VERSIONS) as file:
+        if file.swmr_mode:
+            raise InvalidInputError(
+                "expected a recording that was closed: speckle3d convert makes a whole file"
+            )
     with atomic_path(path) as part:
         shutil.copyfile(path, part)
         with h5py.File(part, "r+", locking=False) as file:
