@@ -22,7 +22,7 @@ import numpy.typing as npt
 from speckle3d.core.arrays import IntArray
 from speckle3d.core.errors import InvalidInputError
 
-_LUMINANCE = np.array([0.299, 0.587, 0.114])
+LUMINANCE = np.array([0.299, 0.587, 0.114])
 """Of red, green and blue: ITU-R BT.601."""
 
 _KINDS = ("uint8", "int16", "float32", "complex64")
@@ -47,6 +47,9 @@ NARROWING_SIGMA = (1.0, 0.5, 0.25, 0.17, 0.17, 0.05)
 is than a single look's, and the relative standard deviation. Simulated phantoms and tissue of two physics
 have 1.39 to 1.56 and are 0.99 to 1.08 times narrower; two looks 1.14 to 1.36 and 1.3 to 1.7; smoothed by
 3 x 3 samples 0.6 to 1.1 and 1.5 to 2, with noise up to 2.9."""
+
+
+IN_COLOUR = "pictures are in colour: taken as grey by luminance; what is drawn over the image stays"
 
 
 class ImageFrames:
@@ -88,7 +91,7 @@ class ImageFrames:
                 f"frame {index}: expected {self.shape[2]} rows of {self.shape[1]} columns, got {image.shape}"
             )
         if image.ndim == 3:
-            image = np.rint(image[..., :3] @ _LUMINANCE).astype(np.uint8)
+            image = np.rint(image[..., :3] @ LUMINANCE).astype(np.uint8)
         return np.ascontiguousarray(image.T, self.dtype)
 
 

@@ -69,21 +69,6 @@ class Member:
             return self.read().decode("utf-8-sig")
 
 
-@dataclass(frozen=True)
-class Files:
-    """Files of one recording: raw samples and descriptions by their kind.
-
-    Attributes
-    ----------
-    name : str
-        What the names of all its files begin with; a time stamp.
-    """
-
-    name: str
-    raw: dict[str, Member]
-    yml: dict[str, Member]
-
-
 def is_package(path: Path, _: bytes) -> bool:
     """Whether a file or folder looks like a package, or one file of one."""
     with suppress(FileError, OSError):
@@ -91,8 +76,8 @@ def is_package(path: Path, _: bytes) -> bool:
     return path.suffix.lower() == ".tar"  # one that is cut says so when it is read
 
 
-def find_files(path: Path) -> Files:
-    """Find the files of a recording.
+def find_files(path: Path) -> tuple[str, dict[str, Member], dict[str, Member]]:
+    """Find the files of a recording: what their names begin with, raw samples and descriptions by kind.
 
     Parameters
     ----------
@@ -115,7 +100,7 @@ def find_files(path: Path) -> Files:
         )
     raw = {member.kind: member for member in members if member.content == "raw"}
     yml = {member.kind: member for member in members if member.content.startswith("y")}
-    return Files(Path(recordings[0]).name, raw, yml)
+    return Path(recordings[0]).name, raw, yml
 
 
 def _members(path: Path) -> list[Member]:

@@ -62,27 +62,27 @@ _YML = "its yml"
 
 def open_package(path: Path, settings: ImportSettings) -> Facts:
     """Read a package: RF is preferred, else I/Q, else the envelope. Times are of the scanner's clock."""
-    files = find_files(path)
-    yield "recording", files.name or "without a name", ""
+    name, raw, sidecars = find_files(path)
+    yield "recording", name or "without a name", ""
     sensor, remarks = None, list[str]()
-    if "imu" in files.yml:
+    if "imu" in sidecars:
         try:
-            sensor = read_samples(files.yml["imu"])
+            sensor = read_samples(sidecars["imu"])
             yield from sensor.rows
             remarks += sensor.remarks
         except (InvalidInputError, FileError) as error:
             remarks.append(f"the sensor is left out: {error}")
-    ymls = {kind: Description.of(file) for kind, file in files.yml.items() if kind != "imu"}
+    ymls = {kind: Description.of(file) for kind, file in sidecars.items() if kind != "imu"}
     for kind, yml in ymls.items():
         facts = ((name, yml.fields[name]) for name in _FACTS if yml.fields.get(name))
         yield from ((f"{kind}: {name}", str(text)[:60], "") for name, text in facts)
-    if (kinds := files.raw.keys() - ymls.keys()) or not files.raw:
-        start, suffix = f"{files.name}_" if files.name else "", "yml" if kinds else "raw"
+    if (kinds := raw.keys() - ymls.keys()) or not raw:
+        start, suffix = f"{name}_" if name else "", "yml" if kinds else "raw"
         lacks = " or ".join(f"{start}{kind}.{suffix}" for kind in sorted(kinds or ymls)) or "samples (.raw)"
         raise InvalidInputError(f"{path}: expected {lacks} beside the rest, got none")
-    kind = min(files.raw, key=lambda kind: [*SAMPLES].index(ymls[kind].kind))
+    kind = min(raw, key=lambda kind: [*SAMPLES].index(ymls[kind].kind))
     yield "sweep is made from", kind, ""
-    yml, member, signal = ymls[kind], files.raw[kind], ymls[kind].kind
+    yml, member, signal = ymls[kind], raw[kind], ymls[kind].kind
     records = open_raw(member, signal)
     shape = records["samples"].shape[:3]
     elements = _elements(yml, shape[1])
@@ -143,7 +143,7 @@ def open_package(path: Path, settings: ImportSettings) -> Facts:
         orientation=None if sensor is None else sensor.orientation,
         # In one spelling, so that curves and calibrations of a probe are found to be of it.
         probe=f"Clarius {model}" if model in ELEMENT_PITCH_MM else settings.probe or yml.model,
-        name=files.name or path.stem,
+        name=name or path.stem,
         substitutes=dict.fromkeys(
             ("vector_pitch_mm", "column_pitch_mm"), "element_pitch_mm" if model else "probe"
         ),
@@ -160,15 +160,15 @@ def sensor_of(path: Path) -> SensorSamples:
     InvalidInputError
         If the package has no sensor, or its samples make no sense.
     """
-    if (member := find_files(path).yml.get("imu")) is None:
+    if (member := find_files(path)[2].get("imu")) is None:
         raise InvalidInputError(f"{path}: expected the sensor's samples (_imu.yml), got none")
     return read_samples(member)
 
 
 def package_files(path: Path) -> Sequence[Path]:
     """Other files on disk that the sweep's content depends on."""
-    files = find_files(path)
-    return sorted({member.path for member in (*files.raw.values(), *files.yml.values())} - {path})
+    _, raw, sidecars = find_files(path)
+    return sorted({member.path for member in (*raw.values(), *sidecars.values())} - {path})
 
 
 def _oscillator(

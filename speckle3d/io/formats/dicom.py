@@ -22,6 +22,7 @@ from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.extras import extra_module
 from speckle3d.core.files import open_regular
+from speckle3d.core.images import IN_COLOUR, LUMINANCE
 from speckle3d.io.frames import FileFrames, ReadFrame
 from speckle3d.io.hdf5 import reading
 from speckle3d.io.import_settings import ImportSettings
@@ -39,9 +40,6 @@ _TISSUE, _CM, _POLAR = [1.0, 1.0], [3.0, 3.0], [12.0, 3.0]
 """Region Spatial Format and Data Type of 2-D tissue; Physical Units of X and Y, cm, or degrees and cm."""
 _KIND = ("RegionSpatialFormat", "RegionDataType")
 _BOX = [f"RegionLocation{end}" for end in ("MinX0", "MinY0", "MaxX1", "MaxY1")]
-_LOSSY_SPREAD = 12
-"""Levels by which the colours of a grey pixel may differ after lossy packing; the tint of a colour map is
-more."""
 _MACHINE = ("Manufacturer", "ManufacturerModelName", "TransducerType", "TransducerData")
 _RATES = ("FrameTime", "CineRate", "RecommendedDisplayFrameRate")
 _EXPECTED = {
@@ -58,7 +56,7 @@ _TAGS = (
 """All that is loaded."""
 
 
-def _frames(path: Path, part: tuple[slice, slice], invert: bool, spread: int, syntax: str) -> ReadFrame:
+def _frames(path: Path, part: tuple[slice, slice], invert: bool, syntax: str) -> ReadFrame:
     """Decode grey frames of a region, (column, row), each from the file anew.
 
     Parameters
@@ -67,8 +65,6 @@ def _frames(path: Path, part: tuple[slice, slice], invert: bool, spread: int, sy
         Rows and columns of the region.
     invert : bool
         Whether black is the highest level.
-    spread : int
-        Levels by which the colours of a grey pixel may differ.
     syntax : str
         UID of the transfer syntax, which the file may lack.
     """
@@ -78,13 +74,7 @@ def _frames(path: Path, part: tuple[slice, slice], invert: bool, spread: int, sy
         with _reading(f"{path}: frame {i}"), open_regular(path) as stream:
             image = np.asarray(pixel_array(stream, index=i, transfer_syntax_uid=syntax))[part]
         if image.ndim == 3:
-            colours = np.argwhere(np.ptp(image.astype(np.int16), axis=2) > spread)
-            if len(colours):
-                raise InvalidInputError(
-                    f"expected grey, got {len(colours)} pixels of a colour, the first at row, column "
-                    f"{colours[0].tolist()} of the region: colour Doppler or an overlay"
-                )
-            image = np.rint(image.mean(axis=2)).astype(np.uint8)
+            image = np.rint(image @ LUMINANCE).astype(np.uint8)
         return 255 - image.T if invert else image.T
 
     return frame
@@ -109,11 +99,10 @@ def open_dicom(path: Path, settings: ImportSettings) -> Facts:
             raise InvalidInputError(f"{name}: expected {words}, got {value}")
     count = int(header.get("NumberOfFrames") or 1)
     part, values = yield from _place(header)
-    kind, is_lossy = header.PhotometricInterpretation, header.get("LossyImageCompression") == "01"
-    if is_lossy:
+    if header.get("LossyImageCompression") == "01":
         yield "pixels", "packed with loss, which smooths speckle", ""
-    spread = _LOSSY_SPREAD if is_lossy or "YBR" in kind else 0
-    source = partial(_frames, path, part, kind == "MONOCHROME1", spread, syntax)
+    kind = header.PhotometricInterpretation
+    source = partial(_frames, path, part, kind == "MONOCHROME1", syntax)
     read = source()
 
     def is_cut(i: int) -> bool:
@@ -123,11 +112,12 @@ def open_dicom(path: Path, settings: ImportSettings) -> Facts:
             return True
         return False
 
-    first = read(0)  # what cannot be decoded at all, and colour, is told at once
+    first = read(0)  # what cannot be decoded at all is told at once
     if is_cut(count - 1):
         whole = bisect(range(count), False, key=is_cut)
         raise FileError(f"{path}: ends early: {whole} of {count} frames")
     times, values["frame_rate_hz"], remarks = _clock(header, count)
+    remarks += () if "MONOCHROME" in kind else (IN_COLOUR,)
     frames = FileFrames(path, source, (count, *first.shape), np.uint8)
     return Recording(path, settings, frames, values, time_s=times, remarks=remarks)
 

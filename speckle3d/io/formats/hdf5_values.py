@@ -152,17 +152,9 @@ def grey_levels(
 def grey_frames(
     source: HDF5Slices, shape: tuple[int, int, int], decibels: bool, dynamic_range_db: float | None
 ) -> tuple[FileFrames, Value]:
-    """Frames of grey levels and their dynamic range; all frames are read once to find the strongest echo.
-
-    Raises
-    ------
-    InvalidInputError
-        If there is no echo at all.
-    """
+    """Frames of grey levels and their dynamic range; all frames are read once to find the strongest echo."""
     read, span = source(), dynamic_range_db or ENVELOPE_RANGE_DB
     top = max((float(read(i).max()) for i in range(shape[0])), default=0.0)
-    if not np.isfinite(top) or not (decibels or top > 0):
-        raise InvalidInputError(f"expected echoes, got amplitudes up to {top:g}")
     turn = partial(grey_levels, turn=source.turn, decibels=decibels, top=top, dynamic_range_db=span)
     frames = replace(source, turn=turn).frames(shape, np.uint8)
     return frames, Value(span, f"of grey levels made here below {top:g}")

@@ -17,7 +17,7 @@ import numpy as np
 
 from speckle3d.core.arrays import AnyArray
 from speckle3d.core.extras import extra_module
-from speckle3d.core.images import ImageFrames
+from speckle3d.core.images import IN_COLOUR, ImageFrames
 from speckle3d.io.frames import FileFrames, ReadFrame
 from speckle3d.io.hdf5 import reading
 from speckle3d.io.import_settings import ImportSettings
@@ -88,7 +88,6 @@ def open_pictures(path: Path, settings: ImportSettings) -> Recording:
     if images is None:
         first = source()(0)
         images = FileFrames(path, source, (count, *first.shape), first.dtype)
-    colours = "pictures are in colour: taken as grey by luminance; what is drawn over the image stays"
     return Recording(
         path,
         settings,
@@ -96,7 +95,7 @@ def open_pictures(path: Path, settings: ImportSettings) -> Recording:
         {"frame_rate_hz": Value(rate_hz, "of the video")},
         name=path.stem,
         assumptions=("parallel lines, as of a linear probe",),
-        remarks=(colours,) if len(images.shape) == 4 else (),
+        remarks=(IN_COLOUR,) if len(images.shape) == 4 else (),
     )
 
 

@@ -7,7 +7,7 @@ z runs fastest over the pixels; ``modulation_frequency`` in Hz, by which complex
 0 where they were not; and ``pulse``, with ``center_frequency`` in Hz and ``fractional_bandwidth`` as a share
 of it. Complex data are a group of ``real`` and ``imag``.
 
-``frame_rate`` is that of videos to be made of the data, 1 unless set: it is told, not used.
+``frame_rate`` is that of videos to be made of the data, 1 unless set: it is not used.
 
 References
 ----------
@@ -81,8 +81,6 @@ def open_uff(file: h5py.File, settings: ImportSettings) -> Facts:
     is_complex = isinstance(find_member(file, data), h5py.Group)
     parts = (f"{data}/real", f"{data}/imag") if is_complex else (data,)
     axis, count = _frame_axis(require_dataset(file, parts[0]), lines * samples)
-    if (video := single(group, "frame_rate")) is not None:
-        yield "frame rate of videos made of it, not used", f"{video:g}", "frames/s"
     modulation_hz = single(group, "modulation_frequency") or 0.0
     modulation = Value(modulation_hz, f"in {name}/modulation_frequency")
     values["demodulation_frequency_hz"] = modulation
@@ -139,7 +137,7 @@ def _frame_axis(node: h5py.Dataset, pixels: int) -> tuple[int | None, int]:
     shape = node.shape
     axis = (0 if shape[-1] == pixels else 3) if len(shape) == 4 else None
     count = 1 if axis is None else shape[axis]
-    if pixels not in (*shape[:1], *shape[-1:]) or node.size != count * pixels:
+    if node.size != count * pixels:
         raise InvalidInputError(
             f"{locate(node)}: expected {pixels} pixels of one channel and one wave, summed, got (MATLAB's "
             f"order) {shape[::-1]}"

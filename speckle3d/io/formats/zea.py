@@ -229,7 +229,7 @@ def _tracker(file: h5py.File, left_mm: float | None) -> tuple[Tracker | None, li
     matrices[:, :3, :3], matrices[:, :3, 3] = rotations.as_matrix(), 1e3 * places_m
     readings, notes = timed_poses(stamps + (single(node, "start_time_offset") or 0.0), matrices)
     if readings is None:
-        return None, [*notes, f"{_POSES}: no pose is of use"]
+        return None, notes
     if is_euler:
         notes.append(f"{_POSES}: euler_xyz is taken for radians about fixed axes x, y, z: zea does not say")
     mounting = None

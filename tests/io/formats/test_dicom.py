@@ -3,7 +3,7 @@ import pytest
 from format_examples import region, write_dicom
 from sweep_examples import frames_of
 
-from speckle3d.core.errors import FileError, InvalidInputError
+from speckle3d.core.errors import FileError
 from speckle3d.core.grid import ImageGrid
 from speckle3d.io.describe import describe
 from speckle3d.io.import_settings import ImportSettings, MissingSettingsError
@@ -79,8 +79,9 @@ def test_grey_in_three_colours_and_from_white_to_black(write_image):
         sweep = load_sweep(write_image(pixels, photometric=photometric), RANGE)
         np.testing.assert_array_equal(frames_of(sweep), np.abs(level - tissue(images()).astype(int)))
     colours[3, 12, 9] = 200, 100, 0
-    with pytest.raises(InvalidInputError, match="colour"):
-        load_sweep(write_image(colours, photometric="RGB"), RANGE)
+    recording = open_recording(write_image(colours, photometric="RGB"), RANGE)
+    assert "in colour" in recording.notes[0]
+    assert recording.sweep.frames[3][9 - BOX[0], 12 - BOX[1]] == round(0.299 * 200 + 0.587 * 100)
 
 
 @pytest.mark.parametrize("reference", [True, False])
