@@ -11,13 +11,13 @@ import numpy as np
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.files import PathLike
-from speckle3d.core.sweep import BModeSettings, RFSettings, Sweep, stored_dtype
+from speckle3d.core.sweep import BModeSettings, RFSettings, Sweep
 from speckle3d.core.volume import LabelMap
 from speckle3d.io import calibrations, curves, reconstructions
 from speckle3d.io.calibrations import read_calibration
 from speckle3d.io.load import kind_of, open_recording
 from speckle3d.io.reconstructions import read_reconstruction
-from speckle3d.io.recordings import Row, number_row
+from speckle3d.io.recordings import Row, number_row, rate_of
 from speckle3d.io.voxels.volumes import is_volume, read_volume
 
 
@@ -60,12 +60,11 @@ def _rows(path: PathLike) -> Iterator[Row]:
 
 
 def _sweep_rows(sweep: Sweep) -> Iterator[Row]:
-    grid, kind = sweep.grid, stored_dtype(sweep.frames)
-    narrow = "" if sweep.frames.dtype == kind else f", stored as pairs of {kind}"
+    grid = sweep.grid
     yield "frames", str(len(sweep)), ""
     yield from _rate_rows("", sweep.frame_time_s, "frames/s")
     yield "vectors x samples", f"{grid.vectors} x {grid.samples}", ""
-    yield "sample type", f"{sweep.frames.dtype}{narrow}", ""
+    yield "sample type", str(sweep.frames.dtype), ""
     yield "vector pitch", f"{grid.vector_pitch_mm:.4g}", "mm"
     yield "sample spacing", f"{grid.sample_spacing_mm:.4g}", "mm"
     yield "width", f"{grid.width_mm:.2f}", "mm"
@@ -74,8 +73,7 @@ def _sweep_rows(sweep: Sweep) -> Iterator[Row]:
         yield number_row("array_radius_mm", grid.fan.radius_mm)
         yield number_row("line_angles_deg", np.rad2deg(grid.angle_rad([0, grid.vectors - 1])))
     yield from _signal_rows(sweep.signal)
-    sensors = {"orientation sensor": sweep.orientation, "tracker": sweep.tracker}
-    for name, sensor in sensors.items():
+    for name, sensor in (("orientation sensor", sweep.orientation), ("tracker", sweep.tracker)):
         if sensor is None:
             yield name, "none", ""
             continue
@@ -101,9 +99,9 @@ def _signal_rows(signal: RFSettings | BModeSettings) -> Iterator[Row]:
 
 
 def _rate_rows(name: str, times: FloatArray, unit: str) -> Iterator[Row]:
-    span = float(np.ptp(times)) if times.size else 0.0
-    yield f"{name}duration", f"{span:.3f}", "s"
-    yield f"{name}rate", f"{(times.size - 1) / span:.2f}" if span else "", unit
+    rate = rate_of(times)
+    yield f"{name}duration", f"{(times.size - 1) / rate if rate else 0.0:.3f}", "s"
+    yield f"{name}rate", f"{rate:.2f}" if rate else "", unit
 
 
 def _reconstruction_rows(path: PathLike) -> Iterator[Row]:

@@ -66,12 +66,6 @@ class Reader:
     takes_settings: bool = True
     claims_hdf5: Callable[[h5py.File], bool] | None = None
 
-    def is_of(self, path: Path, start: bytes, file: h5py.File | None) -> bool:
-        """Whether a recording is of this format."""
-        if self.claims_hdf5 is not None:
-            return file is not None and self.claims_hdf5(file)
-        return self.claims is not None and self.claims(path, start)
-
 
 @contextmanager
 def claim(path: PathLike) -> Iterator[tuple[Reader | None, Path | h5py.File]]:
@@ -84,10 +78,16 @@ def claim(path: PathLike) -> Iterator[tuple[Reader | None, Path | h5py.File]]:
     """
     place, start = Path(path), first_bytes(path)
     with open_hdf5(path) if start.startswith(SIGNATURE) else nullcontext() as file:
+
+        def is_of(reader: Reader) -> bool:
+            if file is not None and reader.claims_hdf5 is not None:
+                return reader.claims_hdf5(file)
+            return reader.claims is not None and reader.claims(place, start)
+
         with reading(path):
-            reader = next((reader for reader in readers() if reader.is_of(place, start, file)), None)
-        is_hdf5 = file is not None and (reader is None or reader.claims_hdf5 is not None)
-        yield reader, file if is_hdf5 else place
+            reader = next(filter(is_of, readers()), None)
+        takes_file = reader is None or reader.claims_hdf5 is not None
+        yield reader, file if file is not None and takes_file else place
 
 
 def find_reader(path: PathLike) -> Reader | None:

@@ -143,9 +143,7 @@ def _place(header: Any) -> Generator[Row, None, tuple[tuple[slice, slice], dict[
     tissue = []
     for candidate in regions:
         kind, box = _numbers(candidate, *_KIND), [int(number) for number in _numbers(candidate, *_BOX)]
-        name = (
-            "2-D tissue" if kind == _TISSUE else "RegionSpatialFormat {:g}, RegionDataType {:g}".format(*kind)
-        )
+        name = f"{_KIND[0]} {kind[0]:g}, {_KIND[1]} {kind[1]:g}"
         place = "columns {0} to {2}, rows {1} to {3}".format(*box)
         yield f"region {'read' if kind == _TISSUE else 'left out'}", f"{name} ({place})", ""
         tissue += [(candidate, box)] if kind == _TISSUE else []
@@ -162,10 +160,10 @@ def _place(header: Any) -> Generator[Row, None, tuple[tuple[slice, slice], dict[
     if units == _CM:
         values["column_pitch_mm"] = Value(10.0 * abs(x_step), "PhysicalDeltaX")
     else:
-        angles_deg = sorted(_along(region, "X", x_step, np.array([0, right - left])))
+        angles_deg = sorted(_along(region, "X", x_step, 0, right - left))
         values["line_angles_deg"] = Value(tuple(angles_deg) or None, "ReferencePixelX0 and PhysicalDeltaX")
     # The first row taken is the region's last where y falls.
-    for depth_cm in _along(region, "Y", y_cm, np.array([bottom - top if y_cm < 0 else 0])):
+    for depth_cm in _along(region, "Y", y_cm, bottom - top if y_cm < 0 else 0):
         values["first_sample_depth_mm"] = Value(10.0 * depth_cm, "ReferencePixelY0 and its physical value")
     if x_step < 0:
         yield "columns", "run against the file's x (PhysicalDeltaX below 0): left as shown", ""
@@ -176,13 +174,13 @@ def _place(header: Any) -> Generator[Row, None, tuple[tuple[slice, slice], dict[
     return (depths, slice(left, right + 1)), values
 
 
-def _along(region: Any, axis: str, step: float, pixels: FloatArray) -> list[float]:
+def _along(region: Any, axis: str, step: float, *pixels: int) -> list[float]:
     """Physical values of pixels along an axis of a region; none where it has no reference pixel."""
     reference = (f"ReferencePixel{axis}0", f"ReferencePixelPhysicalValue{axis}")
     if not all(name in region for name in reference):
         return []
     pixel, value = _numbers(region, *reference)
-    return list(map(float, value + (pixels - pixel) * step))
+    return [value + (number - pixel) * step for number in pixels]
 
 
 def _clock(header: Any, count: int) -> tuple[FloatArray | None, Value, tuple[str, ...]]:

@@ -60,13 +60,9 @@ def played(
 
     def images() -> Iterator[Played]:
         for i, time_s in enumerate(sweep.frame_time_s):
-            pixels, components = _pixels(frames, i, upright)
-            place = _place(sweep, grid, upright, i)
-            yield (
-                float(time_s) - first_s,
-                packed_image(image, time_s + later_s, pixels, place, components),
-                True,
-            )
+            pixels, place = _pixels(frames, i, upright), _place(sweep, grid, upright, i)
+            message = packed_image(image, time_s + later_s, pixels, place, pixels.ndim - 1)
+            yield float(time_s) - first_s, message, True
 
     sensors = zip((sweep.tracker, sweep.orientation), sensor_devices, strict=True)
     readings = (_readings(sensor, name, first_s, later_s) for sensor, name in sensors if sensor is not None)
@@ -93,15 +89,14 @@ def _readings(
         yield at_s, packed_transform(name, time_s + later_s, matrix), False
 
 
-def _pixels(frames: Frames, i: int, upright: bool) -> tuple[AnyArray, int]:
-    """Pixels (column, row) of a frame, (column, row, 2) of I and Q, and the number of components."""
+def _pixels(frames: Frames, i: int, upright: bool) -> AnyArray:
+    """Pixels (column, row) of a frame, (column, row, 2) of I and Q."""
     frame = frames[i]
     if frame.dtype.kind == "c":
-        pairs = np.ascontiguousarray(frame, np.complex64).view(np.float32).reshape(*frame.shape, 2)
-        return (pairs if upright else pairs.transpose(1, 0, 2)), 2
-    if frame.dtype.kind == "f" and upright:
+        frame = np.ascontiguousarray(frame, np.complex64).view(np.float32).reshape(*frame.shape, 2)
+    elif frame.dtype.kind == "f" and upright:
         frame = np.clip(np.round(np.nan_to_num(frame)), 0, 255).astype(np.uint8)
-    return (frame if upright else frame.T), 1
+    return frame if upright else frame.swapaxes(0, 1)
 
 
 def _place(sweep: Sweep, grid: ImageGrid, upright: bool, i: int) -> FloatArray:
