@@ -75,8 +75,8 @@ class Landmarks:
 
 
 def is_challenge_scan(file: h5py.File) -> bool:
-    """Whether an open file is a scan: it has grey frames, and no format of this package's family."""
-    node = None if "format" in file.attrs else find_member(file, "frames")
+    """Whether an open file is a scan: it has grey frames."""
+    node = find_member(file, "frames")
     return isinstance(node, h5py.Dataset) and node.dtype == np.uint8 and len(node.shape or ()) == 3
 
 

@@ -34,9 +34,8 @@ from speckle3d.io.formats.hdf5_values import (
     text_of,
     values_of,
 )
-from speckle3d.io.frames import FileFrames, HDF5Slices
+from speckle3d.io.frames import HDF5Slices
 from speckle3d.io.hdf5 import (
-    file_format,
     find_member,
     locate,
     require_dataset,
@@ -54,7 +53,7 @@ _LINEAR, _SECTOR = "uff.linear_scan", "uff.sector_scan"
 
 def is_uff(file: h5py.File) -> bool:
     """Whether an open file holds objects of USTB."""
-    return not file_format(file) and any(kind.startswith("uff.") for kind in _objects(file).values())
+    return any(kind.startswith("uff.") for kind in _objects(file).values())
 
 
 def _objects(file: h5py.File) -> dict[str, str]:
@@ -93,22 +92,17 @@ def open_uff(file: h5py.File, settings: ImportSettings) -> Facts:
     shape = count, lines, samples
     source = HDF5Slices(path, parts, partial(frame_of, shape=shape[1:]), axis)
     frames = source.frames(shape, np.complex64 if is_complex else np.float32)
-    if is_complex and count and "centre_frequency_hz" in values:
+    if not is_complex:
+        # Echoes have both signs, amplitudes and decibels one.
+        frame = frames[count // 2]
+        is_db = bool(frame.min() < 0)
+        if not is_db or frame.max() <= 0:
+            frames, values["dynamic_range_db"] = grey_frames(source, shape, is_db, settings.dynamic_range_db)
+            yield "data", f"of one sign: {'decibels' if is_db else 'an envelope'}, made grey levels here", ""
+    elif "centre_frequency_hz" in values:
         carrier_hz = modulation_hz or values["centre_frequency_hz"].value
         values["demodulation_frequency_hz"] = by_phase(frames, carrier_hz, modulation, values, settings)
-    elif count and not is_complex and (kind := _kind_of(frames)) != "RF":
-        is_db = kind == "decibels"
-        frames, values["dynamic_range_db"] = grey_frames(source, shape, is_db, settings.dynamic_range_db)
-        yield "data", f"of one sign: {kind}, made grey levels here", ""
     return Recording(path, settings, frames, values)
-
-
-def _kind_of(frames: FileFrames) -> str:
-    """Classify real samples by sign: echoes have both, amplitudes and decibels one."""
-    frame = frames[len(frames) // 2]
-    if frame.min() < 0 < frame.max():
-        return "RF"
-    return "decibels" if frame.min() < 0 else "an envelope"
 
 
 def _scan(group: h5py.Group, source: str) -> tuple[int, int, dict[str, Value]]:

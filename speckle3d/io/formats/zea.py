@@ -39,7 +39,6 @@ from speckle3d.io.formats.hdf5_values import (
 )
 from speckle3d.io.frames import HDF5Slices
 from speckle3d.io.hdf5 import (
-    file_format,
     find_member,
     has_member,
     locate,
@@ -64,9 +63,8 @@ _ROTATIONS = ("quaternion_wxyz", "quaternion_xyzw", "euler_xyz")
 
 
 def is_zea(file: h5py.File) -> bool:
-    """Whether an open file has zea's groups, and no format of this package's family."""
-    kinds = {Path(name).name for name in _members(file)}
-    return not file_format(file) and not kinds.isdisjoint((*_READ, *_CHANNEL_DATA))
+    """Whether an open file has zea's groups."""
+    return any(Path(name).name in (*_READ, *_CHANNEL_DATA) for name in _members(file))
 
 
 def _members(file: h5py.File) -> list[str]:
