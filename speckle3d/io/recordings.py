@@ -327,21 +327,6 @@ def rate_by_spacing(spacing: Value, settings: ImportSettings, values: Mapping[st
     return replace(spacing, value=1e3 * speed / (2.0 * spacing.value), source=words)
 
 
-def grid_values(x_mm: FloatArray, z_mm: FloatArray, where: str, source: str) -> dict[str, Value]:
-    """Pitch, spacing and first depth by positions of lines and depths of samples.
-
-    Raises
-    ------
-    InvalidInputError
-        If they are not evenly spaced.
-    """
-    return {
-        "vector_pitch_mm": Value(step_of(x_mm, f"{where}, x"), source),
-        "row_spacing_mm": Value(step_of(z_mm, f"{where}, z"), source),
-        "first_sample_depth_mm": Value(float(z_mm[0]), source),
-    }
-
-
 def differs(a: Any, b: Any) -> bool:
     """Whether two values are further apart than `CONTRADICTION`."""
     return not np.allclose(a, b, rtol=CONTRADICTION, atol=0)

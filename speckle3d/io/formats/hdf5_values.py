@@ -11,7 +11,7 @@ from typing import Any, TypeAlias
 import h5py
 import numpy as np
 
-from speckle3d.core.arrays import AnyArray, FloatArray
+from speckle3d.core.arrays import AnyArray, ComplexArray, FloatArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.text import printable
 from speckle3d.io.carrier import demodulation_of
@@ -26,6 +26,10 @@ Turn: TypeAlias = Callable[..., AnyArray]
 ENVELOPE_RANGE_DB = 80.0
 """Of grey levels made here unless another is given: 0.31 dB a level, while speckle itself spreads by 5.6
 dB."""
+
+
+TOLERANCE_MM = 1e-3
+"""Of a pixel's place: single precision in metres keeps 1e-5 mm of a depth of 150 mm."""
 
 
 def flat(group: h5py.Group, name: str) -> FloatArray:
@@ -85,29 +89,44 @@ def by_phase(
     return Value(shift_hz, f"{stated.source} and the phase of the data")
 
 
-def fan_values(
-    angle_rad: FloatArray, radius_mm: FloatArray, face_mm: float, where: str, source: str
-) -> dict[str, Value]:
-    """Numbers of lines that meet, by their angles and by the distances of samples from where they meet.
+def pixel_values(place: ComplexArray, where: str, source: str) -> dict[str, Value] | None:
+    """Numbers of a Cartesian or polar grid, by the places of its pixels; None if they lie on neither.
 
     Parameters
     ----------
-    face_mm : float
-        Distance from there to the array's face.
+    place : ndarray of complex, shape (line, sample)
+        Depth + i x lateral position, mm.
 
     Raises
     ------
     InvalidInputError
-        If angles or distances are not evenly spaced.
+        If lines or samples are not evenly spaced.
     """
-    step_of(angle_rad, f"{where}, angles of the lines")
-    array_mm = max(0.0, round(face_mm, 6))
-    numbers: dict[str, Any] = {
-        "array_radius_mm": array_mm,
-        "line_angles_deg": tuple(np.rad2deg(angle_rad[[0, -1]]).tolist()),
-        "row_spacing_mm": step_of(radius_mm, f"{where}, depths"),
-        "first_sample_depth_mm": float(radius_mm[0]) - array_mm,
-    }
+
+    def is_zero(off: ComplexArray) -> bool:
+        return bool(np.abs(off).max() <= TOLERANCE_MM)
+
+    numbers: dict[str, Any]
+    x_mm, z_mm = place[:, 0].imag, place[0].real
+    angle = np.angle(place[:, -1] - place[:, 0])
+    along = np.exp(1j * angle)
+    if is_zero(place - (z_mm + 1j * x_mm[:, None])):
+        numbers = {"vector_pitch_mm": step_of(x_mm, f"{where}, x"), "first_sample_depth_mm": float(z_mm[0])}
+    elif not np.ptp(angle):
+        return None
+    else:
+        # Lines meet where the distance from all of them is least.
+        normals = np.column_stack([-along.imag, along.real])
+        apex = np.linalg.lstsq(normals, (place[:, 0] * along.conj()).imag)[0] @ [1, 1j]
+        z_mm = np.abs(place[0] - apex)
+        if not is_zero(place - apex - np.outer(along, z_mm)):
+            return None
+        step_of(angle, f"{where}, angles of the lines")
+        array_mm = max(0.0, round(-float(apex.real), 6))
+        ends = tuple(np.rad2deg(angle[[0, -1]]).tolist())
+        numbers = {"array_radius_mm": array_mm, "line_angles_deg": ends}
+        numbers["first_sample_depth_mm"] = float(z_mm[0]) - array_mm
+    numbers["row_spacing_mm"] = step_of(z_mm, f"{where}, depths")
     return {name: Value(value, source) for name, value in numbers.items()}
 
 

@@ -26,10 +26,10 @@ import numpy as np
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.io.formats.hdf5_values import (
     by_phase,
-    fan_values,
     flat,
     frame_of,
     grey_frames,
+    pixel_values,
     single,
     text_of,
     values_of,
@@ -43,7 +43,7 @@ from speckle3d.io.hdf5 import (
 )
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.readers import Reader
-from speckle3d.io.recordings import Facts, Recording, Value, grid_values
+from speckle3d.io.recordings import Facts, Recording, Value
 
 FORMAT = "USTB .uff"
 
@@ -109,17 +109,18 @@ def _scan(group: h5py.Group, source: str) -> tuple[int, int, dict[str, Value]]:
     """Lines and samples of a scan, and where they lie."""
     scan, where = require_group(group, "scan"), locate(group, "scan")
     kind = text_of(scan.attrs.get("class", ""))
-    if kind == _LINEAR:
-        x_mm, z_mm = 1e3 * flat(scan, "x_axis"), 1e3 * flat(scan, "z_axis")
-        return x_mm.size, z_mm.size, grid_values(x_mm, z_mm, where, source)
-    if kind != _SECTOR:
+    if kind == _SECTOR:
+        # Depths are from where the lines meet, which is above the array's face if it is curved.
+        place = 1e3 * flat(scan, "depth_axis") * np.exp(1j * flat(scan, "azimuth_axis")[:, None])
+        place += 1e3 * flat(scan, "z")[0] - place[0, 0].real
+    else:
+        place = 1e3 * (flat(scan, "z_axis") + 1j * flat(scan, "x_axis")[:, None])
+    values = pixel_values(place, where, source) if kind in (_LINEAR, _SECTOR) else None
+    if values is None:
         raise InvalidInputError(
             f"{where}: expected a {_LINEAR} or {_SECTOR}, got {kind or 'none'}: beamform onto one of them"
         )
-    angle, radius_mm = flat(scan, "azimuth_axis"), 1e3 * flat(scan, "depth_axis")
-    # Depths are from where the lines meet, which is above the array's face if it is curved.
-    face_mm = radius_mm[0] * np.cos(angle[0]) - 1e3 * flat(scan, "z")[0]
-    return angle.size, radius_mm.size, fan_values(angle, radius_mm, float(face_mm), where, source)
+    return *place.shape, values
 
 
 def _frame_axis(node: h5py.Dataset, pixels: int) -> tuple[int | None, int]:

@@ -25,14 +25,15 @@ import h5py
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from speckle3d.core.arrays import AnyArray, FloatArray
+from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.sweep import Tracker
 from speckle3d.io.formats.hdf5_values import (
+    TOLERANCE_MM,
     by_phase,
-    fan_values,
     frame_of,
     grey_frames,
+    pixel_values,
     single,
     text_of,
     values_of,
@@ -48,15 +49,13 @@ from speckle3d.io.hdf5 import (
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.pose_paths import timed_poses
 from speckle3d.io.readers import Reader
-from speckle3d.io.recordings import Facts, Recording, Value, grid_values
+from speckle3d.io.recordings import Facts, Recording, Value
 
 FORMAT = "zea"
 
 _READ = ("beamformed_data", "envelope_data", "image_sc", "image")
 _CHANNEL_DATA = ("raw_data", "aligned_data")
 _POSES = "metadata/probe_pose"
-_TOLERANCE_MM = 1e-3
-"""Of a pixel's place: single precision in metres keeps 1e-5 mm of a depth of 150 mm."""
 _TIP_FROM_IMAGE = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 """Axes of the image (x lateral, y axial, z = x cross y) along zea's of the transducer's tip."""
 _ROTATIONS = ("quaternion_wxyz", "quaternion_xyzw", "euler_xyz")
@@ -157,28 +156,16 @@ def _pixels(node: h5py.Dataset, shape: tuple[int, ...]) -> tuple[dict[str, Value
     x_first : bool
         Whether the first axis counts lines.
     """
-    where, source = locate(node), "of the coordinates"
+    where = locate(node)
     if node.shape != (*shape, 3) or 0 in shape:
         raise InvalidInputError(f"{where}: expected shape {(*shape, 3)}, got {node.shape}")
     places_mm = 1e3 * node[0].astype(np.float64)
 
-    def is_zero(*off: AnyArray) -> bool:
-        return bool(max(np.abs(array).max() for array in off) <= _TOLERANCE_MM)
-
     for x_first in (False, True):
         x, y, z = np.moveaxis(places_mm if x_first else places_mm.swapaxes(0, 1), 2, 0)
-        if is_zero(x - x[:, :1], z - z[:1], y - y[0, 0]) and np.ptp(x) * np.ptp(z) > 0:
-            return grid_values(x[:, 0], z[0], where, source), float(x[0, 0]), x_first
-        # Lines meet where the distance from all of them is least; places are complex, z + ix.
-        place = z + 1j * x
-        angle = np.angle(place[:, -1] - place[:, 0])
-        along = np.exp(1j * angle)
-        apex = np.linalg.lstsq(np.column_stack([-along.imag, along.real]), (place[:, 0] * along.conj()).imag)[
-            0
-        ] @ [1, 1j]
-        radius = np.abs(place[0] - apex)
-        if is_zero(place - apex - np.outer(along, radius), y - y[0, 0]) and np.ptp(angle) > 0:
-            return fan_values(angle, radius, -float(apex.real), where, source), None, x_first
+        values = pixel_values(z + 1j * x, where, "of the coordinates")
+        if values is not None and np.ptp(y) <= TOLERANCE_MM:
+            return values, float(x[0, 0]) if "vector_pitch_mm" in values else None, x_first
     raise InvalidInputError(
         f"{where}: expected pixels on a Cartesian or polar grid in one plane, got others: beamform onto "
         "zea's cartesian_pixel_grid, or scan-convert them"
