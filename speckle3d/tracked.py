@@ -15,7 +15,7 @@ from speckle3d.core.grid import ImageGrid
 from speckle3d.core.poses import RelativePoses, plot_poses, pose_table
 from speckle3d.core.reconstruction import SharedErrors
 from speckle3d.core.sweep import Sweep
-from speckle3d.core.text import shown
+from speckle3d.core.text import text_rows
 from speckle3d.motion.attenuation import Attenuation
 from speckle3d.motion.coherence import Coherence
 
@@ -23,8 +23,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-@shown
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Tracked:
     """Image-based poses of a sweep with errors, curves, pairs and doubts.
 
@@ -103,21 +102,21 @@ class Tracked:
         centre_mm, time_s = self.grid.centre_mm, self.frame_time_s
         return pose_table(self.image, centre_mm, self.covariance, time_s=time_s, flags=self.flags)
 
-    def facts(self) -> list[tuple[str, object]]:
-        """Summary lines of the tracked sweep."""
+    def __repr__(self) -> str:
         z = self.image.translation[:, 2]
         flag_count = int(np.count_nonzero(self.flags))
         doubts = "; ".join(f"{doubt.about}: {doubt.suspect or doubt.evidence}" for doubt in self.doubts)
         subset = "none" if self.subset is None else f"{1 - self.rejected_share:.0%} of patches agree"
-        return [
-            ("frames", f"{len(self.image)}, {flag_count} of them flagged"),
-            ("travel", f"{np.abs(np.diff(z)).sum():.2f} mm along the image's normal, in mode image"),
-            ("length error", f"{100 * self.scale_sigma:.1f} % claimed (standard deviation)"),
-            ("direction", f"{self.direction:+d}, from {self.direction_from}"),
-            ("subset", subset),
-            ("pairs", f"{self.pairs} of frames"),
-            ("doubts", doubts or "none"),
+        rows = [
+            ("frames", f"{len(self.image)}, {flag_count} of them flagged", ""),
+            ("travel", f"{np.abs(np.diff(z)).sum():.2f} mm along the image's normal, in mode image", ""),
+            ("length error", f"{100 * self.scale_sigma:.1f} % claimed (standard deviation)", ""),
+            ("direction", f"{self.direction:+d}, from {self.direction_from}", ""),
+            ("subset", subset, ""),
+            ("pairs", f"{self.pairs} of frames", ""),
+            ("doubts", doubts or "none", ""),
         ]
+        return f"Tracked\n{text_rows(rows)}".rstrip()
 
     @property
     def scale_sigma(self) -> float:

@@ -15,8 +15,6 @@ from speckle3d.core.geometry import roll_yaw_tilt
 from speckle3d.core.sweep import Sweep
 from speckle3d.core.text import shown
 
-SENSORS = ("tracker", "orientation")
-
 _ANGLES = {"alpha": "roll (alpha)", "beta": "yaw (beta)", "gamma": "tilt (gamma)"}
 _PIXELS = {"s_x": ", columns", "s_y": ", rows"}
 
@@ -128,8 +126,8 @@ class Calibration:
     source: Source = field(default_factory=Source)
 
     def __post_init__(self) -> None:
-        if self.sensor not in SENSORS:
-            raise InvalidInputError(f"sensor: expected one of {', '.join(SENSORS)}, got {self.sensor!r}")
+        if self.sensor not in ("tracker", "orientation"):
+            raise InvalidInputError(f"sensor: expected tracker or orientation, got {self.sensor!r}")
         size = 3 if self.translation_mm is None else 6
         if self.covariance.shape != (size, size):
             raise InvalidInputError(f"covariance: expected shape {(size, size)}, got {self.covariance.shape}")

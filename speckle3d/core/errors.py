@@ -15,11 +15,14 @@ _LONGEST = 1200
 class Speckle3DError(Exception):
     """Root of every error the package raises on purpose.
 
-    Its words may quote a file: they are shown escaped, in one line, and cut if longer than a screen.
+    Its message may quote a file: it is shown escaped, in one line, and cut if longer than a screen.
     """
 
-    def __init__(self, *words: object) -> None:
-        super().__init__(*(_quotable(word) if isinstance(word, str) else word for word in words))
+    def __init__(self, message: str) -> None:
+        text = printable(message)
+        if len(text) > _LONGEST:
+            text = f"{text[: _LONGEST // 2]} ... {text[-_LONGEST // 4 :]}"
+        super().__init__(text)
 
 
 class InvalidInputError(Speckle3DError, ValueError):
@@ -40,11 +43,6 @@ class FileError(Speckle3DError, OSError):
 
 class NoSpaceError(FileError):
     """There is no room left to write a file: the disk is full, or a limit on files is reached."""
-
-
-def _quotable(words: str) -> str:
-    text = printable(words)
-    return text if len(text) <= _LONGEST else f"{text[: _LONGEST // 2]} ... {text[-_LONGEST // 4 :]}"
 
 
 @contextmanager

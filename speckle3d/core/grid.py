@@ -6,13 +6,12 @@ Positions are millimetres in the image: x lateral from the first vector, y axial
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import map_coordinates
 
-from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray
+from speckle3d.core.arrays import AnyArray, BoolArray, Float32Array, FloatArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.extras import extra_module
 
@@ -237,7 +236,7 @@ class ScanConversion:
         # Places on the fan's edge are inside it whatever rounding does.
         self._sample = np.moveaxis(fan.sample_at(self.grid.places_mm).round(6), -1, 0)
 
-    def __call__(self, image: npt.NDArray[Any]) -> Float32Array:
+    def __call__(self, image: AnyArray) -> Float32Array:
         """Picture of an image, shape (column, row), by linear interpolation; NaN outside the fan.
 
         Parameters
@@ -310,10 +309,10 @@ class Region:
         InvalidInputError
             If no sample counts.
         """
-        inside = self.mask(grid)
-        vector, sample = (np.flatnonzero(inside.any(axis=axis)) for axis in (1, 0))
-        wide, high = int(np.ptp(vector)) + 1, int(np.ptp(sample)) + 1
-        left, top = grid.mm(vector[0], sample[0]).tolist()
+        inside = np.argwhere(self.mask(grid))
+        first, last = inside.min(axis=0), inside.max(axis=0)
+        wide, high = (last - first + 1).tolist()
+        left, top = grid.mm(*first).tolist()
         return replace(grid, vectors=wide, samples=high, first_vector_mm=left, first_sample_depth_mm=top)
 
     def _inside(self, grid: ImageGrid) -> BoolArray:

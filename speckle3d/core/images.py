@@ -17,9 +17,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from speckle3d.core.arrays import IntArray
+from speckle3d.core.arrays import AnyArray, IntArray
 from speckle3d.core.errors import InvalidInputError
 
 LUMINANCE = np.array([0.299, 0.587, 0.114])
@@ -82,7 +81,7 @@ class ImageFrames:
     def __len__(self) -> int:
         return self.shape[0]
 
-    def __getitem__(self, index: int | slice) -> npt.NDArray[Any]:
+    def __getitem__(self, index: int | slice) -> AnyArray:
         if isinstance(index, slice):
             return np.stack([self[i] for i in range(*index.indices(len(self)))])
         image = np.asarray(self._images[range(len(self))[index]])

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from speckle3d.core.arrays import BoolArray, FloatArray
+from speckle3d.core.arrays import AnyArray, BoolArray, FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.extras import extra_module
 from speckle3d.core.geometry import require_increasing
@@ -38,7 +38,7 @@ class Frames(Protocol):
     def dtype(self) -> np.dtype[Any]:
         """Sample type: int16, float32, uint8 for B-mode, or complex64 for I/Q and analytic data."""
 
-    def __getitem__(self, index: int) -> npt.NDArray[Any]:
+    def __getitem__(self, index: int) -> AnyArray:
         """Read one frame, shape (vector, sample)."""
 
 
@@ -68,7 +68,7 @@ class _FramesPart:
         self.frames, self.first, self.shape = frames, first, (stop - first, *frames.shape[1:])
         self.dtype, self.stored_dtype = np.dtype(frames.dtype), stored_dtype(frames)
 
-    def __getitem__(self, index: int) -> npt.NDArray[Any]:
+    def __getitem__(self, index: int) -> AnyArray:
         number = self.first + range(self.shape[0])[index]
         if any_thread(self.frames):
             return self.frames[number]

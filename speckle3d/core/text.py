@@ -13,7 +13,6 @@ from typing import Any, TypeVar
 
 Record = TypeVar("Record", bound=type)
 
-_MOST_ROWS = 9
 _MOST_LETTERS = 72
 
 
@@ -84,24 +83,16 @@ def text_rows(rows: Sequence[tuple[str, str, str]]) -> str:
 
 
 def shown(cls: Record) -> Record:
-    """Make a dataclass show its fields in at most ten lines.
-
-    Arrays and poses are told by type and shape. A class may say what to show in a method `facts`, which
-    returns names and values.
-    """
+    """Make a dataclass show its fields, one in a line; arrays and poses are told by type and shape."""
     cls.__repr__ = _text  # type: ignore[assignment]
     return cls
 
 
 def _text(self: Any) -> str:
-    if hasattr(self, "facts"):
-        rows = self.facts()
-    else:
-        rows = [(field.name, getattr(self, field.name)) for field in fields(self) if field.repr]
-    if len(rows) > _MOST_ROWS:
-        rows[_MOST_ROWS - 1 :] = [("and", ", ".join(name for name, _ in rows[_MOST_ROWS - 1 :]))]
-    width = max(len(name) for name, _ in rows)
-    return "\n".join([type(self).__name__, *(f"  {name:<{width}}  {_brief(value)}" for name, value in rows)])
+    rows = {field.name: getattr(self, field.name) for field in fields(self) if field.repr}
+    width = max(map(len, rows))
+    lines = (f"  {name:<{width}}  {_brief(value)}" for name, value in rows.items())
+    return "\n".join([type(self).__name__, *lines])
 
 
 def _brief(value: Any) -> str:

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform
 
-from speckle3d.core.arrays import FloatArray
+from speckle3d.core.arrays import AnyArray, FloatArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.text import shown
 
@@ -41,7 +39,7 @@ class Volume:
     [1.5, 1.0, 1.0, 1.0]
     """
 
-    voxels: npt.NDArray[Any]
+    voxels: AnyArray
     spacing_mm: tuple[float, float, float]
     world_from_grid: RigidTransform
     fields: Mapping[str, str] = field(default_factory=dict)

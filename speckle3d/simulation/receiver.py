@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy import signal as filters
 
+from speckle3d.core.arrays import AnyArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import BModeSettings, Frames, RFSettings, Sweep
 from speckle3d.simulation.scan import SPECKLE_RMS_COUNTS
@@ -58,7 +58,7 @@ class ReceivedFrames:
         n, vectors, samples = self.frames.shape
         return n, vectors, -(-samples // self.decimation)
 
-    def __getitem__(self, index: int) -> npt.NDArray[Any]:
+    def __getitem__(self, index: int) -> AnyArray:
         """One frame, shape (vector, sample)."""
         echoes = filters.hilbert(self.frames[index], axis=1)
         baseband = echoes * np.exp(-2j * np.pi * self.cycles_per_sample * np.arange(echoes.shape[1]))

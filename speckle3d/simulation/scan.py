@@ -6,11 +6,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import numpy.typing as npt
 from scipy.fft import fft, irfft, next_fast_len
 from scipy.spatial.transform import RigidTransform
 
-from speckle3d.core.arrays import Complex64Array, Float32Array, FloatArray, IntArray
+from speckle3d.core.arrays import AnyArray, Complex64Array, Float32Array, FloatArray, IntArray
 from speckle3d.core.geometry import rotation_from_fixed_angles
 from speckle3d.core.grid import ImageGrid
 from speckle3d.kernels.scatter import EchoGrid, scatter_echoes
@@ -63,7 +62,7 @@ class SimulatedFrames:
         """Frames, vectors, samples."""
         return len(self.medium_from_image), self.image.vectors, self.image.samples
 
-    def __getitem__(self, index: int) -> npt.NDArray[np.int16]:
+    def __getitem__(self, index: int) -> AnyArray:
         """One frame, shape (vector, sample), 14-bit counts."""
         counts: Float32Array = self.waveforms(range(self.shape[0])[index]) * self._levels[0]
         return np.clip(np.rint(counts), -_FULL_SCALE, _FULL_SCALE).astype(np.int16)
