@@ -3,8 +3,6 @@
 Written out, since files are read by them: NumPy 2.5 hides the element within `numpy.typing.NDArray`.
 """
 
-from __future__ import annotations
-
 from typing import Any, TypeVar
 
 import numpy as np

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from itertools import chain
 from typing import Any, Literal
 
 import numpy as np
@@ -208,8 +207,8 @@ class DecorrelationCurves:
     def __post_init__(self) -> None:
         rho, shape = self.correlation, (self.depth_mm.size, self.distance_mm.size)
         even = np.linspace(0.0, self.distance_mm[-1], shape[1])
-        parts = [vars(part).values() for part in (self.speckle, self.tilt) if part is not None]
-        by_depth = [self.cells, *chain(*parts)]
+        parts = [vars(part) for part in (self.speckle, self.tilt) if part is not None]
+        by_depth = [self.cells, *(values for part in parts for values in part.values())]
         requirements = {
             "distance_mm: expected equal steps from zero": even[-1] > 0
             and np.allclose(self.distance_mm, even),
@@ -238,7 +237,7 @@ class DecorrelationCurves:
         return replace(
             self,
             depth_mm=np.asarray(depth_mm),
-            correlation=np.exp(-(np.stack([*map(interpolate, roots.T)], axis=1) ** 2)),
+            correlation=np.exp(-(np.array([*map(interpolate, roots.T)]).T ** 2)),
             cells=interpolate(self.cells),
             tilt=at_depths(self.tilt),
             speckle=at_depths(self.speckle),

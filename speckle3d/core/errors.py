@@ -1,7 +1,5 @@
 """Errors raised on purpose, and doubts about a recording; a message is one line: expected, got, and where."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Packages that only some tasks need, installed as extras."""
 
-from __future__ import annotations
-
 import importlib
 from importlib.util import find_spec
 from typing import Any

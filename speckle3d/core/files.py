@@ -3,8 +3,6 @@
 Those that killed processes leave half written have names of their own, and are removed.
 """
 
-from __future__ import annotations
-
 import errno
 import glob
 import importlib
@@ -14,11 +12,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from io import BufferedReader
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 from speckle3d.core.errors import FileError, NoSpaceError
 
-PathLike: TypeAlias = str | os.PathLike[str]
+PathLike = str | os.PathLike[str]
 
 _NO_SPACE = {errno.ENOSPC, errno.EFBIG, getattr(errno, "EDQUOT", errno.ENOSPC)}
 """A full disk, a limit on the size of a file, and one on what a user may store."""
@@ -62,16 +60,16 @@ def whole_file(target: Path) -> Iterator[Path]:
     """
     fcntl = locks()
     left = target.parent.glob(f".part-{'[0-9a-f]' * 8}-{glob.escape(target.name)}")
-    for path in left if fcntl is not None else ():
-        with suppress(OSError), path.open("rb") as file:  # gone by now, of another user, or at work
+    for path in left:
+        # Gone by now, of another user, or at work; or there are no locks to tell by.
+        with suppress(OSError, AttributeError), path.open("rb") as file:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             path.unlink()
     part = target.with_name(f".part-{secrets.token_hex(4)}-{target.name}")
     try:
         with part.open("xb") as file:
-            if fcntl is not None:
-                with suppress(OSError):  # a file system without locks
-                    fcntl.flock(file, fcntl.LOCK_EX)
+            with suppress(OSError, AttributeError):  # a system or a file system without locks
+                fcntl.flock(file, fcntl.LOCK_EX)
             yield part
             os.replace(part, target)
     except FileError:

@@ -6,8 +6,6 @@ named by both of its ends, ``world_from_image``, so that neighbouring names matc
 Lengths are millimetres, angles radians.
 """
 
-from __future__ import annotations
-
 import warnings
 
 import numpy as np
@@ -154,7 +152,7 @@ def require_increasing(times_s: npt.ArrayLike, where: str) -> FloatArray:
 def require_rows(values: npt.ArrayLike, row: tuple[int, ...], where: str) -> FloatArray:
     """Return finite values of shape (m, *row) as an array of floats; else raise `InvalidInputError`."""
     rows = np.asarray(values, dtype=float)
-    if rows.ndim != 1 + len(row) or rows.shape[1:] != row:
+    if not rows.ndim or rows.shape[1:] != row:
         raise InvalidInputError(f"{where}: expected shape {('m', *row)}, got {rows.shape}")
     require_finite(rows, where)
     return rows

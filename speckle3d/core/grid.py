@@ -299,22 +299,6 @@ class Region:
             )
         return inside
 
-    def part(self, grid: ImageGrid) -> ImageGrid:
-        """Smallest rectangle of an image of parallel vectors that holds the region.
-
-        A grid of voxels around it has no room for what does not count.
-
-        Raises
-        ------
-        InvalidInputError
-            If no sample counts.
-        """
-        inside = np.argwhere(self.mask(grid))
-        first, last = inside.min(axis=0), inside.max(axis=0)
-        wide, high = (last - first + 1).tolist()
-        left, top = grid.mm(*first).tolist()
-        return replace(grid, vectors=wide, samples=high, first_vector_mm=left, first_sample_depth_mm=top)
-
     def _inside(self, grid: ImageGrid) -> BoolArray:
         places, inside = grid.places_mm, np.ones((grid.vectors, grid.samples), dtype=bool)
         for part in self.text.split(" and "):
@@ -350,7 +334,7 @@ def polygon_mask(places: FloatArray, corners: npt.ArrayLike, name: str = "polygo
         If corners are too few.
     """
     outline = np.round(np.asarray(corners, dtype=float), 6)
-    if outline.ndim != 2 or len(outline) < 3 or outline.shape[1] != 2:
+    if outline.shape[1:] != (2,) or len(outline) < 3:
         raise InvalidInputError(f"{name}: expected shape (k, 2) with k of 3 or more, got {outline.shape}")
     measure = extra_module("skimage.measure", "calibrate", "a region")
     inside = measure.points_in_poly(np.round(places.reshape(-1, 2), 6), outline)

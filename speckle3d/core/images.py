@@ -12,8 +12,6 @@ References
    1983.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Scatter of residuals, weights that bound what outliers do, and how well a problem is posed."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from speckle3d.core.arrays import Float32Array, FloatArray

@@ -160,8 +160,9 @@ def plot_poses(
             panel.set(xlabel="frame", ylabel=name.replace("_", " / "))
             sigma = columns.get(f"sigma_{name}".replace("length", "z"))
             if sigma is not None:
+                half = 1.96 * sigma
+                low, high = columns[name] - half, columns[name] + half
                 look = {"color": line.get_color(), "alpha": 0.15, "lw": 0, "label": "its 95 % interval"}
-                ends = (columns[name] + side * 1.96 * sigma for side in (-1, 1))
-                panel.fill_between(range(sigma.size), *ends, **look)
+                panel.fill_between(range(half.size), low, high, **look)
     axes[0].legend(fontsize="small", frameon=False)
     return figure

@@ -1,7 +1,5 @@
 """Progress of long work, reported to a callable and shown as a progress bar."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 

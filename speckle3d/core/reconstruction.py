@@ -221,11 +221,12 @@ class Reconstruction:
         """Poses of a mode as a `pandas.DataFrame`, a row for each frame; see `pose_table`."""
         if mode not in self.poses:
             raise InvalidInputError(f"mode: expected one of {', '.join(self.poses)}, got {mode!r}")
-        covariance, columns = None, dict[str, FloatArray | IntArray](time_s=self.frame_time_s)
-        if self.trust is not None:
-            errors = self.trust if mode == "image" else self.trust.modes.get(mode)
-            covariance, columns["flags"] = getattr(errors, "covariance", None), self.trust.flags
-        return pose_table(self.poses[mode], self.grid.centre_mm, covariance, **columns)
+        errors = self.trust if mode == "image" or self.trust is None else self.trust.modes.get(mode)
+        covariance = None if errors is None else errors.covariance
+        flags = {} if self.trust is None else {"flags": self.trust.flags}
+        return pose_table(
+            self.poses[mode], self.grid.centre_mm, covariance, time_s=self.frame_time_s, **flags
+        )
 
     def __post_init__(self) -> None:
         n = self.frame_time_s.size

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Generic, Protocol
+from typing import TYPE_CHECKING, Any, Generic, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -157,7 +157,7 @@ class _Sensor(Generic[Samples]):
     sensor_from_image: Samples | None = None
     time_offset_s: float = 0.0
 
-    label: ClassVar[str]
+    label = "sensor"
     """What messages call the sensor."""
 
     @property
@@ -338,9 +338,8 @@ class Sweep:
                 (dynamic_range_db, 0.0) if dynamic_range_db else estimate_dynamic_range(read, across, down)
             )
             kind = range_db and BModeSettings(range_db[0], dynamic_range_sigma_db=range_db[1])
-        of_kind = "dynamic_range_db" if read.dtype == np.uint8 else "signal"
-        required = {"pitch_mm": pitch_mm, "frame_rate_hz": frame_time_s, of_kind: kind}
-        missing = ", ".join(name for name, value in required.items() if value is None)
+        stated = {"pitch_mm": pitch_mm, "frame_rate_hz": frame_time_s, "dynamic_range_db or signal": kind}
+        missing = ", ".join(name for name, value in stated.items() if value is None)
         if missing:
             raise InvalidInputError(f"arrays do not say, so give {missing}: see docs/howto/pictures.md")
         if isinstance(kind, RFSettings):
@@ -355,14 +354,13 @@ class Sweep:
         """
         xarray = extra_module("xarray", "notebook", "a labelled array")
         grid, vector = self.grid, np.arange(self.grid.vectors)
-        across = {"lateral_mm": grid.mm(vector, 0)[:, 0]}
-        if grid.fan is not None:
-            across = {"angle_rad": grid.angle_rad(vector)}
+        name = "lateral_mm" if grid.fan is None else "angle_rad"
+        across = grid.mm(vector, 0)[:, 0] if grid.fan is None else grid.angle_rad(vector)
         depth_mm = grid.first_sample_depth_mm + np.arange(grid.samples) * grid.sample_spacing_mm
         return xarray.DataArray(
             np.stack([self.frames[i] for i in range(len(self))]),
-            {"time_s": ("frame", self.frame_time_s), **across, "depth_mm": depth_mm},
-            ("frame", *across, "depth_mm"),
+            {"time_s": ("frame", self.frame_time_s), name: across, "depth_mm": depth_mm},
+            ("frame", name, "depth_mm"),
             name=self.name,
         )
 
@@ -407,11 +405,6 @@ class Sweep:
             frame_time_s=self.frame_time_s[first:stop],
             truth=None if self.truth is None else self.truth[first:stop],
         )
-
-    @property
-    def orientation_source(self) -> OrientationSensor | Tracker | None:
-        """The orientation sensor, or the tracker where there is none."""
-        return self.orientation or self.tracker
 
 
 def image_orientation(sensor: OrientationSensor | Tracker, frame_time_s: npt.ArrayLike) -> Rotation:

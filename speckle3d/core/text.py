@@ -1,7 +1,5 @@
 """Text for people: what comes from outside escaped, rows aligned, results shown in a few lines."""
 
-from __future__ import annotations
-
 import os
 import textwrap
 import unicodedata

@@ -4,8 +4,6 @@ Results do not depend on how many threads there are: each item is worked on alon
 Work that threads of the pool share out themselves is done on them, so that none waits for another.
 """
 
-from __future__ import annotations
-
 import os
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
@@ -20,7 +18,6 @@ Result = TypeVar("Result")
 
 _SLICES_PER_CORE = 4
 """So that a core that has done its own share takes from another's."""
-_LIMITS = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS")
 _ALONE: ContextVar[bool] = ContextVar("alone", default=False)
 
 
@@ -47,7 +44,10 @@ def processors() -> int:
     affinity = getattr(os, "sched_getaffinity", None)
     allowed = len(affinity(0)) if affinity else os.cpu_count() or 1
     # OpenMP's may be a list, by depth of nesting.
-    limits = (os.environ.get(name, "").partition(",")[0].strip() for name in _LIMITS)
+    limits = (
+        os.environ.get(name, "").partition(",")[0].strip()
+        for name in ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS")
+    )
     return max(1, min([allowed, *(int(value) for value in limits if value.isdecimal())]))
 
 

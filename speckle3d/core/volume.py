@@ -91,7 +91,7 @@ class Segment:
     colour: tuple[float, float, float]
 
     def __post_init__(self) -> None:
-        fair = len(self.colour) == 3 and all(0 <= part <= 1 for part in self.colour)
+        fair = len(self.colour) == 3 == sum(0 <= part <= 1 for part in self.colour)
         if not (0 < self.value < 2**16 and self.name.strip() and fair):
             raise InvalidInputError(
                 f"segment: expected a label from 1 to 65535, a name and a colour of three parts, got {self}"

@@ -73,7 +73,7 @@ def sensor_of(sweep: Sweep, mode: str) -> OrientationSensor | Tracker | None:
         return None
     if mode == "fused" and sweep.orientation is not None and sweep.orientation.sensor_from_image is None:
         return sweep.tracker or sweep.orientation
-    return sweep.tracker if mode == "pose" else sweep.orientation_source
+    return sweep.tracker if mode == "pose" else sweep.orientation or sweep.tracker
 
 
 def correct_mode(

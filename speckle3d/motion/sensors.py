@@ -130,7 +130,7 @@ def sensed_orientation(sweep: Sweep, settings: SensorSettings) -> Rotation | Non
 
     Frames without one take that of the nearest frame, which may be `SensorSettings.smooth_s` away.
     """
-    sensor, time_s, sigma_s = sweep.orientation_source, sweep.frame_time_s, settings.smooth_s
+    sensor, time_s, sigma_s = sweep.orientation or sweep.tracker, sweep.frame_time_s, settings.smooth_s
     if not settings.consistent_subset or sensor is None or sensor.sensor_from_image is None:
         return None
     read_s = time_s[sensor.covers(time_s)]

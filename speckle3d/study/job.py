@@ -275,7 +275,7 @@ def _correct_modes(
             if mode == SUBSET and tracked.subset is not None:
                 poses[mode] = tracked.subset
             elif mode == SUBSET:
-                require_credible(tracked.doubts, sweep.orientation_source, where)
+                require_credible(tracked.doubts, sweep.orientation or sweep.tracker, where)
                 left_out[mode] = (
                     f"{where}: expected readings over every frame, got gaps where some are left out"
                 )

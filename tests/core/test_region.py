@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.grid import ImageGrid, Region
+from speckle3d.study.scenes.voxels import masked_part
 
 GRID = ImageGrid(
     vectors=31, samples=57, vector_pitch_mm=0.3, sample_spacing_mm=0.1, first_sample_depth_mm=0.7
@@ -44,7 +45,7 @@ def test_a_polygon_with_the_corners_of_a_rectangle_is_that_rectangle():
 def test_the_part_of_the_images_that_a_region_needs():
     grid = ImageGrid(31, 57, 0.3, 0.1, 0.7, 0.06)
     region = Region("fan 4.5,-5 -20,25 7,9.5")
-    part = region.part(grid)
+    part = masked_part(grid, region.mask(grid))
     inside = np.argwhere(region.mask(grid))
     first, last = inside.min(axis=0), inside.max(axis=0)
     assert (part.vectors, part.samples) == tuple(last - first + 1)

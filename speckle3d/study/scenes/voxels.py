@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal
@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from speckle3d.core.arrays import FloatArray, IntArray
+from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.grid import ImageGrid, Region
 from speckle3d.core.poses import PoseErrors
@@ -172,9 +172,9 @@ def write_voxels(
     began = time.perf_counter()
     levels = None if settings.levels == "auto" else settings.levels
     source, meaning = posed.source(levels, settings.dynamic_range_db)
-    part = region.part(source.grid) if region else source.grid
-    grid = (grid_request or GridRequest()).grid(part, source.world_from_image, settings)
     mask = region.mask(source.grid) if region else None
+    part = source.grid if mask is None else masked_part(source.grid, mask)
+    grid = (grid_request or GridRequest()).grid(part, source.world_from_image, settings)
     weights = confidence(posed, grid) if settings.rule == "weighted" and settings.backward_mm == 0 else None
     fields = fields_of(posed, settings, meaning)
     volume = compound_onto(grid, source, settings, weights, mask)
@@ -236,3 +236,15 @@ def fields_of(posed: PosedSweep, settings: CompoundingSettings, meaning: str) ->
         "recording": posed.sweep.name,
         "made_by": f"speckle3d {version('speckle3d')}",
     }
+
+
+def masked_part(grid: ImageGrid, mask: BoolArray) -> ImageGrid:
+    """Smallest rectangle of an image of parallel vectors that holds a mask, shape (vector, sample).
+
+    A grid of voxels around it has no room for what does not count.
+    """
+    inside = np.argwhere(mask)
+    first, last = inside.min(axis=0), inside.max(axis=0)
+    wide, high = (last - first + 1).tolist()
+    left, top = grid.mm(*first).tolist()
+    return replace(grid, vectors=wide, samples=high, first_vector_mm=left, first_sample_depth_mm=top)
