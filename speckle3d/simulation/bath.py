@@ -126,8 +126,7 @@ class WaterBath(TiledMedium):
 
     def scatterers(self, medium_from_image: RigidTransform, box: Box) -> list[Scatterers]:
         """Dust in a box of the image, the reflector, and its reverberations."""
-        translation, rotation = medium_from_image.as_components()
-        level = Level(rotation.as_matrix()[1], -float(translation[1]))
+        level = Level(medium_from_image.rotation.as_matrix()[1], -float(medium_from_image.translation[1]))
         strength = _STRENGTH_PER_MM2 * _SPACING_MM**2
         image_from_sheet = medium_from_image.inv()
         if self.reflector == "bar":

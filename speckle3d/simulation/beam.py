@@ -1,7 +1,5 @@
 """The two-way beam of a linear array with an elevational lens, by diffraction."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
@@ -74,7 +72,7 @@ class Probe:
     def spectrum(self, frequency_hz: FloatArray) -> FloatArray:
         """Two-way pulse spectrum: a raised cosine, halved in amplitude (-6 dB) at the band's edges."""
         low, high = self.signal.bandwidth_hz
-        phase = (np.asarray(frequency_hz) - (low + high) / 2.0) / (high - low)
+        phase = (frequency_hz - (low + high) / 2.0) / (high - low)
         return np.where(np.abs(phase) < 1.0, np.cos(np.pi / 2.0 * phase) ** 2, 0.0)
 
 
@@ -159,14 +157,15 @@ def tabulate_beam(probe: Probe = Probe(), attenuation_db_cm_mhz: float = 0.0) ->
     .. [1] J. W. Goodman, "Introduction to Fourier Optics", first Rayleigh-Sommerfeld solution.
     """
     step = probe.pitch_mm / _PER_PITCH
-    lateral = step * np.arange(round(_LATERAL_REACH_MM / step) + 1, dtype=float)
+    lateral = step * np.arange(0.0, round(_LATERAL_REACH_MM / step) + 1)
     wavenumbers = 2e-3 * np.pi * _NODES_HZ / probe.signal.speed_of_sound_m_s
     field = _sum_sources(probe, lateral, wavenumbers)
     neper = attenuation_db_cm_mhz * _NEPER_PER_DB * 1e-7 * _NODES_HZ
     field *= np.exp(-2.0 * _DEPTH_MM[:, None] * neper)[:, None, None, :]
     field /= np.abs(field[np.argmin(np.abs(_DEPTH_MM - probe.transmit_focus_mm)), 0, 0]).max()
     # Curvature of the two-way wavefront near the axis, lateral and elevational.
-    middle, double = field[..., _NODES_HZ.size // 2], 2.0 * wavenumbers[_NODES_HZ.size // 2]
+    node = _NODES_HZ.size // 2
+    middle, double = field[..., node], 2.0 * wavenumbers[node]
     kx = [_parabola(row, lateral, double) for row in middle[:, :, 0]]
     kz = [_parabola(row, _ELEVATION_MM, double) for row in middle[:, 0, :]]
     depth, bend_x, bend_z = np.stack([_DEPTH_MM, kx, kz])[:, :, None, None]

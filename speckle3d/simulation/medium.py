@@ -193,7 +193,7 @@ class TiledMedium:
         spread = (cell + rng.random(cell.shape)) * [_CELL_MM, height / down, _CELL_MM]
         position = np.concatenate([loose, spread]) + tile_corner(tile, top)
         n = len(position)
-        strength, fill = np.ones(n), np.ones(n)
+        strength, fill = np.ones((2, n))
         for layer in self.layers:
             below = layer.covers(position)
             strength[below], fill[below] = layer.strength, layer.fill
@@ -218,9 +218,9 @@ def _scatterers(medium: TiledMedium, tile: Tile) -> Scatterers:
     parts = [medium._background(tile)]
     parts += [medium._fascia(tile, layer, n) for n, layer in enumerate(medium.layers) if layer.fascia]
     # Children of a neighbouring tile's parents may lie in this tile.
-    for step in product((-1, 0, 1), repeat=2):
+    i, j = tile
+    for near in product(range(i - 1, i + 2), range(j - 1, j + 2)):
         for number, clusters in enumerate(medium.clusters, 1000):
-            near = tile[0] + step[0], tile[1] + step[1]
             position, strength = _children(clusters, near, medium.entropy, number)
             inside = (np.floor(position[:, [0, 2]] / TILE_MM) == tile).all(axis=1)
             parts.append((position[inside], strength[inside]))
@@ -275,14 +275,14 @@ def tissue(entropy: int, length_mm: float) -> TiledMedium:
     strengths = (0.9, 0.35, 0.7, 0.55, 0.9, 0.7, 0.45, 0.2)
     fascias = (0.0, 1.0, 1.6, 0.8, 2.0, 1.0, 1.6, 1.2)
     layers = [
-        Layer(float(top), random_waves(rng, 0.25, (0.25, 0.0, 0.2)), *properties)
+        Layer(top, random_waves(rng, 0.25, (0.25, 0.0, 0.2)), *properties)
         for top, *properties in zip(tops, strengths, fascias, strict=True)
     ]
     layers[-1] = layers[-1]._replace(fill=0.2)
     texture = random_waves(rng, 0.25, (2.0, 2.0, 2.0), 12)
     cysts = [_sphere(rng, length_mm, (1.0, 2.5), 0.0) for _ in range(6)]
     heading, dip = rng.normal(0.0, 0.1), rng.normal(0.0, 0.02)
-    along = (float(np.sin(heading)), float(np.sin(dip)), float(np.cos(heading)))
+    along = (np.sin(heading), np.sin(dip), np.cos(heading))
     _, skin, _, first, second, third, fourth, deep = tops.tolist()
     # Fibres in three muscles, in ever larger numbers with depth, crossing septa, and round clusters.
     clusters = [

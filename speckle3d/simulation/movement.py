@@ -135,12 +135,11 @@ def hand_sweep(
     number : int
         Of crossed sweeps.
     """
-    fan, turned, crossing = np.deg2rad([settings.fan_deg, settings.turn_deg, settings.crossing_deg]).tolist()
+    fan, turned, crossing = np.deg2rad([settings.fan_deg, settings.turn_deg, settings.crossing_deg])
     time = _knot_times(duration_s)
     columns = np.zeros((time.size, 6))
     columns[:, 0] = face_mm / 2.0
-    reverse = settings.preset == "reversal"
-    columns[:, 2] += _progress(time, duration_s, reverse, rng) * settings.length_mm
+    columns[:, 2] += _progress(time, duration_s, settings.preset == "reversal", rng) * settings.length_mm
     phase = np.clip(time / duration_s, 0.0, 1.0)
     share = phase * phase * (3.0 - 2.0 * phase)
     if settings.preset == "rotation":
@@ -171,8 +170,7 @@ def calibration_scan(
     """
     over_floor = settings.preset == "plane"
     across, off = (_ROAMING_MM, _ROAMING_MM) if over_floor else (_LATERAL_SHARE * face_mm, _OFF_POINT_MM)
-    turns = np.deg2rad([settings.tilt_range_deg, *_YAW_ROLL_DEG])
-    reach = np.array([across, _LIFT_REACH_MM, off, *turns])
+    reach = [across, _LIFT_REACH_MM, off, *np.deg2rad([settings.tilt_range_deg, *_YAW_ROLL_DEG])]
     time = _knot_times(settings.duration_s)
     swings = (
         size * _swings(time / settings.duration_s, count, rng)

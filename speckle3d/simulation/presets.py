@@ -1,7 +1,5 @@
 """Named sweeps: settings in, sweeps with truth out."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -59,8 +57,8 @@ class SimulatedSweep:
 
     def description(self) -> dict[str, Any]:
         """Plain values for a file: the settings and, where it is for a calibration to find, the mounting."""
-        values = self.settings.model_dump(mode="json")
-        if self.sweep.tracker is not None and self.sweep.tracker.sensor_from_image is None:
+        values, tracker = self.settings.model_dump(mode="json"), self.sweep.tracker
+        if tracker is not None and tracker.sensor_from_image is None:
             values["tracker_sensor_from_image"] = TRACKER_FROM_IMAGE.as_matrix().tolist()
             wxyz = ORIENTATION_FROM_IMAGE.as_quat(scalar_first=True).tolist()
             values["orientation_sensor_from_image_wxyz"] = wxyz
@@ -89,13 +87,15 @@ def simulate(settings: SimulationSettings) -> tuple[SimulatedSweep, ...]:
     (8, 600)
     """
     medium_seed, heading_seed, *sweep_seeds = SeedSequence(settings.seed).spawn(4)
-    world = world_from_medium(float(default_rng(heading_seed).uniform(-np.pi, np.pi)))
+    world = world_from_medium(default_rng(heading_seed).uniform(-np.pi, np.pi))
     if settings.preset in _BATH:
         world = RigidTransform.from_translation(_BATH_MM) * world
     medium = _medium(settings, _entropy(medium_seed))
     beam = tabulate_beam(attenuation_db_cm_mhz=medium.attenuation_db_cm_mhz)
-    numbers = range(1 + (settings.preset == "crossed"))
-    return tuple(_sweep(settings, beam, medium, world, sweep_seeds[number], number) for number in numbers)
+    return tuple(
+        _sweep(settings, beam, medium, world, sweep_seeds[number], number)
+        for number in range(1 + (settings.preset == "crossed"))
+    )
 
 
 def _medium(settings: SimulationSettings, entropy: int) -> TiledMedium:
@@ -121,8 +121,7 @@ def _sweep(
     number: int,
 ) -> SimulatedSweep:
     """Sweep `number` of a preset: images and sensors along a trajectory of its own."""
-    probe, in_bath = beam.probe, settings.preset in _BATH
-    image = _image_grid(settings, probe)
+    in_bath, image = settings.preset in _BATH, _image_grid(settings, beam.probe)
     sensors: dict[str, Any] = {}
     if settings.preset == "stepped":
         gap_mm = 2.0 * beam.extent_mm[1]
@@ -151,8 +150,8 @@ def _sweep(
             sensors = {name: replace(sensor, sensor_from_image=None) for name, sensor in sensors.items()}
     rf = SimulatedFrames(beam, medium, poses, image, settings.snr_db, _entropy(seed))
     reflector = f"-{settings.reflector}" if settings.preset == "plane" else ""
-    name = f"{settings.preset}{reflector}-{settings.seed}" + ("-crossing" if number else "")
-    sweep = Sweep(rf, image, probe.signal, times, truth=world * poses, name=name, **sensors)
+    name = f"{settings.preset}{reflector}-{settings.seed}" + "-crossing" * number
+    sweep = Sweep(rf, image, beam.probe.signal, times, truth=world * poses, name=name, **sensors)
     if settings.signal != "rf":
         range_db = settings.dynamic_range_db if settings.signal == "bmode" else None
         sweep = received(sweep, range_db, decimation=settings.decimation)

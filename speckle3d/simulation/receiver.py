@@ -1,7 +1,5 @@
 """Receiver of a scanner: RF to I/Q, or to grey levels of a B-mode image."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Any
 

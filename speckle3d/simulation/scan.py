@@ -1,7 +1,5 @@
 """RF frames from a beam, a medium and poses, computed when read and the same each time."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -127,9 +125,8 @@ class SimulatedFrames:
         rms = np.sqrt(self.beam.echo_power(np.linspace(0.0, probe.signal.sampling_rate_hz / 2.0, 513)))
         depth = image.first_sample_depth_mm + np.arange(image.samples) * image.sample_spacing_mm
         focus = float(np.interp(probe.transmit_focus_mm, self.beam.depth_mm, rms))
-        quietest = focus / _MOST_GAIN
-        gain = SPECKLE_RMS_COUNTS / np.maximum(np.interp(depth, self.beam.depth_mm, rms), quietest)
-        return gain.astype(np.float32), focus
+        level = np.maximum(np.interp(depth, self.beam.depth_mm, rms), focus / _MOST_GAIN)
+        return (SPECKLE_RMS_COUNTS / level).astype(np.float32), focus
 
     def _noise(self, index: int) -> Complex64Array:
         """Spectrum of one frame's electronic noise, shape (vector, bin)."""

@@ -1,7 +1,5 @@
 """Sensors that ride on the simulated probe, each on its own clock, with its own errors."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.random import Generator
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -36,7 +34,7 @@ _MAGNETOMETER_AU = (0.0, 0.004)
 _DIP_RAD = np.deg2rad(66.0)
 """The earth's field points north and this much down; its strength is one."""
 
-_GRAVITY_M_S2 = 9.81
+_GRAVITY_M_S2 = np.array([0.0, 0.0, 9.81])
 _DERIVATIVE_S = 1e-3
 """Half-width of central differences: short against a tremor's period of 80 ms, long against rounding."""
 
@@ -70,13 +68,13 @@ def simulate_orientation(
     readings = Rotation.from_rotvec(wander) * rotation * white
     # At rest the specific force, acceleration minus gravity, points up.
     acceleration = 1e-3 * (path[0] - 2.0 * path[1] + path[2]) / _DERIVATIVE_S**2
-    force = rotation.inv().apply(acceleration + np.array([0.0, 0.0, _GRAVITY_M_S2]))
+    force = rotation.inv().apply(acceleration + _GRAVITY_M_S2)
     rate = (before.inv() * after).as_rotvec() / (2.0 * _DERIVATIVE_S)
     field = rotation.inv().apply([np.cos(_DIP_RAD), 0.0, -np.sin(_DIP_RAD)])
 
     def noisy(true: FloatArray, bias: float, white: float) -> FloatArray:
-        errors = noise * bias * rng.standard_normal(3), noise * white * rng.standard_normal(true.shape)
-        return np.asarray(true + errors[0] + errors[1])
+        biased = true + noise * bias * rng.standard_normal(3)
+        return np.asarray(biased + noise * white * rng.standard_normal(true.shape))
 
     return OrientationSensor(
         TimedRotations(clock - _OFFSET_S, readings),

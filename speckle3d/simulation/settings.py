@@ -1,13 +1,10 @@
 """Settings of a simulation, as given on the command line and kept in files; nothing heavy is imported."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator
 
 Reflector = Literal["wall", "bar"]
-Signal = Literal["rf", "iq", "bmode"]
 Preset = Literal["phantom", "tissue", "reversal", "rotation", "crossed", "stepped", "plane", "wires"]
 
 
@@ -67,7 +64,9 @@ class SimulationSettings(BaseModel):
     sensor_noise: float = Field(
         1.0, ge=0, le=10, description="plane, wires: factor on the noise of both sensors; 0: exact ones."
     )
-    signal: Signal = Field("rf", description="Echoes as they come, their I/Q, or 8-bit grey levels.")
+    signal: Literal["rf", "iq", "bmode"] = Field(
+        "rf", description="Echoes as they come, their I/Q, or 8-bit grey levels."
+    )
     decimation: int | None = Field(
         None,
         ge=1,
