@@ -17,7 +17,6 @@ References
 
 from __future__ import annotations
 
-from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -70,9 +69,6 @@ class Landmarks:
     frame: npt.NDArray[np.int64]
     points_mm: FloatArray
 
-    def __len__(self) -> int:
-        return int(self.frame.size)
-
 
 def is_challenge_scan(file: h5py.File) -> bool:
     """Whether an open file is a scan: it has grey frames."""
@@ -98,8 +94,7 @@ def open_scan(file: h5py.File, _: ImportSettings) -> Recording:
     n, height, width = node.shape
     slices = HDF5Slices(scan.absolute(), ("frames",), np.transpose)
     tracker, remarks = None, list[str]()
-    separate = _transforms_file(scan)
-    with nullcontext(file) if separate is None else open_hdf5(separate) as transforms:
+    with open_hdf5(_transforms_file(scan) or scan) as transforms:
         if has_member(transforms, "tforms"):
             matrices = read_array(transforms, "tforms", ("pose", 4, 4))
             readings, remarks = timed_poses(np.arange(len(matrices)) / FRAME_RATE_HZ, matrices)

@@ -12,7 +12,7 @@ they are the image's columns and rows, and a row lies together.
 
 from __future__ import annotations
 
-import math
+import struct
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -31,35 +31,34 @@ _NAMES = (
     "kind", "frames", "width", "height", "bits", *map(str, range(8)), "probe", "transmit_hz", "sampling_hz",
     "rate_hz", "lines", "extra",
 )  # fmt: skip
-_HEADER = np.dtype([(name, "<i4") for name in _NAMES])
+_HEADER = struct.Struct("<19i")
 _READ = {2: ("B-mode before scan conversion (.bpr)", 8), 4: ("B-mode (.b8)", 8), 16: ("RF (.rf)", 16)}
 """Name and bits of the types that are read; all are powers of two."""
-_BMODE, _LAST_TYPE = 4, 2**19
+_BMODE, _TYPES = 4, [2**k for k in range(20)]
 _SUFFIXES = (".rf", ".bpr", ".b8", ".crf", ".col")
 
 
 def _open_frames(path: Path, record: np.dtype[Any], count: int, is_image: bool) -> ReadFrame:
     """Map frames that lie one after the other, each with its number before it or not."""
-    pixels = np.memmap(path, record, "r", _HEADER.itemsize, (count,))["pixels"]
+    pixels = np.memmap(path, record, "r", _HEADER.size, (count,))["pixels"]
     return lambda i: pixels[i].T if is_image else pixels[i]
 
 
-def _header(content: bytes) -> Any:
-    return np.frombuffer(content, _HEADER, 1)[0]
+def _header(start: bytes) -> dict[str, int]:
+    return dict(zip(_NAMES, _HEADER.unpack_from(start), strict=True))
 
 
-def _has_tags(header: Any, size: int) -> bool | None:
-    """Whether each frame has its number before it, by the file's size; None if that is neither's."""
-    frames, *sides = (int(header[name]) for name in ("frames", "width", "height", "bits"))
-    sizes = {_HEADER.itemsize + frames * (math.prod(sides) // 8 + tag): bool(tag) for tag in (0, 4)}
-    return sizes.get(size) if frames > 0 < min(sides) else None
+def _tag_bytes(header: dict[str, int], size: int) -> int | None:
+    """Bytes of the number before each frame, by the file's size: 4 or none; None if it is neither's."""
+    frames, frame_bytes = header["frames"], header["width"] * header["height"] * header["bits"] // 8
+    sizes = {_HEADER.size + frames * (frame_bytes + tag): tag for tag in (0, 4)}
+    return sizes.get(size) if frames > 0 else None
 
 
 def _claims(path: Path, start: bytes) -> bool:
-    if len(start) < _HEADER.itemsize or not 0 < (kind := int(_header(start)["kind"])) <= _LAST_TYPE:
+    if len(start) < _HEADER.size or (header := _header(start))["kind"] not in _TYPES:
         return False
-    is_whole = _has_tags(_header(start), path.stat().st_size) is not None
-    return kind.bit_count() == 1 and (is_whole or path.suffix.lower() in _SUFFIXES)
+    return _tag_bytes(header, path.stat().st_size) is not None or path.suffix.lower() in _SUFFIXES
 
 
 def open_ultrasonix(path: Path, settings: ImportSettings) -> Facts:
@@ -68,28 +67,29 @@ def open_ultrasonix(path: Path, settings: ImportSettings) -> Facts:
     The header has no line pitch and no band; of B-mode no pixel size and no dynamic range.
     """
     header, size = _header(first_bytes(path)), path.stat().st_size
-    name, bits = _READ.get(int(header["kind"]), (f"type {header['kind']}", 0))
+    name, bits = _READ.get(header["kind"], (f"type {header['kind']}", 0))
     yield "recorded", name, ""
     yield "probe's number", str(header["probe"]), ""
     yield "line density", str(header["lines"]), "lines"
     values = {
-        "sampling_rate_hz": Value(float(header["sampling_hz"]) or None, "in the header"),
-        "centre_frequency_hz": Value(float(header["transmit_hz"]) or None, "in the header: transmitted"),
-        "frame_rate_hz": Value(max(int(header["rate_hz"]), 0) or None, "in the header"),
+        "sampling_rate_hz": Value(header["sampling_hz"] or None, "in the header"),
+        "centre_frequency_hz": Value(header["transmit_hz"] or None, "in the header: transmitted"),
+        "frame_rate_hz": Value(header["rate_hz"] or None, "in the header"),
     }
-    count, width, height = (int(header[name]) for name in ("frames", "width", "height"))
+    count, width, height = header["frames"], header["width"], header["height"]
     if header["bits"] != bits or not count:
         raise InvalidInputError(
             f"expected frames of RF, of 16 bits, or B-mode, of 8, got {count} of {name}, of "
             f"{header['bits']} bits"
         )
-    if (has_tags := _has_tags(header, size)) is None:
-        whole = 8 * (size - _HEADER.itemsize) // (width * height * bits)
+    if (tag := _tag_bytes(header, size)) is None:
+        whole = 8 * (size - _HEADER.size) // (width * height * bits)
         raise FileError(f"{path}: ends early, or is longer than its frames: {whole} of {count} frames")
     is_image, dtype = header["kind"] == _BMODE, np.dtype("<i2" if bits == 16 else "u1")
-    shape = (height, width) if is_image else (width, height)
-    tag = [("tag", "<i4")] if has_tags else []
-    source = partial(_open_frames, path, np.dtype([*tag, ("pixels", dtype, shape)]), count, is_image)
+    record = np.dtype(
+        [("tag", f"V{tag}"), ("pixels", dtype, (height, width) if is_image else (width, height))]
+    )
+    source = partial(_open_frames, path, record, count, is_image)
     frames = FileFrames(path, source, (count, width, height), dtype.newbyteorder("="))
     return Recording(path, settings, frames, values, assumptions=() if is_image else ("parallel lines",))
 
