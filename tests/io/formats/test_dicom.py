@@ -42,8 +42,12 @@ def test_the_region_of_tissue_with_its_scale_in_cm(write_image):
     np.testing.assert_allclose(sweep.frame_time_s, 0.04 * np.arange(4), rtol=1e-12)
     rows = describe(path)
     assert any(name == "region left out" and "rows 46 to 49" in value for name, value, _ in rows)
-    assert b"Doe^Jane" in path.read_bytes()
+    content = path.read_bytes()
+    assert b"Doe^Jane" in content
     assert "Doe" not in repr(rows) + repr(sweep)
+    # Without file meta information, as devices store what they send.
+    path.write_bytes(content[content.index(b"\x08\0\x16\0") :])
+    np.testing.assert_array_equal(frames_of(load_sweep(path, RANGE)), tissue(images()))
 
 
 def test_rows_that_run_upwards_are_turned_over(write_image):
