@@ -132,7 +132,7 @@ def pixel_values(place: ComplexArray, where: str, source: str) -> dict[str, Valu
 
 def text_of(value: Any) -> str:
     """Convert a value of HDF5, or the first of several, to text."""
-    first = np.ravel(value)[0]
+    first = next(iter(np.ravel(value)), "")
     return printable(first.decode("utf-8", "replace") if isinstance(first, bytes) else str(first)).strip("\0")
 
 

@@ -69,7 +69,8 @@ def is_zea(file: h5py.File) -> bool:
 def _members(file: h5py.File) -> list[str]:
     """Members of the ``data`` groups: at the root, or of tracks."""
     tracks = find_member(file, "tracks")
-    homes = ["data", *(f"tracks/{name}/data" for name in tracks or ())]
+    names = tracks if isinstance(tracks, h5py.Group) else ()
+    homes = ["data", *(f"tracks/{name}/data" for name in names)]
     groups = ((home, find_member(file, home)) for home in homes)
     return [f"{home}/{name}" for home, group in groups if isinstance(group, h5py.Group) for name in group]
 
