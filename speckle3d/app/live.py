@@ -13,7 +13,7 @@ import panel as pn
 from bokeh.models import ColumnDataSource
 from panel.viewable import Viewable
 
-from speckle3d.app.look import SimplePage, batch_changes
+from speckle3d.app.look import Page, batch_changes
 from speckle3d.app.plots import ImagePlot, empty_plot, greys
 from speckle3d.app.server import AppServer
 from speckle3d.core.geometry import roll_yaw_tilt
@@ -41,7 +41,7 @@ def watch(session: Session, status: Callable[[], str]) -> Iterator[tuple[str, st
     tuple of (str, str)
         Its address, and one that leads there once.
     """
-    page = SimplePage("Live", lambda: _Viewer(session, status).layout())
+    page = Page("Live", lambda: _Viewer(session, status).layout())
     loop = asyncio.new_event_loop()
     asyncio.set_event_loop(loop)
     server = AppServer([page], "live", unseen_s=float("inf"))

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import partial, wraps
 from html import escape
-from typing import Any, Protocol, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import panel as pn
 from panel.viewable import Viewable
@@ -34,18 +33,8 @@ white-space:nowrap" title="{name}">{name}</span></div>
 _BODY = "html, body { background: #fff; overflow-x: hidden; }"
 
 
-class Page(Protocol):
-    """A page, shown as one tab of the app."""
-
-    title: str
-
-    def view(self) -> Viewable:
-        """Return what is shown, made anew for every viewer."""
-
-
-@dataclass
-class SimplePage:
-    """A page of a function that makes its view."""
+class Page(NamedTuple):
+    """A page, shown as one tab of the app: its title, and what makes its view for a viewer."""
 
     title: str
     view: Callable[[], Viewable]

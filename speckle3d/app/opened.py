@@ -88,12 +88,12 @@ def open_pages(path: Path, record: Path | None = None, **of_file: Any) -> Iterat
         Also if a file is to be recorded.
     """
     if path.is_char_device() or re.fullmatch(r"COM\d+", str(path), re.IGNORECASE):
-        from speckle3d.app.sensor.page import SensorPage
+        from speckle3d.app.sensor.page import sensor_page
         from speckle3d.app.sensor.watch import SensorWatch
 
         watch = SensorWatch(str(path), record)
         with watch.recording():
-            yield [SensorPage(watch)]
+            yield [sensor_page(watch)]
         return
     if record is not None:
         raise InvalidInputError(f"{path}: expected a serial port beside --record, got something else")
@@ -127,7 +127,7 @@ def _sweep_pages(
 
     if not len(sweep):
         raise InvalidInputError(f"{path}: expected frames to look at, got none")
-    pages: list[Page] = [SweepPage(sweep, reconstruction, doubts)]
+    pages = [Page("Sweep", SweepPage(sweep, reconstruction, doubts).view)]
     if sweep.orientation is not None:
         pages.append(_sensor(log_of(sweep.orientation, path.name), sweep.orientation.sensor_from_image))
     return pages
@@ -145,13 +145,13 @@ def _result_pages(path: Path, sweep_file: Path | None, file: Path) -> list[Page]
     mode = "image"
     with suppress(MismatchError):  # modes disagree: all can be looked at
         mode = default_mode(result)[0]
-    viewer = ReconstructionPage(result, sweep, path, sweep_file, mode)
+    viewer = Page("Reconstruction", ReconstructionPage(result, sweep, mode).view)
     # First what was asked for.
     return [viewer, *pages] if file == path else [pages[0], viewer, *pages[1:]]
 
 
 def _sensor(log: ImuLog, mounting: Rotation | None = None) -> Page:
     from speckle3d.app.sensor.log import LogReadings
-    from speckle3d.app.sensor.page import SensorPage
+    from speckle3d.app.sensor.page import sensor_page
 
-    return SensorPage(LogReadings(log), mounting)
+    return sensor_page(LogReadings(log), mounting)

@@ -6,7 +6,7 @@ from field_scenes import simulate_motion
 from scipy.spatial.transform import Rotation
 
 from speckle3d.app.sensor.log import LogReadings
-from speckle3d.app.sensor.page import SensorPage
+from speckle3d.app.sensor.page import sensor_page
 from speckle3d.app.sensor.watch import SensorWatch
 from xsens.fusion.field import Trust
 from xsens.fusion.online import OnlineState
@@ -63,7 +63,7 @@ def test_live_columns_run_to_now_without_a_jump_of_the_heading():
     assert (columns["t"][0], columns["t"][-1]) == (pytest.approx(-1.9), 0.0)
     np.testing.assert_allclose(np.diff(columns["heading"]), 1.0, atol=1e-6)
     np.testing.assert_allclose(columns["half"], 1.96 * np.degrees(0.02))
-    SensorPage(source).view()
+    sensor_page(source).view()
     assert len(watch([]).columns()["t"]) == 0
 
 

@@ -1,20 +1,15 @@
 """The reconstruction viewer without a browser."""
 
-import io
-import shlex
-import sys
-from contextlib import chdir, redirect_stdout, suppress
-
 import numpy as np
 import pytest
+from commands import run_command
 from scipy.spatial.transform import RigidTransform
 
-from speckle3d import cli
 from speckle3d.app.reconstruction.page import ReconstructionPage, _Viewer
 from speckle3d.core.grid import ImageGrid
 from speckle3d.core.reconstruction import Provenance, Reconstruction, Trust
 from speckle3d.core.sweep import BModeSettings, Sweep
-from speckle3d.io.load import recording_sha256
+from speckle3d.io.load import load_sweep, recording_sha256
 from speckle3d.io.reconstructions import read_reconstruction, write_reconstruction
 from speckle3d.io.sweep_writer import write_sweep
 from speckle3d.io.voxels.volumes import read_volume
@@ -24,8 +19,8 @@ FRAMES = 24
 
 
 @pytest.fixture(scope="module")
-def page(tmp_path_factory):
-    """A sweep of smooth speckle with two modes, of which one is 5 % longer, on disk and as a page."""
+def folder(tmp_path_factory):
+    """A sweep of smooth speckle with two modes, of which one is 5 % longer."""
     folder = tmp_path_factory.mktemp("smooth")
     z = 0.4 * np.arange(FRAMES)
     x, y = np.meshgrid(np.arange(32) * 0.5, np.arange(40) * 0.5, indexing="ij")
@@ -44,38 +39,29 @@ def page(tmp_path_factory):
     write_reconstruction(
         folder / "r.h5", Reconstruction(sweep.frame_time_s, GRID, poses, origin, trust=trust)
     )
-    return ReconstructionPage(read_reconstruction(folder / "r.h5"), sweep, folder / "r.h5")
+    return folder
 
 
 @pytest.fixture
-def viewer(page):
-    viewer = _Viewer(page)
+def viewer(folder):
+    viewer = _Viewer(ReconstructionPage(read_reconstruction(folder / "r.h5"), load_sweep(folder / "s.h5")))
     viewer.layout()
     return viewer
 
 
-def run_command(page, command):
-    """What a command prints that is run where the reconstruction is."""
-    output = io.StringIO()
-    with pytest.MonkeyPatch.context() as patch, redirect_stdout(output), chdir(page.folder):
-        patch.setattr(sys, "argv", shlex.split(command))
-        with suppress(SystemExit):
-            cli.main()
-    return output.getvalue().splitlines()
-
-
-def commands(pane):
-    parts = [part.split("</div>")[0].split(">")[-1] for part in pane.object.split("<div")[1:]]
-    return [part.replace("&#x27;", "'").replace("&lt;", "<") for part in parts]
-
-
-@pytest.mark.parametrize(("cut", "mode"), [("along", "pose"), ("frame", "image"), ("depth", "pose")])
-def test_a_cut_is_what_its_command_makes(viewer, page, cut, mode):
+@pytest.mark.parametrize(
+    ("cut", "mode", "option"),
+    [
+        ("along", "pose", "--lateral-mm=9"),
+        ("frame", "image", "--frame=7"),
+        ("depth", "pose", "--depth-mm=11"),
+    ],
+)
+def test_a_cut_is_what_its_command_makes(viewer, folder, cut, mode, option):
     viewer.mode = mode
     viewer.param.update(frame=7, lateral_mm=9.0, depth_mm=11.0)
-    command = commands(viewer._commands)[["along", "frame", "depth"].index(cut)]
-    run_command(page, command.replace(f"{cut}.png", f"{cut}-{mode}.nrrd"))
-    levels = read_volume(page.folder / f"{cut}-{mode}.nrrd").voxels[..., 0].T.astype(float)
+    run_command("reslice", folder / "r.h5", "-o", folder / f"{cut}.nrrd", "--mode", mode, option)
+    levels = read_volume(folder / f"{cut}.nrrd").voxels[..., 0].T.astype(float)
     (pixels,) = viewer._plots[cut].source.data["image"]
     grey = (pixels & 0xFF).astype(float)
     assert levels.shape == grey.shape
@@ -84,12 +70,12 @@ def test_a_cut_is_what_its_command_makes(viewer, page, cut, mode):
     assert np.abs(grey - (levels - 1) * 255 / 254)[inside].max() < 2.0
 
 
-def test_points_are_measured_as_their_command_measures(viewer, page):
+def test_points_are_measured_as_their_command_measures(viewer, folder):
     for frame, lateral, depth in ((2, 3.0, 4.0), (18, 9.0, 15.0), (20, 2.0, 8.0)):
         viewer.param.update(frame=frame, lateral_mm=lateral, depth_mm=depth)
         viewer._add()
-    (command,) = commands(viewer._words)
-    lines = run_command(page, command)
+    points = [f"--point={','.join(map(repr, point.tolist()))}" for point in viewer.points_mm]
+    lines = run_command("measure", folder / "r.h5", "--mode", "image", *points).splitlines()
     assert any(line.startswith("distance 1 2: 14.07") for line in lines)
     for line in lines:
         assert line.replace("'", "&#x27;") in viewer._words.object

@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import partial
 from pathlib import Path
 
-from speckle3d.app.look import SimplePage
+from speckle3d.app.look import Page
 from speckle3d.app.phantom.lines import LinesViewer
 from speckle3d.app.phantom.points import PointsViewer
 from speckle3d.calibrating.phantoms import open_phantom, require_frames
@@ -13,7 +13,7 @@ from speckle3d.calibrating.settings import ScanSettings, WireSettings
 from speckle3d.core.errors import InvalidInputError
 
 
-def phantom_page(images: Path, settings: ScanSettings) -> SimplePage:
+def phantom_page(images: Path, settings: ScanSettings) -> Page:
     """Page of a phantom's recording, which is looked at and calibrated with.
 
     Parameters
@@ -35,4 +35,4 @@ def phantom_page(images: Path, settings: ScanSettings) -> SimplePage:
     is_wires = isinstance(settings, WireSettings)
     make = partial(PointsViewer if is_wires else LinesViewer, recording, images, settings)
     make()  # which refuses what cannot be shown
-    return SimplePage("Points" if is_wires else "Lines", lambda: make().view())
+    return Page("Points" if is_wires else "Lines", lambda: make().view())

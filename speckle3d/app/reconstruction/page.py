@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import shlex
-from collections.abc import Iterable
 from dataclasses import replace
 from functools import lru_cache
 from html import escape
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -33,8 +30,6 @@ from speckle3d.study.reslices.places import along_sweep, in_frame
 
 KEPT_BYTES = 600_000_000
 """Of images that are kept; those of a longer sweep are made again when they are needed."""
-_DIGITS = 4
-"""Of points' coordinates in mm: those that are measured are the ones that a command is given."""
 _SIDE_PX = 250
 _COLOURS = {"frame": "#ffd700", "lateral_mm": "#4fc3ff", "depth_mm": "#8de04f"}
 """Of sliders, and of the lines of the cross hair that they move."""
@@ -46,10 +41,6 @@ _CUTS = {
 """Along the sweep, in a frame's plane, parallel to the skin: the slider that moves the cut, and those that
 move the upright and the level line in it."""
 _HELP = "Click in a cut: the cross hair, and with it the other cuts, go there."
-_CODE = (
-    "font-family:ui-monospace,'DejaVu Sans Mono',monospace;font-size:11px;white-space:pre-wrap;"
-    "overflow-wrap:anywhere;user-select:all;background:#f3f5f7;padding:6px;border:1px solid #d5dae0"
-)
 
 
 class ReconstructionPage:
@@ -61,29 +52,12 @@ class ReconstructionPage:
         Its pairs are not needed.
     sweep : Sweep
         Of the frames that were reconstructed; see `speckle3d.study.images.open_reconstruction`.
-    file : Path
-        Of the reconstruction.
-    sweep_file : path, optional
-        The sweep, if it is not where the reconstruction says: commands that are shown then name it.
     mode : str
         The one that is shown first.
     """
 
-    title = "Reconstruction"
-
-    def __init__(
-        self,
-        reconstruction: Reconstruction,
-        sweep: Sweep,
-        file: Path,
-        sweep_file: Path | None = None,
-        mode: str = "image",
-    ) -> None:
-        self.reconstruction, self.mode, self.folder = reconstruction, mode, file.resolve().parent
-        self.source = Path(file.resolve().name)
-        recording = Path(reconstruction.provenance.input_path)
-        is_there = sweep_file is None and (self.folder / recording).exists()
-        self.sweep_file = None if is_there else (sweep_file or recording).resolve()
+    def __init__(self, reconstruction: Reconstruction, sweep: Sweep, mode: str = "image") -> None:
+        self.reconstruction, self.mode = reconstruction, mode
         poses = reconstruction.poses[mode]
         self._sweep = PosedSweep(sweep, np.arange(len(sweep)), poses, mode, reconstruction)
         self.reference = find_reference(sweep)
@@ -131,8 +105,7 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
             name: CutPlot(name, (_COLOURS[upright], _COLOURS[level]), self._go)
             for name, (_, (upright, level)) in _CUTS.items()
         }
-        self._words, self._commands = pn.pane.HTML(_HELP, width=_SIDE_PX), pn.pane.HTML("", width=_SIDE_PX)
-        self._lengths = pn.pane.HTML("", width=_SIDE_PX)
+        self._words, self._lengths = pn.pane.HTML(_HELP, width=_SIDE_PX), pn.pane.HTML("", width=_SIDE_PX)
         for name, (slider, _) in _CUTS.items():
             self.param.watch(lambda *_, name=name: self._cut(name), ["mode", "overlay", slider])
             self._cut(name)
@@ -153,14 +126,12 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
         add.on_click(self._add)
         remove.on_click(lambda _: setattr(self, "points_mm", self.points_mm[:-1]))
         calibrations = self._page.reconstruction.provenance.calibrations
-        commands = pn.Card(self._commands, title="The commands", collapsed=True, width=_SIDE_PX)
         side = pn.Column(
             controls,
             self._lengths,
             pn.pane.HTML("<br>".join(f"calibration used: {escape(file.path)}" for file in calibrations)),
             pn.Row(add, remove, margin=0),
             self._words,
-            commands,
             width=_SIDE_PX + 40,
             scroll="y-auto",
             sizing_mode="stretch_height",
@@ -218,17 +189,13 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
     def _poses(self) -> RigidTransform:
         return self._page.posed(*self._pair).poses[self.mode]
 
-    def _slider(self, name: str) -> dict[str, Any]:
-        """Name and value of the slider that moves a cut."""
-        slider = _CUTS[name][0]
-        return {slider: getattr(self, slider)}
-
     @batch_changes
     def _cut(self, name: str) -> None:
         posed, plot = self._page.posed(*self._pair), self._plots[name]
+        source, slider = self._page.images, _CUTS[name][0]
         try:
-            source, slider = self._page.images, self._slider(name)
-            place = (in_frame if name == "frame" else along_sweep)(posed, source.grid, **slider)
+            cut: Any = in_frame if name == "frame" else along_sweep
+            place = cut(posed, source.grid, **{slider: getattr(self, slider)})
             picture = cut_at_modes(posed, place, source)
         except Speckle3DError as error:
             plot.plot.title.text = str(error).split(";")[0]
@@ -254,60 +221,26 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
 
     @batch_changes
     def _draw_points(self, *_: Any) -> None:
-        """Draw the cross hair and the points, and write the commands."""
-        page = self._page
+        """Draw the cross hair and the points."""
         points = np.array(self.points_mm).reshape(-1, 3)
         for plot in self._plots.values():
             plot.show_points(self._cross_mm, points)
-        options: list[tuple[str, object]]
-        options = [("mode", mode) for mode in self._pair if mode]
-        options += [("difference_to", self.mode)] if self._pair[1] else []
-        options += [("sweep", page.sweep_file)] if page.sweep_file else []
-        self._commands.object = "".join(
-            _command(
-                "reslice", page.source, [("output", f"{name}.png"), *self._slider(name).items(), *options]
-            )
-            for name in _CUTS
-        )
 
     def _add(self, *_: Any) -> None:
         """Measure from and to where the cross hair is."""
-        self.points_mm = [*self.points_mm, np.round(self._cross_mm, _DIGITS)]
+        self.points_mm = [*self.points_mm, self._cross_mm]
 
     def _measure(self, *_: Any) -> None:
-        """Say what is between the points, as `speckle3d measure` does, and give its command."""
+        """Say what is between the points, as `speckle3d measure` does."""
         page, points = self._page, np.array(self.points_mm).reshape(-1, 3)
         lines = [
             f"{k + 1}: {', '.join(f'{value:.2f}' for value in point)} mm" for k, point in enumerate(points)
         ]
-        again = ""
         if len(points) > 1:
             try:
                 lines += [row.line for row in measure(page.reconstruction, points, self.mode)]
                 lines.append(how_measured(self.mode, PICKING * self._grid.vector_pitch_mm))
                 lines += filter(None, [caution(page.reconstruction, self.mode)])
-                places = [("point", ",".join(map(repr, point))) for point in points.tolist()]
-                again = _command("measure", page.source, [("mode", self.mode), *places])
             except Speckle3DError as error:
                 lines.append(str(error))
-        self._words.object = (
-            "".join(f"<p style='margin:3px 0'>{escape(line)}</p>" for line in lines) + again or _HELP
-        )
-
-
-def _command(name: str, source: Path, options: Iterable[tuple[str, object]]) -> str:
-    """HTML of a command line about a reconstruction, which one click selects.
-
-    Parameters
-    ----------
-    name : str
-        Of the command.
-    source : path
-        The reconstruction.
-    options : iterable of (str, object)
-        Names of options, as ``depth_mm``, and their values.
-    """
-    words = ["speckle3d", name, str(source)]
-    for option, value in options:
-        words += [f"--{option.replace('_', '-')}", f"{value:g}" if isinstance(value, float) else str(value)]
-    return f'<div style="{_CODE}">{escape(shlex.join(words))}</div>'
+        self._words.object = "".join(f"<p style='margin:3px 0'>{escape(line)}</p>" for line in lines) or _HELP

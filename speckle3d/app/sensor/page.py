@@ -15,7 +15,7 @@ from panel.viewable import Viewable
 from plotly import graph_objects as go
 from scipy.spatial.transform import Rotation
 
-from speckle3d.app.look import batch_changes
+from speckle3d.app.look import Page, batch_changes
 from speckle3d.app.plots import time_plot
 from speckle3d.app.sensor.log import Columns, LogReadings
 from speckle3d.app.sensor.watch import SHOWN_S, SensorWatch
@@ -49,7 +49,7 @@ _KEY = (
 )
 
 
-class SensorPage:
+def sensor_page(source: Source, sensor_from_image: Rotation | None = None) -> Page:
     """Page of an orientation sensor: readings, orientation, and trust in its field.
 
     Parameters
@@ -65,20 +65,12 @@ class SensorPage:
 
     >>> import numpy as np
     >>> from speckle3d.app.sensor.log import LogReadings
-    >>> from speckle3d.app.sensor.page import SensorPage
+    >>> from speckle3d.app.sensor.page import sensor_page
     >>> from xsens import ImuLog
     >>> log = ImuLog(np.arange(300) / 100.0, gyroscope_rad_s=np.zeros((300, 3)))
-    >>> view = SensorPage(LogReadings(log)).view()
+    >>> view = sensor_page(LogReadings(log)).view()
     """
-
-    title = "Sensor"
-
-    def __init__(self, source: Source, sensor_from_image: Rotation | None = None) -> None:
-        self._source, self._mounting = source, sensor_from_image
-
-    def view(self) -> Viewable:
-        """The sentence on the magnetometer above, the probe on the left, readings over time on the right."""
-        return _Viewer(self._source, self._mounting).layout()
+    return Page("Sensor", lambda: _Viewer(source, sensor_from_image).layout())
 
 
 class _Viewer(param.Parameterized):  # type: ignore[misc]
@@ -101,7 +93,7 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
         self._show()
 
     def layout(self) -> Viewable:
-        """Lay everything out, and begin to follow a live sensor."""
+        """The sentence on the magnetometer above, the probe on the left, readings over time on the right."""
         lines = {
             label: names
             for label, names in _PLOTS.items()

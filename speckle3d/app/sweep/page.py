@@ -52,8 +52,6 @@ class SweepPage:
         What the checks found as it was made; None if that is not known.
     """
 
-    title = "Sweep"
-
     def __init__(
         self,
         sweep: Sweep,
