@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -29,48 +28,6 @@ _DIGITS = 3
 _NO_POINTS: dict[str, list[Any]] = {"column": [], "row": [], "wire": []}
 
 
-class Picks(dict[tuple[int, str], tuple[float, float]]):
-    """Column and row by frame and wire; of each wire one in a frame, the last that was set there.
-
-    Parameters
-    ----------
-    names : sequence of str
-        Of the phantom's wires; none where they are not told apart, and a frame has one point.
-    """
-
-    def __init__(self, names: Iterable[str]) -> None:
-        super().__init__()
-        self.names = tuple(names) or ("",)
-
-    def of(self, frame: int) -> dict[str, tuple[float, float]]:
-        """Column and row by wire, in the order of the wires."""
-        return {name: self[frame, name] for name in self.names if (frame, name) in self}
-
-    def set_frame(self, frame: int, points: Iterable[tuple[float, float, str]]) -> None:
-        """Take these columns, rows and wires as the points of a frame, in place of those it had."""
-        for name in self.of(frame):
-            del self[frame, name]
-        for column, row, wire in points:
-            if wire in self.names:
-                self[frame, wire] = round(column, _DIGITS), round(row, _DIGITS)
-
-    def take(self, points: PickedPoints | Detections) -> None:
-        """Take points of many frames, in place of all that were there."""
-        wires = np.zeros(len(points.frame), int) if points.wire is None else points.wire
-        self.clear()
-        for frame, wire, (column, row) in zip(
-            points.frame.tolist(), wires.tolist(), points.pixels.round(_DIGITS).tolist(), strict=True
-        ):
-            self[frame, self.names[wire]] = column, row
-
-    def points(self) -> PickedPoints:
-        """All points, by frame and wire, as they are written into a file."""
-        rows = sorted((frame, self.names.index(wire), *place) for (frame, wire), place in self.items())
-        frame, wire, column, row = np.array(rows, dtype=float).reshape(-1, 4).T
-        wires = None if self.names == ("",) else wire.astype(np.int64)
-        return PickedPoints(frame.astype(np.int64), np.column_stack([column, row]), wires)
-
-
 class PointsViewer(PhantomViewer):
     """Dots of wires, or places where wires cross, in the frames of a recording; as `PhantomViewer`.
 
@@ -84,11 +41,13 @@ class PointsViewer(PhantomViewer):
         assert isinstance(settings, WireSettings)
         super().__init__(recording, images, settings)
         self._phantom, self._drawing = WireSetup.of(settings.phantom), False
-        self.picks = Picks(self._phantom.names)
+        # Where the wires are not told apart, a frame has one point.
+        self._names = self._phantom.names or ("",)
+        self._picks: dict[int, dict[str, tuple[float, float]]] = {}
         if settings.points is not None:
             points = read_points(settings.points, self._phantom.names)
             points.require_inside(recording.images.shape)
-            self.picks.take(points)
+            self._take(points)
         self._points = ColumnDataSource(_NO_POINTS, name="points")
         self._points.on_change("data", self._edit)
         dots = self.frame_plot.plot.scatter(
@@ -132,7 +91,7 @@ class PointsViewer(PhantomViewer):
 
     def show(self, image: npt.NDArray[Any], settings: ScanSettings) -> str:
         """Draw the points of a frame, and count them."""
-        points = self.picks.of(self.frame)
+        points = self._picks.get(self.frame, {})
         column, row = zip(*points.values(), strict=True) if points else ((), ())
         self._drawing = True
         self._points.data = {"column": list(column), "row": list(row), "wire": list(points)}
@@ -142,14 +101,12 @@ class PointsViewer(PhantomViewer):
             self._wire.value = missing[0]
         self._name_next()
         lacking = f"; none on {', '.join(missing)}" if points and missing else ""
-        total, frames = len(self.picks), len({frame for frame, _ in self.picks})
-        return f"frame {self.frame}: {len(points)} points{lacking}; {total} in {frames} frames"
+        total = sum(map(len, self._picks.values()))
+        return f"frame {self.frame}: {len(points)} points{lacking}; {total} in {len(self._picks)} frames"
 
     def find(self, settings: ScanSettings) -> Detections:
         """Take the points that are there."""
-        if not self.picks:
-            raise InvalidInputError("expected points: find them, or click where they are")
-        return detections_by_hand(self.recording, self.picks.points(), settings)
+        return detections_by_hand(self.recording, self._points_by_hand(), settings)
 
     def before_saving(self, settings: ScanSettings, out: Path) -> ScanSettings:
         """Save the points, which are those of the calibration, for the command to be given them."""
@@ -157,11 +114,39 @@ class PointsViewer(PhantomViewer):
 
     def _edit(self, attribute: str, old: object, new: Any) -> None:
         if not self._drawing:
-            self.picks.set_frame(self.frame, zip(new["column"], new["row"], new["wire"], strict=True))
+            points = {
+                wire: (round(column, _DIGITS), round(row, _DIGITS))
+                for column, row, wire in zip(new["column"], new["row"], new["wire"], strict=True)
+                if wire in self._names
+            }
+            self._picks |= {self.frame: points}
             self._mark_picks()
 
+    def _take(self, points: PickedPoints | Detections) -> None:
+        """Take points of many frames, in place of all that were there."""
+        wires = np.zeros(len(points.frame), int) if points.wire is None else points.wire
+        self._picks.clear()
+        for frame, wire, (column, row) in zip(
+            points.frame.tolist(), wires.tolist(), points.pixels.round(_DIGITS).tolist(), strict=True
+        ):
+            self._picks.setdefault(frame, {})[self._names[wire]] = column, row
+
+    def _points_by_hand(self) -> PickedPoints:
+        """All points, by frame and wire, as they are written into a file."""
+        rows = sorted(
+            (frame, self._names.index(wire), *place)
+            for frame, points in self._picks.items()
+            for wire, place in points.items()
+        )
+        if not rows:
+            raise InvalidInputError("expected points: find them, or click where they are; got none")
+        frame, wire, *pixels = np.array(rows).T
+        wires = wire.astype(np.int64) if self._phantom.names else None
+        return PickedPoints(frame.astype(np.int64), np.column_stack(pixels), wires)
+
     def _mark_picks(self) -> None:
-        self.mark_frames(dict.fromkeys((frame for frame, _ in self.picks), "has points"))
+        self._picks = {frame: points for frame, points in self._picks.items() if points}
+        self.mark_frames(dict.fromkeys(self._picks, "has points"))
         self.changed()
 
     @batch_changes
@@ -172,7 +157,7 @@ class PointsViewer(PhantomViewer):
         try:
             settings = self.settings().model_copy(update={"points": None})
             self.tell("finding points in all frames ...")
-            self.picks.take(await run_in_thread(self._search, partial(self._find_points, settings)))
+            self._take(await run_in_thread(self._search, partial(self._find_points, settings)))
         except Speckle3DError as error:
             self.tell(str(error), ORANGE)
             return
@@ -192,8 +177,6 @@ class PointsViewer(PhantomViewer):
             self._points_note.object = sentence(str(error), ORANGE, "saved")
 
     def _write(self, name: str) -> Path:
-        if not self.picks:
-            raise InvalidInputError("expected points to save, got none")
-        path = new_path(self.folder, name, ".csv")
-        write_points(path, self.picks.points(), self._phantom.names)
+        points, path = self._points_by_hand(), new_path(self.folder, name, ".csv")
+        write_points(path, points, self._phantom.names)
         return path

@@ -11,7 +11,6 @@ import numpy as np
 import panel as pn
 import param
 from panel.viewable import Viewable
-from plotly import graph_objects as go
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.app.look import batch_changes
@@ -142,8 +141,8 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
         third = pn.Column(depth, self._trajectories(), sizing_mode="stretch_both")
         return pn.Row(side, along, frame, third, sizing_mode="stretch_both")
 
-    def _outlines(self) -> go.Figure:
-        """Outlines of the frames of all modes in space."""
+    def _trajectories(self) -> Viewable:
+        """Outlines of frames in space, and length and angles over the frames, of all modes."""
         page = self._page
         poses = {mode: page.posed(mode, None).poses[mode] for mode in page.modes}
         outlines = plot_outlines(poses, self._grid)
@@ -156,11 +155,6 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
             scene_xaxis_nticks=3,
             scene_yaxis_nticks=3,
         )
-        return outlines
-
-    def _trajectories(self) -> Viewable:
-        """Outlines of frames in space, and length and angles over the frames, of all modes."""
-        page = self._page
         trust = page.reconstruction.trust
         covariance = None if trust is None else trust.covariance
         drift = plot_curves(
@@ -169,12 +163,9 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
         drift.update_layout(
             height=None, font_size=9, showlegend=False, updatemenus=[], margin={"t": 10, "r": 10}
         )
-        over_frames = pn.pane.Plotly(drift, sizing_mode="stretch_both")
-        return pn.Tabs(
-            ("in space", pn.pane.Plotly(self._outlines(), sizing_mode="stretch_both")),
-            ("over the frames", over_frames),
-            sizing_mode="stretch_both",
-        )
+        figures = {"in space": outlines, "over the frames": drift}
+        panes = [(name, pn.pane.Plotly(plot, sizing_mode="stretch_both")) for name, plot in figures.items()]
+        return pn.Tabs(*panes, sizing_mode="stretch_both")
 
     @property
     def _cross_mm(self) -> FloatArray:
@@ -202,7 +193,7 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
             return
         plot.show_cut(picture, *self._pair)
         lengths = {mode: text.replace("\n", ", ") for mode, text in picture.lengths.items()}
-        words = "".join(f"{label_of(mode)}: {text}<br>" for mode, text in lengths.items())
+        words = "".join(f"length, {label_of(mode)}: {text}<br>" for mode, text in lengths.items())
         if self._pair[1]:
             words += "green: this mode alone, magenta: the other alone, grey: both"
         self._lengths.object = words
