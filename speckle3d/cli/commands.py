@@ -3,8 +3,8 @@
 A command is a function with a numpydoc docstring. Options under *Parameters* are common and shown by
 ``--help`` in that order, those under *Other Parameters* by ``--help-all``. "With --origin or --curve:" and
 "Not with --paper." in a help are rules that are checked, as is "One of --level or --labels." in the text. A
-parameter annotated with `Fields` of a pydantic model or a dataclass becomes an option for each field, with a
-model's description of it as help; the function gets the model made of the values that were given.
+parameter annotated with `Fields` of a pydantic model becomes an option for each field, with its description
+as help; the function gets the model made of the values that were given.
 """
 
 from __future__ import annotations
@@ -21,7 +21,6 @@ from typing import (
     TYPE_CHECKING,
     Annotated,
     Any,
-    Literal,
     NamedTuple,
     Union,
     get_args,
@@ -72,7 +71,7 @@ _REPLACEMENTS = {
 
 
 class Fields(NamedTuple):
-    """Fields of a pydantic model or a dataclass as options: all, only some, or all but some."""
+    """Fields of a pydantic model as options: all, only some, or all but some."""
 
     model: str
     only: Sequence[str] = ()
@@ -80,13 +79,10 @@ class Fields(NamedTuple):
 
     def options(self, words: Words) -> dict[str, inspect.Parameter]:
         """Options by the fields' names; the model is loaded."""
-        from pydantic.dataclasses import dataclass
-
         model = _load(self.model)
-        is_model = hasattr(model, "model_fields")
-        infos = model.model_fields if is_model else dataclass(model, frozen=True).__pydantic_fields__
-        names = [name for name in self.only or infos if name not in self.without]
-        return {name: _field_option(name, infos[name], words) for name in names}
+        kinds, fields = get_type_hints(model), model.model_fields
+        names = [name for name in self.only or fields if name not in self.without]
+        return {name: _field_option(name, kinds[name], fields[name], words) for name in names}
 
 
 def _load(place: str) -> Any:
@@ -259,28 +255,13 @@ def _option(name: str, kind: Any, default: Any, info: Any, words: Words) -> insp
     return inspect.Parameter(name, only, default=default, annotation=Annotated[kind, info])
 
 
-def _without_bounds(kind: Any) -> Any:
-    """A type without pydantic's bounds, of which typer knows nothing."""
-    return kind.__origin__ if get_origin(kind) is Annotated else kind
-
-
-def _field_option(name: str, field: FieldInfo, words: Words) -> inspect.Parameter:
-    """An option of a field: of its type if that is a word of a command, else text that the model reads."""
-    kind: Any = field.annotation
-    default = field.default
-    if get_origin(kind) in (Union, UnionType):
-        members = [member for member in get_args(kind) if member is not type(None)]
-        choices = tuple(value for member in members for value in get_args(member))
-        are_literals = all(get_origin(member) is Literal for member in members)
-        kind = members[0] if len(members) == 1 else Literal[choices] if are_literals else str
-    if get_origin(kind) is tuple:
-        kind = tuple.__class_getitem__(tuple(map(_without_bounds, get_args(kind))))
-    kind = _without_bounds(kind)
-    default_text = "" if isinstance(default, bool | tuple) or default in (None, "") else f" ({default})"
+def _field_option(name: str, kind: Any, field: FieldInfo, words: Words) -> inspect.Parameter:
+    """An option of a field: of its type if that is a single one, else text that the model reads."""
+    if get_origin(kind) in (Union, UnionType) and len(get_args(kind)) > 2:
+        kind = str
+    default = "" if isinstance(field.default, bool) or field.default in (None, "") else f" ({field.default})"
     text = (field.description or "").removesuffix(".")
-    info = typer.Option(help=text and f"{text[:1].upper()}{text[1:]}{default_text}.")
-    if default is True:
-        info.param_decls = (f"{_flag(name)}/--no-{_flag(name)[2:]}",)
+    info = typer.Option(help=text and f"{text[:1].upper()}{text[1:]}{default}.")
     return _option(name, kind | None, None, info, words)
 
 

@@ -73,9 +73,7 @@ def convert(
         Fields("speckle3d.io.import_settings:ImportSettings", without=("image_to_probe", "arrays")),
     ],
     calibration: Paths = None,
-    compression: Annotated[
-        Literal["gzip", "lzf", "none"] | None, typer.Option("--compression", "--compress")
-    ] = None,
+    compression: Literal["gzip", "lzf", "none"] | None = None,
     mode: MaybeText = None,
     sweep_file: MaybePath = None,
 ) -> None:

@@ -255,7 +255,6 @@ _LAST_S = 5.0
 def play(
     images: Path,
     port: Port = 18944,
-    address: str = "127.0.0.1",
     rate: Annotated[float, typer.Option(min=1e-3, max=1e3)] = 1.0,
     kind: Annotated[Kind | None, typer.Option("--as")] = None,
 ) -> None:
@@ -275,11 +274,6 @@ def play(
     rate
         Speed, times the sweep's own.
 
-    Other Parameters
-    ----------------
-    address
-        0.0.0.0: also for other machines.
-
     Examples
     --------
     $ speckle3d play sweep.h5
@@ -296,8 +290,8 @@ def play(
     next(send(shift_s))  # refused at once if messages cannot hold it
     if shift_s:
         note(f"times in the messages are the sweep's and {shift_s:g} s")
-    with Server(port, address) as server, progress_bar(f"playing {read.name}") as progress:
-        note(f"{address}:{server.port}: {len(read)} frames of {read.name}; waiting for a client")
+    with Server(port) as server, progress_bar(f"playing {read.name}") as progress:
+        note(f"127.0.0.1:{server.port}: {len(read)} frames of {read.name}; waiting for a client")
         while not server.wait_connected(1.0):
             server.receive(0.0)
         count, start_s = 0, time.monotonic()

@@ -3,22 +3,19 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import typer
 
 from speckle3d.cli.common import MaybeText, Out, Reference, Result, note
-
-LengthUnit = Literal["m", "mm"]
 
 
 def export(
     reconstruction_file: Path,
     out: Annotated[Out, "trajectory"],
     mode: MaybeText = None,
-    length_unit: LengthUnit = "m",
 ) -> None:
-    """Write the poses of one mode as TUM text (time_s x y z qx qy qz qw, image to world).
+    """Write the poses of one mode as TUM text (time_s x y z qx qy qz qw, image to world, s and m).
 
     Parameters
     ----------
@@ -27,8 +24,6 @@ def export(
         Text file to write.
     mode
         Which poses to write (by default those that claim the smallest error of length).
-    length_unit
-        Unit of lengths.
 
     Examples
     --------
@@ -39,7 +34,7 @@ def export(
 
     estimate = load_estimate(reconstruction_file, mode)
     note(estimate.name)
-    write_tum(out, estimate.time_s, estimate.poses, length_unit)
+    write_tum(out, estimate.time_s, estimate.poses)
 
 
 def score(
@@ -47,7 +42,6 @@ def score(
     of: Annotated[Path, typer.Argument(metavar="REFERENCE")],
     mode: MaybeText = None,
     reference: Reference | None = None,
-    length_unit: LengthUnit | None = None,
 ) -> Result:
     """Score a trajectory: pose errors as evo has them, drift rates, displacement of pixels and landmarks.
 
@@ -65,8 +59,6 @@ def score(
     ----------------
     reference
         Which poses of a sweep.
-    length_unit
-        Unit of lengths in TUM text that does not say (m).
 
     Examples
     --------
@@ -74,8 +66,8 @@ def score(
     """
     from speckle3d.scoring.trajectories import compare_trajectories, load_estimate, load_reference
 
-    trajectory = load_estimate(estimate, mode, length_unit)
-    scores = compare_trajectories(trajectory, load_reference(of, reference, mode, length_unit))
+    trajectory = load_estimate(estimate, mode)
+    scores = compare_trajectories(trajectory, load_reference(of, reference, mode))
     if scores["same_sweep"] is False:
         note(
             f"warning: {trajectory.name} was made from another file than {of.name} (SHA-256): "

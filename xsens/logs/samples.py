@@ -150,6 +150,17 @@ class ImuLog:
         return sum(gap.lost for gap in self.gaps)
 
     @property
+    def losses(self) -> str:
+        """Number and length of the gaps in words; empty if there are none."""
+        if not self.gaps:
+            return ""
+        longest_s = max(gap.duration_s for gap in self.gaps)
+        gaps = (
+            f"{self.lost} samples lost in {len(self.gaps)} gaps" if self.lost else f"{len(self.gaps)} pauses"
+        )
+        return f"{gaps}, the longest of {longest_s:.3f} s"
+
+    @property
     def own_direction(self) -> FloatArray | None:
         """A direction that rests in the world, seen from the sensor by its own orientation, shape (m, 3).
 

@@ -117,7 +117,7 @@ class LogReadings:
         """Facts about the log and the orientation at a time."""
         log, orientation, rotation = self._log, self._orientation, self.orientation_at(time_s)
         rows = [] if rotation is None else [angles(rotation)]
-        north, notes, losses = "magnetic north, y west", log.notes, "none"
+        north, notes = "magnetic north, y west", log.notes
         if isinstance(orientation, Orientation):
             times_s, last = orientation.rotations.time_s, len(orientation) - 1
             at = min(int(np.searchsorted(times_s, time_s + self._start_s)), last)
@@ -125,14 +125,11 @@ class LogReadings:
             rows.append(("known to (95 %)", f"inclination {max(inclination):.1f}°, heading {heading:.1f}°"))
             north = north if orientation.magnetic else "where it was at the start, y to its left"
             notes = (*notes, *orientation.notes)
-        if log.gaps:
-            longest_s = max(gap.duration_s for gap in log.gaps)
-            losses = f"{log.lost} samples in {len(log.gaps)} gaps, the longest of {longest_s:.3f} s"
         origin = "none: neither its own nor by its readings" if self._stream is None else self._stream[2]
         return [
             *rows,
             ("log", f"{len(log)} samples, {log.duration_s:.1f} s, {log.rate_hz:.1f} per second"),
-            ("lost", losses),
+            ("gaps", log.losses or "none"),
             ("orientation", origin),
             ("world", f"x {north}, z up"),
             *(("note", text) for text in notes),

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from speckle3d.cli.common import MaybeNumber, MaybePath, MaybeText, Out, Result, notes
+from speckle3d.cli.common import MaybeNumber, MaybePath, MaybeText, Out, Result, note, notes
 from speckle3d.cli.outputs import require_own_place
-from speckle3d.core.errors import InvalidInputError, naming
+from speckle3d.core.errors import naming
 
 if TYPE_CHECKING:
     from speckle3d.core.grid import ImageGrid
@@ -110,7 +110,8 @@ def surface(
 ) -> Result:
     """Find the surface where a volume crosses a grey level, or those of its labels, and measure them.
 
-    One of --level or --labels. Where the sweep ends the surface stays open, and what is open has no volume.
+    One of --level or --labels. Where the sweep ends the surface stays open, and what is open has no volume;
+    labels are closed there unless --state tells where it ends.
 
     Parameters
     ----------
@@ -137,8 +138,8 @@ def surface(
     mode
         Poses that VOLUME was made at, if its file does not say (image).
     state
-        With --level: which voxels are empty, from `speckle3d volume --state`; without it, of whole numbers,
-        zeros that reach the border.
+        Which voxels are empty, from `speckle3d volume --state`: there the surface ends, and stays open.
+        Without it, of grey levels, zeros that reach the border.
 
     Examples
     --------
@@ -160,10 +161,12 @@ def surface(
     if level is not None:
         surfaces = {out: surface_of(volume, level, "below" if below else "above", mask)}
     else:
-        by_label = surfaces_of_labels(volume).items()
+        by_label = surfaces_of_labels(volume, mask).items()
         surfaces = {out.with_stem(f"{out.stem}-{label}"): surface for label, surface in by_label}
         for place in surfaces:
             require_own_place(place, "surface")
+        if mask is None:
+            note("labels that reach the end of the sweep are closed there: --state leaves them open")
     sizes = []
     for place, mesh in surfaces.items():
         mesh = largest_part(mesh) if largest else mesh
@@ -182,9 +185,7 @@ def _errors(
     from speckle3d.study.pose_errors import caution, errors_of
     from speckle3d.study.posed import MARK, pose_mark, require_made_at
 
-    volume_mode = volume.fields.get("poses", mode or "image")
-    if mode is not None and mode != volume_mode:
-        raise InvalidInputError(f"--mode: expected {volume_mode}, at whose poses VOLUME was made, got {mode}")
+    volume_mode = mode or volume.fields.get("poses", "image")
     if path is None:
         return None
     reconstruction = read_reconstruction(path, with_pairs=False)

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from speckle3d.cli.commands import Fields
 from speckle3d.cli.common import (
     MaybeNumber,
     MaybePath,
@@ -54,11 +53,7 @@ def note_gaps(log: ImuLog) -> None:
     """Report on stderr what a log lacks, and what was assumed in its place."""
     from xsens.logs.contradictions import contradictions
 
-    notes([*log.notes, contradictions(log).get("gravity")])
-    if log.gaps:
-        longest = max(gap.duration_s for gap in log.gaps)
-        text = f"{log.lost} samples lost in {len(log.gaps)} gaps" if log.lost else f"{len(log.gaps)} pauses"
-        note(f"{text}, the longest of {longest:.3f} s; nothing filled in")
+    notes([*log.notes, contradictions(log).get("gravity"), log.losses and f"{log.losses}; nothing filled in"])
 
 
 def orientation_of(
@@ -108,9 +103,7 @@ def info(log_file: Path, rate_hz: MaybeNumber = None, world: World = None) -> Re
         ("samples", str(len(log)), ""),
         ("duration", f"{log.duration_s:.3f}", "s"),
         ("rate", *rate),
-        ("lost", str(log.lost), "samples"),
-        ("gaps", str(len(log.gaps)), ""),
-        ("longest gap", f"{max((gap.duration_s for gap in log.gaps), default=0.0):.3f}", "s"),
+        ("gaps", log.losses or "none", ""),
         ("own orientation", str(int(log.oriented.sum())), "samples"),
     ]
     for name, unit in zip(INERTIAL, ("m/s^2", "rad/s", "a.u."), strict=True):
@@ -331,7 +324,9 @@ def _beside_tracker(
 def record(
     port: str,
     out: OutArgument,
-    settings: Annotated[Any, Fields("xsens.live.device:DeviceSettings")],
+    content: str = "orientation",
+    rate_hz: MaybeNumber = None,
+    baud: int | None = None,
     duration_s: float = math.inf,
     append: bool = False,
 ) -> None:
@@ -361,9 +356,10 @@ def record(
     --------
     $ speckle3d imu record /dev/ttyUSB0 log.mtb
     """
+    from xsens.live.device import DeviceSettings
     from xsens.live.recording import record as record_port
 
-    state = None
+    state, settings = None, DeviceSettings(content, rate_hz, baud)
     try:
         with status_line() as show:
             show("connecting")

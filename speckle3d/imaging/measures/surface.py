@@ -89,10 +89,10 @@ def surface_of(
     return smooth_surface(surface, smooth) if smooth else surface
 
 
-def surfaces_of_labels(volume: Volume) -> dict[int, Surface]:
+def surfaces_of_labels(volume: Volume, known: BoolArray | None = None) -> dict[int, Surface]:
     """Surfaces around each label of a label map, by label; 0 is no label.
 
-    A label that reaches the border of the grid is open there.
+    A label that reaches the border of the grid, or of the `known` voxels, is open there.
 
     Raises
     ------
@@ -108,9 +108,9 @@ def surfaces_of_labels(volume: Volume) -> dict[int, Surface]:
             f"labels: expected at most {MAX_LABELS} whole numbers, got {len(labels)} values: are these grey "
             "levels?"
         )
-    everywhere, surfaces = np.ones(volume.shape, dtype=bool), {}
+    mask, surfaces = np.ones(volume.shape, dtype=bool) if known is None else known, {}
     for label in labels[labels != 0].astype(int).tolist():
-        surface = _march(volume, (voxels == label).astype(np.float32), 0.5, "above", everywhere)
+        surface = _march(volume, (voxels == label).astype(np.float32), 0.5, "above", mask)
         surfaces[label] = replace(surface, fields={**surface.fields, "label": str(label)})
     if not surfaces:
         raise InsufficientDataError("labels: expected voxels other than 0, got none")

@@ -47,7 +47,7 @@ class CompoundingSettings(BaseModel):
         "this far along each axis, whatever the voxels' shape.",
     )
     voxel_type: VoxelType = Field("uint8", description="Type of the voxels; in float32 empty ones are NaN.")
-    levels: Levels | Literal["auto"] = Field(
+    levels: Literal["auto", "log", "linear", "stored"] = Field(
         "auto",
         description="log (compressed to 0-255), linear (echo amplitude), or stored; auto: stored for B-mode, "
         "log for RF and I/Q.",
