@@ -139,13 +139,13 @@ def _obsolete_names(values: dict[str, Any]) -> list[str]:
     return [name for name in names if name in REMOVED_SETTINGS]
 
 
-def load_config(path: Path) -> Config:
+def load_config(path: Path | None = None) -> Config:
     """Read a configuration from a TOML file; settings that it does not give keep their defaults.
 
     Parameters
     ----------
-    path : path
-        TOML file; settings that it does not give keep their defaults.
+    path : path, optional
+        TOML file; without one all settings have their defaults.
 
     Returns
     -------
@@ -158,7 +158,7 @@ def load_config(path: Path) -> Config:
     InvalidInputError
         Naming the setting that is unknown or out of range.
     """
-    return config_from_toml(read_toml(path), str(path))
+    return config_from_toml(read_toml(path), str(path)) if path else Config()
 
 
 def unit_of(name: str) -> str:

@@ -245,11 +245,9 @@ def _option(name: str, kind: Any, default: Any, info: Any, words: Words) -> insp
     if isinstance(info, typer.models.ArgumentInfo):
         info.metavar = info.metavar or flag.strip("-").upper()
     else:
-        if match := re.match(r"list\[(?:.*\.)?(\w+)", str(kind)):
-            info.metavar = f"<{match[1].lower()}>"  # which may be repeated, as the help says
         for member in get_args(kind):
-            if get_origin(member) is tuple:
-                info.metavar = " ".join(f"<{number.__name__}>" for number in get_args(member))
+            if get_origin(member) in (list, tuple):
+                info.metavar = " ".join(f"<{item.__name__.lower()}>" for item in get_args(member))
         if info.default is ... and not info.param_decls:
             info.param_decls = (f"{flag}/--no-{flag[2:]}" if default is True else flag,)
     return inspect.Parameter(name, only, default=default, annotation=Annotated[kind, info])

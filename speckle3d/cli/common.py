@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from enum import StrEnum
@@ -13,15 +13,14 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+import speckle3d as s3
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.text import printable
 
 if TYPE_CHECKING:
     from calibration.beam import BeamBias
     from speckle3d.calibrating.written import Written
-    from speckle3d.config import Config
     from speckle3d.core.grid import ImageGrid
-    from speckle3d.core.sweep import Sweep
 
 
 class Drift(StrEnum):
@@ -101,15 +100,10 @@ def common_options() -> None:
     """
 
 
-def note(text: str) -> None:
-    """Print a remark of one line on stderr, apart from the results; what it quotes is shown escaped."""
-    sys.stderr.write(f"{printable(text)}\n")
-
-
-def notes(lines: Iterable[str | None]) -> None:
-    """Print remarks on stderr, a line each; where one is empty there is none."""
+def note(*lines: str | None) -> None:
+    """Print remarks on stderr, a line each, apart from the results; what they quote is shown escaped."""
     for line in filter(None, lines):
-        note(line)
+        sys.stderr.write(f"{printable(line)}\n")
 
 
 def emit(text: str) -> None:
@@ -141,14 +135,7 @@ def rows_of(rows: Sequence[tuple[str, Any, str]]) -> Result:
     return [{"description": d, "value": v, "unit": u} for d, v, u in rows], text_rows(rows)
 
 
-def load_settings(path: Path | None) -> Config:
-    """Read the configuration in a file, or take the default one."""
-    from speckle3d.config import Config, load_config
-
-    return load_config(path) if path else Config()
-
-
-def part_of(sweep: Sweep, frames: str | None, option: str) -> Sweep:
+def part_of(sweep: s3.Sweep, frames: str | None, option: str) -> s3.Sweep:
     """Frames FIRST-LAST of a sweep; by default all."""
     if frames is None:
         return sweep
@@ -178,15 +165,15 @@ def clip_of(config: str | None, grid: ImageGrid, skew_rad: float) -> str | None:
     return None if config is None else read_device_set(config).clip_region(replace(grid, skew_rad=skew_rad))
 
 
-def mount(sweep: Sweep, paths: Sequence[Path]) -> Sweep:
+def mount(sweep: s3.Sweep, paths: Sequence[Path]) -> s3.Sweep:
     """Put calibration files on a sweep's sensors, and report on stderr where they contradict the sweep."""
     import numpy as np
 
     from speckle3d.examine.sensors import rigid
-    from speckle3d.io.calibrations import apply_calibrations, read_calibration
+    from speckle3d.io.calibrations import apply_calibrations
 
     for path in paths:
-        calibration = read_calibration(path)
+        calibration = s3.load_calibration(path)
         mounting = getattr(getattr(sweep, calibration.sensor), "sensor_from_image", None)
         if mounting is None:
             continue

@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal
 
 import typer
 
+import speckle3d as s3
 from speckle3d.cli.commands import Fields
 from speckle3d.cli.common import (
     MaybePath,
@@ -18,12 +19,10 @@ from speckle3d.cli.common import (
     emit,
     mount,
     note,
-    notes,
     rows_of,
 )
 from speckle3d.cli.outputs import require_own_place
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.core.progress import progress_bar
 
 
 def info(path: Path) -> Result:
@@ -40,13 +39,13 @@ def info(path: Path) -> Result:
     $ speckle3d info sweep.h5
     """
     from speckle3d.io.describe import describe
-    from speckle3d.io.reconstructions import FORMAT, read_reconstruction
+    from speckle3d.io.reconstructions import FORMAT
 
     rows = describe(path)
     if rows[0][1] == FORMAT:
         from speckle3d.scoring.lengths import part_lengths
 
-        result = read_reconstruction(path)
+        result = s3.load_reconstruction(path)
         if len(result.frame_time_s):
             lengths_mm = part_lengths(result.poses, result.grid.centre_mm)[1]
             rows += [(f"length, mode {mode}", f"{mm.sum():.2f}", "mm") for mode, mm in lengths_mm.items()]
@@ -60,9 +59,7 @@ def config() -> None:
     --------
     $ speckle3d config > settings.toml
     """
-    from speckle3d.config import Config
-
-    emit(Config().to_toml(comments=True))
+    emit(s3.Config().to_toml(comments=True))
 
 
 def convert(
@@ -110,7 +107,7 @@ def convert(
     from speckle3d.io.load import kind_of, open_recording
     from speckle3d.io.plus.write import SUFFIXES, write_sequence
     from speckle3d.io.reconstructions import FORMAT
-    from speckle3d.io.sweep_writer import COMPRESSIONS, write_sweep
+    from speckle3d.io.sweep_writer import COMPRESSIONS
     from speckle3d.study.posed import USUAL_RANGE_DB, open_posed
     from speckle3d.study.scenes.scene import slicer_sequence
 
@@ -121,8 +118,8 @@ def convert(
         range_db = settings.dynamic_range_db or USUAL_RANGE_DB
         others = type(settings)(**settings.model_dump(exclude={"dynamic_range_db"}, exclude_unset=True))
         posed = open_posed(source, mode, sweep_file, others, calibration or ())
-        notes(posed.notes())
-        with progress_bar(f"writing {out.name}") as progress:
+        note(*posed.notes())
+        with s3.progress_bar(f"writing {out.name}") as progress:
             sequence, poses = slicer_sequence(posed, range_db)
             write_sequence(out, sequence, progress, packs, poses)
         return
@@ -133,13 +130,13 @@ def convert(
     sizes = {name: pixels[name] for name in pixels.keys() - settings.model_fields_set}
     recording = open_recording(source, settings.model_copy(update=sizes))
     sweep = mount(resized(recording.sweep, sizes), calibration or ())
-    notes(recording.notes)
+    note(*recording.notes)
     config = recording.settings.plus_config
     if region := clip_of(config, sweep.grid, 0.0 if sweep.tracker is None else sweep.tracker.image_skew_rad):
         note(f"{out}: does not hold the clip of {config}: give `speckle3d volume` --region '{region}'")
-    with progress_bar(f"writing {out.name}") as progress:
+    with s3.progress_bar(f"writing {out.name}") as progress:
         if suffix not in SUFFIXES:
-            write_sweep(out, sweep, progress, COMPRESSIONS[compression or "none"])
+            s3.write_sweep(out, sweep, progress, COMPRESSIONS[compression or "none"])
             return
         left_out = write_sequence(out, sweep, progress, packs)
     for part in left_out:
@@ -162,13 +159,10 @@ def simulate(
     --------
     $ speckle3d simulate sweep.h5 --preset tissue --length-mm 8 --seed 4
     """
-    from speckle3d.io.sweep_writer import write_sweep
-    from speckle3d.simulation.presets import simulate as prepare
-
-    with progress_bar("computing the beam"):
-        simulations = prepare(settings)
+    with s3.progress_bar("computing the beam"):
+        simulations = s3.simulate(settings)
     paths = [out, out.with_name(f"{out.stem}-crossing{out.suffix}")][: len(simulations)]
     require_own_place(paths[-1], "simulation")
     for path, simulation in zip(paths, simulations, strict=True):
-        with progress_bar(f"simulating {path.name}") as progress:
-            write_sweep(path, simulation.sweep, progress, simulation=simulation.description())
+        with s3.progress_bar(f"simulating {path.name}") as progress:
+            s3.write_sweep(path, simulation.sweep, progress, simulation=simulation.description())

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import typer
 
+import speckle3d as s3
 from speckle3d.cli.common import (
     Drift,
     Json,
@@ -18,19 +19,12 @@ from speckle3d.cli.common import (
     Sweeps,
     WritablePath,
     emit,
-    load_settings,
     mount,
     note,
-    notes,
     part_of,
 )
 from speckle3d.core.errors import InsufficientDataError, MismatchError
 from speckle3d.core.extras import require_extra
-from speckle3d.core.progress import progress_bar
-
-if TYPE_CHECKING:
-    from speckle3d.config import Config
-    from speckle3d.study.job import JobResult
 
 _SIGNS = {
     "truth": "that of the simulation's truth",
@@ -95,45 +89,50 @@ def reconstruct(
     --------
     $ speckle3d reconstruct data/phantom.h5 -o out --drift orientation --drift pose
     """
-    from speckle3d.io.curves import curves_beside, read_curves, trust_words, write_curves
-    from speckle3d.io.load import load_sweep, open_recording
-    from speckle3d.study.job import run_job
+    from speckle3d.io.curves import curves_beside, trust_words
+    from speckle3d.io.load import open_recording
+    from speckle3d.study.posed import open_posed
+    from speckle3d.study.scenes.voxels import write_voxels
 
-    settings = load_settings(config_file).with_choices(drift_curves=drift_curves, region=region)
+    settings = s3.load_config(config_file).with_choices(drift_curves=drift_curves, region=region)
     modes, calibrations = list[str](dict.fromkeys(drift or ())), calibration or ()
     recording = open_recording(sweep_file)
     sweep = recording.sweep
-    notes(recording.remarks)
+    note(*recording.remarks)
     curves_path = curves_file or curves_beside(sweep_file)
-    curves = read_curves(curves_path)
+    curves = s3.load_curves(curves_path)
     if curves_file is None:
         note(trust_words(curves_path, curves, settings.curves.same_probe))
     mount(sweep, calibrations)
     crossing = None
     if crossing_file is not None or crossing_frames is not None:
-        whole = sweep if crossing_file is None else load_sweep(crossing_file)
+        whole = sweep if crossing_file is None else s3.load_sweep(crossing_file)
         crossing = part_of(whole, crossing_frames, "--crossing-frames"), crossing_file or sweep_file
         if not {"crossed", "fused"}.intersection(modes):
             modes.append("crossed")
     sweep = part_of(sweep, frames, "--frames")
-    with progress_bar(f"reconstructing {sweep_file.name}") as progress:
-        result = run_job(
+    with s3.progress_bar(f"reconstructing {sweep_file.name}") as progress:
+        result = s3.run_job(
             sweep, sweep_file, curves, out, modes, reference, settings, progress, calibrations, crossing
         )
     if as_json:
         emit((result.directory / "summary.json").read_text(encoding="utf-8"))
-        notes(result.summary.lines)
+        note(*result.summary.lines)
     else:
         emit(result.table)
     _tell(result)
     note(f"{len(sweep)} frames in {result.seconds:.1f} s; results in {result.directory}")
     if save_curves is not None and result.curves is not None:
-        write_curves(save_curves, result.curves)
+        s3.write_curves(save_curves, result.curves)
         note(f"curves corrected by the crossing sweep, for this probe: {save_curves}")
     elif save_curves is not None:
         note(f"{save_curves}: not written, since the sweeps could not be crossed")
     if volume is not None:
-        _write_volume(result, sweep_file, volume, settings)
+        posed = open_posed(result.directory / "reconstruction.h5", None, sweep_file)
+        note(*posed.notes())
+        with s3.progress_bar(f"compounding {volume.name}"):
+            report = write_voxels(posed, settings.volume, volume)
+        note(report.line)
     for reason in result.summary.left_out.values():
         raise MismatchError(f"{reason}; the other modes' results are in {result.directory}")
 
@@ -189,9 +188,9 @@ def compare(
     from speckle3d.study.paper import paper_study
     from speckle3d.study.schedulers import scheduler_for
 
-    settings, paths = load_settings(config_file), sweeps or []
+    settings, paths = s3.load_config(config_file), sweeps or []
     table = ""
-    with scheduler_for(scheduler, workers) as runner, progress_bar("comparing") as bar:
+    with scheduler_for(scheduler, workers) as runner, s3.progress_bar("comparing") as bar:
         if curves_file is not None and paper:
             study, table = paper_study(
                 out, curves_file, runner, bar, lambda n, total: note(f"{n} of {total} sweeps simulated")
@@ -211,18 +210,7 @@ def compare(
         raise InsufficientDataError(f"{out}: expected a sweep that can be compared, got none")
 
 
-def _write_volume(result: JobResult, sweep_file: Path, out: Path, settings: Config) -> None:
-    """Compound the sweep at the poses just found."""
-    from speckle3d.study.posed import open_posed
-    from speckle3d.study.scenes.voxels import write_voxels
-
-    posed = open_posed(result.directory / "reconstruction.h5", None, sweep_file)
-    notes(posed.notes())
-    with progress_bar(f"compounding {out.name}"):
-        note(write_voxels(posed, settings.volume, out).line)
-
-
-def _tell(result: JobResult) -> None:
+def _tell(result: s3.JobResult) -> None:
     """Note on stderr what limits the results."""
     details = result.summary.details
     for line in details["flagged_frames"]:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+import speckle3d as s3
 from speckle3d.cli.commands import Fields
 from speckle3d.cli.common import (
     Drift,
@@ -23,7 +24,6 @@ from speckle3d.cli.common import (
     Out,
     Paths,
     Port,
-    load_settings,
     note,
     status_line,
 )
@@ -31,13 +31,12 @@ from speckle3d.cli.reconstruction import reconstruct
 from speckle3d.cli.signals import ENDS, handle_signals
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.extras import require_extra
-from speckle3d.core.progress import progress_bar
 
 if TYPE_CHECKING:
     from types import FrameType
 
     from speckle3d.core.grid import ImageGrid
-    from speckle3d.core.sweep import Frames, Sweep
+    from speckle3d.core.sweep import Frames
     from speckle3d.io.igtl.link import Connection, LinkState
     from speckle3d.live.progress import Progress
     from speckle3d.live.session import Session
@@ -134,9 +133,7 @@ def live(
     if view:
         require_extra("app", "live --view", "panel")
         from speckle3d.app.live import watch
-    from speckle3d.io.curves import read_curves
     from speckle3d.io.igtl.link import Connection, Server
-    from speckle3d.io.load import load_sweep
     from speckle3d.live.crossing import CrossingCheck
     from speckle3d.live.session import Session, SessionSettings
     from speckle3d.live.warming import warm_up
@@ -146,7 +143,7 @@ def live(
     match = re.fullmatch(r"\[?(.+?)\]?:([0-9]{1,5})", server)
     if match is None or not 0 < int(match[2]) < 2**16:
         raise InvalidInputError(f"expected HOST:PORT, as localhost:18944, got {server!r}")
-    config, curves = load_settings(config_file).with_choices(region=region), read_curves(curves_file)
+    config, curves = s3.load_config(config_file).with_choices(region=region), s3.load_curves(curves_file)
     recording = out / "sweep.h5"
     if recording.exists():
         raise InvalidInputError(f"{recording}: there already; expected a folder without a recorded sweep")
@@ -156,8 +153,8 @@ def live(
     warm_up(curves, config)
     first = None
     if crossing_file is not None:
-        with progress_bar(f"tracking {crossing_file.name}") as progress:
-            first = CrossingCheck.of(load_sweep(crossing_file), curves, config, progress)
+        with s3.progress_bar(f"tracking {crossing_file.name}") as progress:
+            first = CrossingCheck.of(s3.load_sweep(crossing_file), curves, config, progress)
     with ExitStack() as pages, ExitStack() as links:
         relay = None if serve is None else links.enter_context(Server(serve))
         if relay is not None:
@@ -281,16 +278,15 @@ def play(
     require_extra("live", "play", "pyigtl", "fastcrc")
     from speckle3d.io.igtl.link import Server
     from speckle3d.io.igtl.played import clock_shift_s, played
-    from speckle3d.io.load import load_sweep
 
-    read = load_sweep(images)
+    read = s3.load_sweep(images)
     frames, grid, upright = _frames(read, kind)
     send = partial(played, read, frames, grid, upright, _DEVICES)
     shift_s = clock_shift_s(read)
     next(send(shift_s))  # refused at once if messages cannot hold it
     if shift_s:
         note(f"times in the messages are the sweep's and {shift_s:g} s")
-    with Server(port) as server, progress_bar(f"playing {read.name}") as progress:
+    with Server(port) as server, s3.progress_bar(f"playing {read.name}") as progress:
         note(f"127.0.0.1:{server.port}: {len(read)} frames of {read.name}; waiting for a client")
         while not server.wait_connected(1.0):
             server.receive(0.0)
@@ -307,17 +303,16 @@ def play(
         note(f"{count} frames sent{slow}")
 
 
-def _frames(sweep: Sweep, kind: Kind | None) -> tuple[Frames, ImageGrid, bool]:
+def _frames(sweep: s3.Sweep, kind: Kind | None) -> tuple[Frames, ImageGrid, bool]:
     """Frames to send, their grid, and whether their vectors are columns."""
     from speckle3d.core.sweep import BModeSettings
-    from speckle3d.study.images import grey_images
 
     is_grey = isinstance(sweep.signal, BModeSettings)
     if kind == "rf" and is_grey:
         raise InvalidInputError(f"--as rf: expected echoes, got {sweep.name}, which holds B-mode")
     if is_grey or kind == "bmode":
         keep_levels = is_grey and sweep.frames.dtype == "uint8"
-        images = grey_images(sweep, levels="stored" if keep_levels else "log")
+        images = s3.grey_images(sweep, levels="stored" if keep_levels else "log")
         return images, images.grid, True
     if sweep.grid.fan is not None:
         raise InvalidInputError(f"{sweep.name}: expected parallel vectors to send, got a fan's: --as bmode")

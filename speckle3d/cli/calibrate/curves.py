@@ -2,23 +2,19 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
+import speckle3d as s3
 from speckle3d.cli.common import (
     MaybePath,
     MaybeText,
     Out,
     Result,
     Sweeps,
-    load_settings,
     note,
     part_of,
 )
 from speckle3d.core.errors import naming
-from speckle3d.core.progress import progress_bar
-
-if TYPE_CHECKING:
-    from speckle3d.core.curves import DecorrelationCurves
 
 
 def curves(
@@ -60,31 +56,28 @@ def curves(
     --------
     $ speckle3d calibrate curves steps.h5 turning.h5 -o curves.h5
     """
-    from speckle3d.io.curves import read_curves, write_curves
-    from speckle3d.io.load import load_sweep
     from speckle3d.io.toml import load_toml
-    from speckle3d.phantom_curves import calibrate_curves
     from speckle3d.sheet_curves import ProbeSheet, data_sheet_curves
     from speckle3d.tracked_curves import jitters, tracked_curves
 
-    settings = load_settings(config_file).with_choices(region=region)
+    settings = s3.load_config(config_file).with_choices(region=region)
     if probe is not None:
         with naming(str(probe)):
             sheet = load_toml(ProbeSheet, probe)
-            result = data_sheet_curves(sheet, load_sweep(like) if like else None, settings)
+            result = data_sheet_curves(sheet, s3.load_sweep(like) if like else None, settings)
     else:
-        rough = read_curves(start) if start else None
-        recordings = [part_of(load_sweep(path), frames, "--frames") for path in sweeps or []]
-        with progress_bar("correlating frames") as progress:
+        rough = s3.load_curves(start) if start else None
+        recordings = [part_of(s3.load_sweep(path), frames, "--frames") for path in sweeps or []]
+        with s3.progress_bar("correlating frames") as progress:
             if rough is not None or all(jitters(sweep) for sweep in recordings):
                 result = tracked_curves(recordings, rough, settings, progress)
             else:
-                result = calibrate_curves(recordings, settings, progress)
-    write_curves(out, result)
+                result = s3.calibrate_curves(recordings, settings, progress)
+    s3.write_curves(out, result)
     return _report(result)
 
 
-def _report(curves: DecorrelationCurves) -> Result:
+def _report(curves: s3.DecorrelationCurves) -> Result:
     import numpy as np
 
     first = (curves.correlation < 0.5).argmax(axis=1)

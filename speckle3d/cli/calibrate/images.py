@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+import speckle3d as s3
 from speckle3d.cli.commands import Fields
 from speckle3d.cli.common import (
     MaybeNumber,
@@ -23,7 +24,6 @@ from speckle3d.cli.common import (
     report_of,
 )
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError, naming
-from speckle3d.core.progress import progress_bar
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import RigidTransform
@@ -83,11 +83,10 @@ def images(
     from calibration.images.solver import calibrate_images
     from speckle3d.calibrating.recordings import open_recording
     from speckle3d.calibrating.written import write_with_report
-    from speckle3d.io.calibrations import read_calibration
 
     if poses and len(poses) != 2:
         raise InvalidInputError(f"--poses: expected it twice, for A and for B, got {len(poses)}")
-    calibration = None if start is None else read_calibration(start)
+    calibration = None if start is None else s3.load_calibration(start)
     if time_offset_s is None and calibration is not None:
         time_offset_s = calibration.time_offset_s
     a, b = (
@@ -101,7 +100,7 @@ def images(
     # Half of the limits: a mounting that is off by 20 degrees is good enough for no more.
     poses_a, poses_b = (sweep.world_from_sensor(sweep.covered()) for sweep in (a, b))
     angulation(poses_a, poses_b, begin).require(0.5)
-    with progress_bar("comparing sweeps") as bar:
+    with s3.progress_bar("comparing sweeps") as bar:
         result = calibrate_images(a, b, begin, settings, bar)
     notes, answer = notes_of(result), calibration_from_images(result, (a, b))
     files = write_with_report(answer, (first, second), out, lambda _: figure_of(result, (a, b)), notes)
@@ -176,11 +175,10 @@ def clock(
     from calibration.clock.line import FEWEST_FRAMES, delay_from_lines, line_signal
     from calibration.detection.lines import detect_lines
     from speckle3d.calibrating.recordings import open_recording
-    from speckle3d.io.calibrations import read_calibration, write_calibration
 
     if by == "images" and sensor != "tracker":
         raise InvalidInputError(f"--by images: expected --sensor tracker, which knows places, got {sensor}")
-    start = None if calibration is None else read_calibration(calibration)
+    start = None if calibration is None else s3.load_calibration(calibration)
     if start is not None and start.sensor != sensor:
         raise MismatchError(
             f"{calibration}: expected a calibration of the {sensor}, got one of {start.sensor}"
@@ -196,13 +194,13 @@ def clock(
                 f"{images}: expected --calibration, how the image sits on the sensor, at least roughly; "
                 "got none"
             )
-        with progress_bar("trying delays") as progress, naming(str(images)):
+        with s3.progress_bar("trying delays") as progress, naming(str(images)):
             delay = delay_from_images(recording, recording.mounting, search_s, progress=progress)
         frames = len(recording.frame_time_s)
         words = f"images of the way forward correlate by {delay.followed:.2f} with those of the way back"
     else:
         times, columns = recording.frame_time_s, recording.images.shape[1]
-        with progress_bar(f"finding lines in {images.name}") as progress, naming(str(images)):
+        with s3.progress_bar(f"finding lines in {images.name}") as progress, naming(str(images)):
             lines = detect_lines(recording.images, recording.pixel_mm, None, scan.corners, progress)
             frames = len(lines)
             if frames < FEWEST_FRAMES:
@@ -215,7 +213,7 @@ def clock(
             delay = delay_from_lines(signal, times[lines.frame], readings, around_s, search_s)
         words = f"the sensor explains {100 * delay.followed:.0f} % of the line's motion in {frames} frames"
     if start is not None and out is not None:
-        write_calibration(out, replace(start, time_offset_s=delay.seconds))
+        s3.write_calibration(out, replace(start, time_offset_s=delay.seconds))
         note(f"calibration with this offset in {out}")
     error_s = delay.standard_error_s
     offset = {"time_offset_s": delay.seconds, "standard_error_s": error_s}

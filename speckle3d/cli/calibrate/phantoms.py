@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import speckle3d as s3
 from speckle3d.cli.commands import Fields
 from speckle3d.cli.common import Out, Result, note, report_of
 from speckle3d.core.errors import InvalidInputError, naming
-from speckle3d.core.progress import progress_bar
 
 if TYPE_CHECKING:
     from speckle3d.calibrating.settings import ScanSettings
@@ -91,13 +91,13 @@ def _calibrate(images: Path, settings: ScanSettings, out: Path) -> Result:
     if settings.validation is None and getattr(settings, "validation_points", None) is not None:
         raise InvalidInputError("--validation-points: expected the recording in --validation, got none")
     recording = open_phantom(images, settings)
-    with progress_bar(f"looking into {images.name}") as progress, naming(str(images)):
+    with s3.progress_bar(f"looking into {images.name}") as progress, naming(str(images)):
         detections = detect_phantom(recording, settings, progress)
     with naming(str(images)):
         outcome = solve_phantom(recording, detections, settings)
     notes = remarks(outcome)
     if settings.validation is not None:
-        with progress_bar(f"looking into {settings.validation.name}") as progress:
+        with s3.progress_bar(f"looking into {settings.validation.name}") as progress:
             notes += validation_notes(outcome, settings, progress)
     files = write_outcome(outcome, settings, images, out, notes)
     return report_of(files, notes, outcome.beam)
@@ -121,9 +121,8 @@ def repeatability(calibrations: list[Path], size_px: tuple[int, int] | None = No
     import numpy as np
 
     from calibration.repeatability import repeatability as repeated
-    from speckle3d.io.calibrations import read_calibration
 
-    scatter = repeated([read_calibration(path) for path in calibrations], size_px)
+    scatter = repeated([s3.load_calibration(path) for path in calibrations], size_px)
     angles_deg, shifts_mm = np.rad2deg(scatter.roll_yaw_tilt_sd_rad), scatter.centre_shift_mm
     lines = [
         f"standard deviation over {scatter.trials} calibrations",

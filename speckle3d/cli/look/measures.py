@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from speckle3d.cli.common import MaybeNumber, MaybePath, MaybeText, Out, Result, note, notes
+import speckle3d as s3
+from speckle3d.cli.common import MaybeNumber, MaybePath, MaybeText, Out, Result, note
 from speckle3d.cli.outputs import require_own_place
 from speckle3d.core.errors import naming
 
@@ -53,17 +54,15 @@ def measure(
     $ speckle3d measure out --mode image --point 3,10,1 --point 3,12,9
     """
     from speckle3d.io.points import PICTURE, WORLD, parse_places, read_places
-    from speckle3d.io.reconstructions import read_reconstruction
     from speckle3d.scoring.modes import default_mode
     from speckle3d.scoring.trajectories import poses_of
     from speckle3d.study.pose_errors import PICKING, caution, how_measured
-    from speckle3d.study.pose_errors import measure as measure_points
     from speckle3d.study.posed import pose_mark, require_made_at
     from speckle3d.study.reslices.cuts import read_plane
 
     columns = WORLD if on is None else PICTURE
     places = read_places(points, columns) if points is not None else parse_places(point or [], columns)
-    reconstruction, why = read_reconstruction(reconstruction_file, with_pairs=False), ""
+    reconstruction, why = s3.load_reconstruction(reconstruction_file, with_pairs=False), ""
     if on is not None:
         plane = read_plane(on, mode)
         require_made_at(plane.mark, pose_mark(poses_of(reconstruction, plane.mode)), str(on))
@@ -71,8 +70,8 @@ def measure(
     elif mode is None:
         mode, why = default_mode(reconstruction)
     pick_mm = PICKING * reconstruction.grid.vector_pitch_mm if pick_mm is None else pick_mm
-    measurements = measure_points(reconstruction, places, mode, pick_mm)
-    notes([why, caution(reconstruction, mode)])
+    measurements = s3.measure(reconstruction, places, mode, pick_mm)
+    note(why, caution(reconstruction, mode))
     numbers = {"mode": mode, "pick_mm": pick_mm, "measurements": [_record(m) for m in measurements]}
     lines = [*(measurement.line for measurement in measurements), how_measured(mode, pick_mm)]
     return numbers, "\n".join(lines)
@@ -146,20 +145,14 @@ def surface(
     $ speckle3d surface volume.nrrd -o cyst.stl --level 60 --below --largest
     """
     from speckle3d.core.volume import EMPTY
-    from speckle3d.imaging.measures.surface import (
-        largest_part,
-        smooth_surface,
-        surface_of,
-        surfaces_of_labels,
-    )
-    from speckle3d.io.shapes import write_surface
-    from speckle3d.io.voxels.volumes import read_states, read_volume
+    from speckle3d.imaging.measures.surface import largest_part, smooth_surface, surfaces_of_labels
+    from speckle3d.io.voxels.volumes import read_states
 
-    volume = read_volume(volume_file)
+    volume = s3.load_volume(volume_file)
     errors = _errors(reconstruction, mode, volume, volume_file)
     mask = None if state is None else read_states(state, volume) != EMPTY
     if level is not None:
-        surfaces = {out: surface_of(volume, level, "below" if below else "above", mask)}
+        surfaces = {out: s3.surface_of(volume, level, "below" if below else "above", mask)}
     else:
         by_label = surfaces_of_labels(volume, mask).items()
         surfaces = {out.with_stem(f"{out.stem}-{label}"): surface for label, surface in by_label}
@@ -171,7 +164,7 @@ def surface(
     for place, mesh in surfaces.items():
         mesh = largest_part(mesh) if largest else mesh
         mesh = smooth_surface(mesh, smooth) if smooth else mesh
-        write_surface(place, mesh)
+        s3.write_surface(place, mesh)
         sizes.append(_sizes(place, mesh, *(errors or ())))
     return sizes, "\n".join(map(_line, sizes))
 
@@ -180,7 +173,6 @@ def _errors(
     path: Path | None, mode: str | None, volume: Volume, where: Path
 ) -> tuple[PoseErrors, ImageGrid] | None:
     """Errors of the poses that a volume was made at, and the grid of the images."""
-    from speckle3d.io.reconstructions import read_reconstruction
     from speckle3d.scoring.trajectories import poses_of
     from speckle3d.study.pose_errors import caution, errors_of
     from speckle3d.study.posed import MARK, pose_mark, require_made_at
@@ -188,11 +180,11 @@ def _errors(
     volume_mode = mode or volume.fields.get("poses", "image")
     if path is None:
         return None
-    reconstruction = read_reconstruction(path, with_pairs=False)
+    reconstruction = s3.load_reconstruction(path, with_pairs=False)
     with naming(f"{where}: made at the poses of {volume_mode}"):
         poses = poses_of(reconstruction, volume_mode)
     require_made_at(volume.fields.get(MARK, ""), pose_mark(poses), str(where))
-    notes([caution(reconstruction, volume_mode)])
+    note(caution(reconstruction, volume_mode))
     return errors_of(reconstruction, volume_mode), reconstruction.grid
 
 

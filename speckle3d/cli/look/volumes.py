@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import BaseModel
 
+import speckle3d as s3
 from speckle3d.cli.commands import Fields
 from speckle3d.cli.common import (
     MaybeNumber,
@@ -17,18 +18,14 @@ from speckle3d.cli.common import (
     Result,
     WritablePath,
     clip_of,
-    load_settings,
     note,
-    notes,
 )
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.core.progress import progress_bar
 
 if TYPE_CHECKING:
     from speckle3d.core.arrays import FloatArray
     from speckle3d.core.grid import Region
     from speckle3d.imaging.voxels.settings import CompoundingSettings
-    from speckle3d.io.import_settings import ImportSettings
     from speckle3d.study.posed import PosedSweep, SweepModes
 
 _IMPORTED = (
@@ -60,14 +57,14 @@ def compounding_settings(config_file: Path | None, options: CompoundingSettings)
     """Group `volume` of a configuration, with the options that were given in its place."""
     from speckle3d.io.toml import validated
 
-    base, values = load_settings(config_file).volume, options.model_dump(exclude_unset=True)
+    base, values = s3.load_config(config_file).volume, options.model_dump(exclude_unset=True)
     return validated(base.model_dump() | values, "volume", type(base))
 
 
 def open_sweep_at(
     modes: Sequence[str | None],
     source: Path,
-    settings: ImportSettings,
+    settings: s3.ImportSettings,
     choice: SweepChoice,
 ) -> tuple[list[PosedSweep], Region | None]:
     """Open a sweep at the poses of each mode (None: the best), and note on stderr what it says of itself.
@@ -84,7 +81,7 @@ def open_sweep_at(
     options = choice.sweep_file, settings, choice.calibration or ()
     sweeps = [open_posed(source, mode, *options) for mode in modes]
     first = sweeps[0]
-    notes(first.notes())
+    note(*first.notes())
     clip = clip_of(settings_for(source, settings).plus_config, first.sweep.grid, first.skew_rad)
     region = choice.region or clip
     return sweeps, None if region is None else Region(region)
@@ -155,10 +152,10 @@ def volume(
 
     compounding = compounding_settings(config_file, settings)
     (posed,), part = open_sweep_at([mode], input_file, recording, choice)
-    with progress_bar(f"compounding {out.name}"):
+    with s3.progress_bar(f"compounding {out.name}"):
         report = write_voxels(posed, compounding, out, grid, part, state, deviation)
     if deviation is not None and posed.reconstruction is not None:
-        notes([caution(posed.reconstruction, posed.mode)])
+        note(caution(posed.reconstruction, posed.mode))
     note(report.line)
     return report.summary(), ""
 
@@ -199,7 +196,7 @@ def scene(
     $ speckle3d scene out/reconstruction.h5 -o scene --images
     """
     from speckle3d.study.results import require_own
-    from speckle3d.study.scenes.scene import FILES, write_scene
+    from speckle3d.study.scenes.scene import FILES
 
     require_own(out, FILES)
     if not {(out / name).resolve() for name in FILES.names}.isdisjoint(
@@ -209,8 +206,8 @@ def scene(
     compounding = compounding_settings(config_file, settings)
     modes = list(dict.fromkeys(mode)) if mode else [None]
     sweeps, part = open_sweep_at(modes, input_file, recording, choice)
-    with progress_bar(f"writing {out.name}") as progress:
-        reports = write_scene(out, sweeps, compounding, part, images, deviation, progress)
+    with s3.progress_bar(f"writing {out.name}") as progress:
+        reports = s3.write_scene(out, sweeps, compounding, part, images, deviation, progress)
     for report in reports:
         note(report.line)
 
@@ -274,7 +271,6 @@ def reslice(
     """
     from speckle3d.imaging.cuts.oblique import spanned_plane
     from speckle3d.io.points import parse_places
-    from speckle3d.io.voxels.volume_writer import write_volume
     from speckle3d.study.posed import at_modes
     from speckle3d.study.reslices.cuts import cut_as_volume, cut_at_modes
     from speckle3d.study.reslices.places import along_curve, along_sweep, in_frame, in_world
@@ -299,12 +295,12 @@ def reslice(
         place = in_frame(modes, grid, frame, angle_deg, lateral_mm, pixel_mm)
     else:
         place = along_sweep(modes, grid, lateral_mm, depth_mm, pixel_mm)
-    with progress_bar(f"reslicing {out.name}"):
+    with s3.progress_bar(f"reslicing {out.name}"):
         picture = cut_at_modes(modes, place, source, dynamic_range_db, part)
     if out.suffix.lower() == ".png":
         save_reslices(picture, out)
     else:
-        write_volume(out, cut_as_volume(picture))
+        s3.write_volume(out, cut_as_volume(picture))
 
 
 def _curve(path: Path, picture: Path | None, modes: SweepModes) -> FloatArray:

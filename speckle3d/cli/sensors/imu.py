@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+import speckle3d as s3
+import xsens
 from speckle3d.cli.common import (
     MaybeNumber,
     MaybePath,
@@ -17,7 +19,6 @@ from speckle3d.cli.common import (
     Result,
     WritablePath,
     note,
-    notes,
     rows_of,
     status_line,
 )
@@ -26,39 +27,34 @@ from speckle3d.core.errors import InvalidInputError, naming
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
-    from speckle3d.core.streams import TimedRotations
-    from xsens.fusion.orient import Orientation
-    from xsens.logs.samples import ImuLog
 
 World = Annotated[Literal["ENU", "NWU", "NED"] | None, typer.Option(case_sensitive=False)]
 Method = Literal["smoother", "filter", "vqf", "vqf-online", "sensor"]
 
 
-def read(path: Path, rate_hz: float | None = None, world: str | None = None) -> ImuLog:
+def read(path: Path, rate_hz: float | None = None, world: str | None = None) -> xsens.ImuLog:
     """Read a log of any kind, or what a recording holds of its orientation sensor."""
     from speckle3d.sensor_logs import held_log
-    from xsens.logs.parts import Hints
-    from xsens.logs.read import read_log
 
     log = held_log(path)
     if log is None:
-        return read_log(path, Hints(rate_hz=rate_hz, world=world))
+        return xsens.read_log(path, xsens.Hints(rate_hz=rate_hz, world=world))
     if rate_hz is not None or world is not None:
         flag = "--world" if rate_hz is None else "--rate-hz"
         raise InvalidInputError(f"{flag}: expected a log with it, got {path.name}, which says it itself")
     return log
 
 
-def note_gaps(log: ImuLog) -> None:
+def note_gaps(log: xsens.ImuLog) -> None:
     """Report on stderr what a log lacks, and what was assumed in its place."""
     from xsens.logs.contradictions import contradictions
 
-    notes([*log.notes, contradictions(log).get("gravity"), log.losses and f"{log.losses}; nothing filled in"])
+    note(*log.notes, contradictions(log).get("gravity"), log.losses and f"{log.losses}; nothing filled in")
 
 
 def orientation_of(
-    log: ImuLog, method: Method, magnetometer: bool
-) -> tuple[TimedRotations, Orientation | None]:
+    log: xsens.ImuLog, method: Method, magnetometer: bool
+) -> tuple[xsens.TimedRotations, xsens.Orientation | None]:
     """Orientation of a log, and how it was estimated; None for the sensor's own."""
     from xsens.logs.contradictions import contradictions
 
@@ -73,11 +69,9 @@ def orientation_of(
                 f"{against['own orientation']} The accelerometer agrees with the gyroscope"
             )
         return log.rotations(), None
-    from xsens.fusion.orient import orient as estimate
-    from xsens.fusion.settings import FusionSettings
 
-    orientation = estimate(log, FusionSettings(use_magnetometer=magnetometer), method)
-    notes(orientation.notes)
+    orientation = xsens.orient(log, xsens.FusionSettings(use_magnetometer=magnetometer), method)
+    note(*orientation.notes)
     return orientation.rotations, orientation
 
 
@@ -133,10 +127,8 @@ def convert(
     --------
     $ speckle3d imu convert log.mtb log.csv
     """
-    from xsens.logs.textlogs import write_csv
-
     log = read(log_file, rate_hz, world)
-    write_csv(out, log)
+    xsens.write_csv(out, log)
     note_gaps(log)
 
 
@@ -180,14 +172,11 @@ def orient(
     """
     import numpy as np
 
-    from speckle3d.io.calibrations import read_calibration
-    from speckle3d.io.load import load_sweep
     from speckle3d.sensor_logs import attach_log, ridden_along, with_orientation
-    from xsens.logs.textlogs import write_csv
 
     if into is None and out is None:
         raise InvalidInputError("expected --into SWEEP.h5, -o CSV or both, got neither")
-    if into is not None and not replace_stream and load_sweep(into).orientation is not None:
+    if into is not None and not replace_stream and s3.load_sweep(into).orientation is not None:
         raise InvalidInputError(
             f"{into}: expected no orientation sensor's stream, got one: --replace replaces it"
         )
@@ -199,14 +188,14 @@ def orient(
         # As options say, else the calibration, else the sweep that the log is from.
         offset_s, mounting = (sensor.time_offset_s, sensor.sensor_from_image) if sensor else (0.0, None)
         if calibration is not None:
-            solution = read_calibration(calibration)
+            solution = s3.load_calibration(calibration)
             mounting = solution.rotation
             offset_s = offset_s if solution.time_offset_s is None else solution.time_offset_s
         offset_s = offset_s if time_offset_s is None else time_offset_s
         coverage = attach_log(into, log, rotations, mounting, offset_s, replace_stream)
         note(f"orientation of {len(rotations)} samples in {into}{coverage}")
     if out is not None:
-        write_csv(out, with_orientation(log, rotations))
+        xsens.write_csv(out, with_orientation(log, rotations))
     note_gaps(log)
     rows: list[tuple[str, float, str]] = [("samples", len(rotations), ""), ("duration", log.duration_s, "s")]
     if orientation is not None:
@@ -271,54 +260,52 @@ def accuracy(
     """
     from scipy.spatial.transform import Rotation
 
-    from speckle3d.io.calibrations import read_calibration
     from speckle3d.study.figures import save_figure
-    from xsens.accuracy.angles import AccuracyTable, pair_errors
-    from xsens.accuracy.figures import figure_turns
-    from xsens.accuracy.mechanism import read_mechanism_csv, readings_at
 
     log = read(log_file, rate_hz, world)
     note_gaps(log)
     mountings = Rotation.identity(1)
     if calibration:
-        mountings = Rotation.concatenate([read_calibration(path).rotation for path in calibration])
+        mountings = Rotation.concatenate([s3.load_calibration(path).rotation for path in calibration])
     else:
         note("no --calibration: the sensor's axes are taken for the image's")
-    mechanism = None if reference is None else read_mechanism_csv(reference, turns)
+    mechanism = None if reference is None else xsens.read_mechanism_csv(reference, turns)
     with naming(str(log_file)):
         rotations, _ = orientation_of(log, method, magnetometer)
         if mechanism is not None:
-            readings, truth = readings_at(rotations, mechanism), mechanism.base_from_image
+            readings, truth = xsens.readings_at(rotations, mechanism), mechanism.base_from_image
         elif optical is not None:
             readings, truth = _beside_tracker(rotations, optical, time_offset_s, fit_mounting, mountings)
-        errors = pair_errors(readings, truth, mountings)
-    table = AccuracyTable.of({log_file.stem: errors})
+        errors = xsens.pair_errors(readings, truth, mountings)
+    table = xsens.AccuracyTable.of({log_file.stem: errors})
     if figure is not None:
-        save_figure(figure_turns({log_file.stem: errors}, log_file.name), figure)
+        save_figure(xsens.figure_turns({log_file.stem: errors}, log_file.name), figure)
     how = f"{len(errors)} errors: pairs of {errors.frames} orientations, {len(mountings)} calibrations"
     return rows_of(table.values())[0], f"{table.text()}\n{how}"
 
 
 def _beside_tracker(
-    rotations: TimedRotations, optical: Path, time_offset_s: float, fit_mounting: bool, mountings: Rotation
+    rotations: xsens.TimedRotations,
+    optical: Path,
+    time_offset_s: float,
+    fit_mounting: bool,
+    mountings: Rotation,
 ) -> tuple[Rotation, Rotation]:
     """Readings of the sensor, and the image's orientation by the tracker at the same moments."""
-    from speckle3d.core.streams import TimedRotations
     from speckle3d.io.tum import is_tum, read_tum
-    from xsens.accuracy.angles import common_readings, mounting_from_motion
 
     if is_tum(optical):
         poses = read_tum(optical)
-        target_stream = TimedRotations(poses.time_s, poses.world_from_sensor.rotation)
+        target_stream = xsens.TimedRotations(poses.time_s, poses.world_from_sensor.rotation)
     else:
         log = read(optical)
         note_gaps(log)
         target_stream = log.rotations()
-    readings, target = common_readings(rotations, target_stream, time_offset_s)
+    readings, target = xsens.common_readings(rotations, target_stream, time_offset_s)
     if not fit_mounting:
         return readings, target
     note("the target's mounting is found from the motion: constant errors of calibration do not show")
-    return readings, target * mounting_from_motion(readings * mountings.mean(), target)
+    return readings, target * xsens.mounting_from_motion(readings * mountings.mean(), target)
 
 
 def record(
@@ -356,14 +343,11 @@ def record(
     --------
     $ speckle3d imu record /dev/ttyUSB0 log.mtb
     """
-    from xsens.live.device import DeviceSettings
-    from xsens.live.recording import record as record_port
-
-    state, settings = None, DeviceSettings(content, rate_hz, baud)
+    state, settings = None, xsens.DeviceSettings(content, rate_hz, baud)
     try:
         with status_line() as show:
             show("connecting")
-            for state in record_port(port, out, settings, append, duration_s=duration_s):
+            for state in xsens.record(port, out, settings, append, duration_s=duration_s):
                 show(state.line())
     except KeyboardInterrupt:
         note("stopped")
