@@ -220,20 +220,13 @@ def _check(flag: str, option: inspect.Parameter, value: Any, flags: Mapping[str,
         if rule[1] == "Not with" and partners:
             raise InvalidInputError(f"{flag}: expected no {partners[0]} beside it, got both")
     for item in value if isinstance(value, list | tuple) else [value]:
-        is_allowed = item == math.inf and re.search(r"\binf\b", info.help or "")
-        if isinstance(item, float) and not math.isfinite(item) and not is_allowed:
+        if isinstance(item, float) and not math.isfinite(item):
             raise InvalidInputError(f"{flag}: expected a finite number, got {item}")
         if isinstance(item, Path) and not item.exists() and not info.writable:
             where = f"{flag}: " if isinstance(info, typer.models.OptionInfo) else ""
-            is_server = re.fullmatch(r"[^/]+:[0-9]+", str(item))
-            live = f"; a server's sweep: speckle3d live {item} --view" if is_server else ""
-            raise FileError(f"{where}{item}: expected a file, got none{live}")
+            raise FileError(f"{where}{item}: expected a file, got none")
     if isinstance(value, Path) and not info.writable and (value / "reconstruction.h5").is_file():
         return value / "reconstruction.h5"
-    if option.name == "reconstruction_file" and value.is_dir():
-        raise FileError(
-            f"{value}: expected a results folder, which `speckle3d reconstruct` makes, got another"
-        )
     return value
 
 

@@ -80,7 +80,7 @@ def test_every_setting_is_printed_with_its_default(run):
         (("compare", "{sweep}", "-o", "{sweep}"), "expected a folder or a new name, got the file"),
         (("reslice", "{sweep}", "-o", "c.png", "--state=s.nrrd"), "--state=s.nrrd was removed: "),
         (("calibrate", "images", "a", "b", "-o", "c.h5", "--scales"), "--pixel-mm takes them"),
-        (("view", "{sweep}", "--pixel-mm", "1", "1"), "--column-pitch-mm and"),
+        (("view", "{sweep}", "--pixel-mm", "1", "1"), "--pixel-mm: expected --calibrate"),
     ],
 )
 def test_what_is_refused_is_refused_before_work(

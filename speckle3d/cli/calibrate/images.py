@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from math import nan
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -24,10 +24,6 @@ from speckle3d.cli.common import (
     report_of,
 )
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError, naming
-
-if TYPE_CHECKING:
-    from scipy.spatial.transform import RigidTransform
-
 
 Triple = tuple[float, float, float]
 
@@ -77,12 +73,14 @@ def images(
     $ speckle3d calibrate images one.h5 across.h5 -o tracker.h5 --start rough.h5
     """
     import numpy as np
+    from scipy.spatial.transform import RigidTransform
 
     from calibration.images.angulation import angulation
     from calibration.images.report import calibration_from_images, figure_of, notes_of
     from calibration.images.solver import calibrate_images
     from speckle3d.calibrating.recordings import open_recording
     from speckle3d.calibrating.written import write_with_report
+    from speckle3d.core.geometry import rotation_from_fixed_angles
 
     if poses and len(poses) != 2:
         raise InvalidInputError(f"--poses: expected it twice, for A and for B, got {len(poses)}")
@@ -96,38 +94,23 @@ def images(
     if time_offset_s is not None:
         a, b = (replace(sweep, time_offset_s=time_offset_s) for sweep in (a, b))
     mounting = a.mounting if calibration is None else calibration.sensor_from_image
-    begin = _start(start_mm, start_deg, mounting, first)
-    # Half of the limits: a mounting that is off by 20 degrees is good enough for no more.
-    poses_a, poses_b = (sweep.world_from_sensor(sweep.covered()) for sweep in (a, b))
-    angulation(poses_a, poses_b, begin).require(0.5)
-    with s3.progress_bar("comparing sweeps") as bar:
-        result = calibrate_images(a, b, begin, settings, bar)
-    notes, answer = notes_of(result), calibration_from_images(result, (a, b))
-    files = write_with_report(answer, (first, second), out, lambda _: figure_of(result, (a, b)), notes)
-    return report_of(files, notes)
-
-
-def _start(
-    start_mm: Triple | None,
-    start_deg: Triple | None,
-    mounting: RigidTransform | None,
-    first: Path,
-) -> RigidTransform:
-    """Mounting to start from: by ruler and eye, or that of a calibration or of the first sweep."""
-    import numpy as np
-    from scipy.spatial.transform import RigidTransform
-
-    from speckle3d.core.geometry import rotation_from_fixed_angles
-
     if start_mm is not None and start_deg is not None:
         roll, yaw, tilt = np.deg2rad(start_deg)
-        return RigidTransform.from_components(start_mm, rotation_from_fixed_angles(roll, yaw, tilt))
+        turn = rotation_from_fixed_angles(roll, yaw, tilt)
+        mounting = RigidTransform.from_components(start_mm, turn)
     if mounting is None:
         raise InsufficientDataError(
             f"{first}: expected a start, within 20 mm and 20 degrees: --start CAL.h5, or --start-mm X Y Z "
             "with --start-deg ROLL YAW TILT; got none"
         )
-    return mounting
+    # Half of the limits: a mounting that is off by 20 degrees is good enough for no more.
+    poses_a, poses_b = (sweep.world_from_sensor(sweep.covered()) for sweep in (a, b))
+    angulation(poses_a, poses_b, mounting).require(0.5)
+    with s3.progress_bar("comparing sweeps") as bar:
+        result = calibrate_images(a, b, mounting, settings, bar)
+    notes, answer = notes_of(result), calibration_from_images(result, (a, b))
+    files = write_with_report(answer, (first, second), out, lambda _: figure_of(result, (a, b)), notes)
+    return report_of(files, notes)
 
 
 _SCAN = ("poses", "transform", "pixel_mm", "region")

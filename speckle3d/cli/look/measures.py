@@ -15,7 +15,6 @@ from speckle3d.core.errors import naming
 if TYPE_CHECKING:
     from speckle3d.core.grid import ImageGrid
     from speckle3d.core.poses import PoseErrors
-    from speckle3d.core.surface import Surface
     from speckle3d.core.volume import Volume
     from speckle3d.imaging.measures.measure import Measurement
 
@@ -144,8 +143,15 @@ def surface(
     --------
     $ speckle3d surface volume.nrrd -o cyst.stl --level 60 --below --largest
     """
+    import numpy as np
+
     from speckle3d.core.volume import EMPTY
-    from speckle3d.imaging.measures.surface import largest_part, smooth_surface, surfaces_of_labels
+    from speckle3d.imaging.measures.surface import (
+        largest_part,
+        measures_of,
+        smooth_surface,
+        surfaces_of_labels,
+    )
     from speckle3d.io.voxels.volumes import read_states
 
     volume = s3.load_volume(volume_file)
@@ -165,39 +171,28 @@ def surface(
         mesh = largest_part(mesh) if largest else mesh
         mesh = smooth_surface(mesh, smooth) if smooth else mesh
         s3.write_surface(place, mesh)
-        sizes.append(_sizes(place, mesh, *(errors or ())))
+        about = {"parts": int(mesh.parts().max()) + 1, "size_mm": np.ptp(mesh.vertices_mm, axis=0)}
+        sizes.append({"file": str(place), **vars(measures_of(mesh, *errors)), **about})
     return sizes, "\n".join(map(_line, sizes))
 
 
 def _errors(
     path: Path | None, mode: str | None, volume: Volume, where: Path
-) -> tuple[PoseErrors, ImageGrid] | None:
-    """Errors of the poses that a volume was made at, and the grid of the images."""
+) -> tuple[PoseErrors, ImageGrid] | tuple[()]:
+    """Errors of the poses that a volume was made at, and the grid of the images; empty without a path."""
     from speckle3d.scoring.trajectories import poses_of
     from speckle3d.study.pose_errors import caution, errors_of
     from speckle3d.study.posed import MARK, pose_mark, require_made_at
 
-    volume_mode = mode or volume.fields.get("poses", "image")
     if path is None:
-        return None
+        return ()
+    volume_mode = mode or volume.fields.get("poses", "image")
     reconstruction = s3.load_reconstruction(path, with_pairs=False)
     with naming(f"{where}: made at the poses of {volume_mode}"):
         poses = poses_of(reconstruction, volume_mode)
     require_made_at(volume.fields.get(MARK, ""), pose_mark(poses), str(where))
     note(caution(reconstruction, volume_mode))
     return errors_of(reconstruction, volume_mode), reconstruction.grid
-
-
-def _sizes(place: Path, surface: Surface, *errors: Any) -> dict[str, Any]:
-    """Measures of one surface, by name."""
-    from dataclasses import asdict
-
-    import numpy as np
-
-    from speckle3d.imaging.measures.surface import measures_of
-
-    about = {"parts": int(surface.parts().max()) + 1, "size_mm": np.ptp(surface.vertices_mm, axis=0)}
-    return {"file": str(place), **asdict(measures_of(surface, *errors)), **about}
 
 
 def _line(sizes: dict[str, Any]) -> str:
@@ -209,5 +204,6 @@ def _line(sizes: dict[str, Any]) -> str:
             error = "" if sigma is None else f" +- {1.96 * sigma:.1f} (95 %)"
             words.append(f"{name} {value:.1f}{error} {unit}")
     if sizes["open_mm"] > 0:
+        words.append("the volume is of its closed parts" if sizes["volume_mm3"] else "no part is closed")
         words.append(f"open along {sizes['open_mm']:.1f} mm where the sweep or the grid ends")
     return f"{sizes['file']}: {', '.join(words)}"

@@ -9,7 +9,6 @@ from typing import Annotated, Any, Literal
 
 from speckle3d.cli.commands import Fields
 from speckle3d.cli.common import MaybePath, Port, WritablePath, note
-from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.extras import require_extra
 
 _SETTINGS = "speckle3d.calibrating.settings"
@@ -65,7 +64,7 @@ def view(
     transform
         With --calibrate: poses to use, by their name in an image sequence, as ToolToTracker (ProbeToTracker).
     pixel_mm
-        Distance between columns and rows of a phantom's images, mm, if FILE does not say.
+        With --calibrate: distance between columns and rows, mm, if FILE does not say.
     column_pitch_mm, row_spacing_mm, frame_rate_hz, dynamic_range_db, plus_config
         Of a recording that does not say it, as in `speckle3d convert`. Not with --calibrate.
 
@@ -83,10 +82,6 @@ def view(
 
     with ExitStack() as running:
         if calibrate is None:
-            if scan.pixel_mm is not None:
-                raise InvalidInputError(
-                    "--pixel-mm: is of --calibrate; a recording takes --column-pitch-mm and --row-spacing-mm"
-                )
             pages = running.enter_context(
                 open_pages(file, record, reconstruction=reconstruction, sweep=sweep_file, settings=recording)
             )

@@ -199,10 +199,6 @@ def scene(
     from speckle3d.study.scenes.scene import FILES
 
     require_own(out, FILES)
-    if not {(out / name).resolve() for name in FILES.names}.isdisjoint(
-        path.resolve() for path in (input_file, choice.sweep_file) if path
-    ):
-        raise InvalidInputError(f"{out}: expected a folder without the input, which would be replaced")
     compounding = compounding_settings(config_file, settings)
     modes = list(dict.fromkeys(mode)) if mode else [None]
     sweeps, part = open_sweep_at(modes, input_file, recording, choice)
@@ -217,7 +213,6 @@ def reslice(
     out: Annotated[Out, "picture volume"],
     *,
     mode: list[str] | None = None,
-    difference_to: MaybeText = None,
     lateral_mm: MaybeNumber = None,
     depth_mm: MaybeNumber = None,
     frame: int | None = None,
@@ -255,8 +250,6 @@ def reslice(
 
     Other Parameters
     ----------------
-    difference_to
-        What modes are compared with (truth or tracker if known, else the first).
     angle_deg
         With --frame: turn out of it about its depth line; 90 is along the sweep.
     pixel_mm
@@ -284,7 +277,7 @@ def reslice(
         plane = spanned_plane(corners[0], *(corners[1:] - corners[0]))
     first_mode = mode[:1] if mode else [None]
     (first,), part = open_sweep_at(first_mode, input_file, recording, choice)
-    modes = at_modes(first, mode or (), difference_to)
+    modes = at_modes(first, mode or ())
     source, _ = modes.posed.source(None, dynamic_range_db)
     grid = source.grid
     if curve is not None:

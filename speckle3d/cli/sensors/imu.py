@@ -314,7 +314,7 @@ def record(
     content: str = "orientation",
     rate_hz: MaybeNumber = None,
     baud: int | None = None,
-    duration_s: float = math.inf,
+    duration_s: MaybeNumber = None,
     append: bool = False,
 ) -> None:
     """Record a sensor on a serial port; every byte is in the file as soon as it has come.
@@ -330,7 +330,7 @@ def record(
     rate_hz
         Samples per second; by default as set.
     duration_s
-        Stop after so long; inf: at Ctrl-C.
+        Stop after so long; by default at Ctrl-C.
 
     Other Parameters
     ----------------
@@ -347,7 +347,7 @@ def record(
     try:
         with status_line() as show:
             show("connecting")
-            for state in xsens.record(port, out, settings, append, duration_s=duration_s):
+            for state in xsens.record(port, out, settings, append, duration_s=duration_s or math.inf):
                 show(state.line())
     except KeyboardInterrupt:
         note("stopped")
