@@ -21,7 +21,7 @@ import speckle3d.motion
 from speckle3d.core.errors import Speckle3DError
 from speckle3d.io.curves import read_curves
 from speckle3d.io.load import load_sweep
-from speckle3d.tracking import track
+from speckle3d.pipeline import track
 
 NOT_OF_THE_PATH = ("diffraction", "lens", "phantom")
 """Modules of curves, which change no estimate."""
