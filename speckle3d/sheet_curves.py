@@ -9,8 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from speckle3d.config import Config
 from speckle3d.core.arrays import FloatArray
-from speckle3d.core.curves import CurveKey, DecorrelationCurves, NominalProbe, TiltResponse, curve_widths
-from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.curves import DecorrelationCurves, NominalProbe, TiltResponse, curve_widths
 from speckle3d.core.sweep import RFSettings, Sweep
 from speckle3d.matching.intensity import band_weights, two_way_wavenumber
 from speckle3d.matching.matcher import FrameMatcher
@@ -74,11 +73,7 @@ class ProbeSheet(BaseModel):
         description="Of the echo's frequency, either way, as a share; for want of a sweep.",
     )
     attenuation_tolerance: float = Field(0.2, ge=0, le=2, description="Either way, dB/cm/MHz.")
-    depth_mm: float = Field(40.0, gt=5, le=300, description="Depth of the images.")
-    sampling_rate_mhz: float | None = Field(None, gt=0, le=1000, description="Of the RF.")
-    vector_pitch_mm: float | None = Field(None, gt=0, le=5, description="Distance of vectors.")
     speed_of_sound_m_s: float = Field(SPEED_M_S, gt=300, le=4000)
-    probe: str = Field("", description="Name of probe and preset as recordings have it.")
 
     @field_validator("band_mhz")
     @classmethod
@@ -101,41 +96,26 @@ class ProbeSheet(BaseModel):
         )
 
 
-def data_sheet_curves(
-    sheet: ProbeSheet, like: Sweep | None = None, config: Config | None = None
-) -> DecorrelationCurves:
+def data_sheet_curves(sheet: ProbeSheet, like: Sweep, config: Config | None = None) -> DecorrelationCurves:
     """Calculate decorrelation curves of a probe by diffraction.
 
     Parameters
     ----------
     sheet : ProbeSheet
         What the data sheet says.
-    like : Sweep, optional
+    like : Sweep
         A sweep of the probe, whose signal, depths and patches the curves are made for. Of RF its spectrum by
         depth takes the place of the sheet's frequencies and attenuation, and its speckle tells the patches'
-        cells. Without a sweep, the sheet must give the sampling rate and the vectors' pitch.
+        cells.
     config : Config, optional
-
-    Raises
-    ------
-    InvalidInputError
-        If the sheet lacks what no sweep tells.
     """
     settings, probe, speed = config or Config(), sheet.nominal, sheet.speed_of_sound_m_s
-    spectra, area, band = None, np.full(1, np.nan), (probe.low_hz, probe.high_hz)
-    if like is None:
-        key, patches = _key(sheet, settings), settings.patches
-        first = patches.top_mm + patches.height_mm / 2.0
-        rows = np.arange(first, sheet.depth_mm - patches.height_mm / 2.0 + 1e-9, 1.5)
-        if rows.size < 2:
-            raise InvalidInputError(f"depth_mm: expected room for two patches, got {sheet.depth_mm:g} mm")
-    else:
-        matcher = FrameMatcher(like, settings)
-        key, rows, texture = matcher.key, matcher.patches.row_depth_mm, measured_texture(like, matcher)
-        size, spectra = texture.speckle_size(), texture.spectra()
-        area = 2.0 * np.pi * _interpolate(rows, size.lateral_mm) * _interpolate(rows, size.axial_mm)
+    matcher = FrameMatcher(like, settings)
+    key, rows, texture = matcher.key, matcher.patches.row_depth_mm, measured_texture(like, matcher)
+    size, spectra = texture.speckle_size(), texture.spectra()
+    area = 2.0 * np.pi * _interpolate(rows, size.lateral_mm) * _interpolate(rows, size.axial_mm)
     # Of grey levels no filter takes away what the pulse has beyond -6 dB.
-    edge_fraction = PULSE_EDGES
+    band, edge_fraction = (probe.low_hz, probe.high_hz), PULSE_EDGES
     if isinstance(key.signal, RFSettings):
         band, edge_fraction = key.signal.bandwidth_hz, key.edge_fraction
     frequency = band_nodes(band, edge_fraction)
@@ -160,25 +140,6 @@ def data_sheet_curves(
     sigma = sheet_sigma(sheet, rows, spectra is not None)
     return DecorrelationCurves(
         key, rows, grid, rho, cells, tilt=tilt, scale_sigma=sigma, origin="data sheet", nominal=probe
-    )
-
-
-def _key(sheet: ProbeSheet, settings: Config) -> CurveKey:
-    """Key of curves that are made without an example sweep."""
-    for name in ("vector_pitch_mm", "sampling_rate_mhz"):
-        if getattr(sheet, name) is None:
-            raise InvalidInputError(f"{name}: expected in the probe's settings, or a sweep, got none")
-    low, high = sheet.nominal.low_hz, sheet.nominal.high_hz
-    rate, speed = 1e6 * (sheet.sampling_rate_mhz or 0.0), sheet.speed_of_sound_m_s
-    return CurveKey(
-        RFSettings(rate, speed, (low + high) / 2.0, (low, high)),
-        sheet.vector_pitch_mm or 0.0,
-        settings.patches.width_mm,
-        settings.patches.height_mm,
-        settings.intensity.equalise_mm,
-        settings.matching.correlate,
-        settings.intensity.edge_fraction,
-        sheet.probe,
     )
 
 

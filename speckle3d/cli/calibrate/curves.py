@@ -40,7 +40,7 @@ def curves(
     start
         Rough curves to correct by the sweeps' tracker; then they may be over tissue, too. Not with --probe.
     probe
-        TOML with a probe's data sheet: elevation_aperture_mm, elevation_focus_mm, band_mhz.
+        With --like: TOML with a probe's data sheet: elevation_aperture_mm, elevation_focus_mm, band_mhz.
     like
         With --probe: sweep whose signal, depths and echoes to calculate for.
     region
@@ -61,10 +61,10 @@ def curves(
     from speckle3d.tracked_curves import jitters, tracked_curves
 
     settings = s3.load_config(config_file).with_choices(region=region)
-    if probe is not None:
+    if probe is not None and like is not None:
         with naming(str(probe)):
             sheet = load_toml(ProbeSheet, probe)
-            result = data_sheet_curves(sheet, s3.load_sweep(like) if like else None, settings)
+            result = data_sheet_curves(sheet, s3.load_sweep(like), settings)
     else:
         rough = s3.load_curves(start) if start else None
         recordings = [part_of(s3.load_sweep(path), frames, "--frames") for path in sweeps or []]
