@@ -122,7 +122,8 @@ def orient(
     if not isinstance(log, ImuLog):
         raise InvalidInputError(f"expected an ImuLog, as read_log(path) gives, got {type(log).__name__}")
     settings, method = settings or FusionSettings(), Method(method)
-    rows, samples, notes = usable_samples(log)
+    used = log if settings.use_magnetometer else replace(log, magnetometer_au=None)
+    rows, samples, notes = usable_samples(used)
     if settings.use_magnetometer and not finite_rows(samples.field_au).any():
         notes.append("no magnetometer: the heading is relative to the start")
         settings = replace(settings, use_magnetometer=False)

@@ -115,11 +115,13 @@ def usable_samples(log: ImuLog) -> tuple[IntArray, Samples, list[str]]:
             f"{median_s:.4g} s: times in milliseconds?"
         )
     against = contradictions(log)
-    fatal = ["gravity", "gyroscope", "accelerometer", "own orientation"]
-    if against.get("accelerometer") == "":
-        fatal.pop()
-    if problem := next(filter(None, map(against.get, fatal)), ""):
-        raise InvalidInputError(f"{source}: {problem}")
+    fatal = ["gravity", "gyroscope", "accelerometer"]
+    if against.get("accelerometer") != "":  # nor does it agree: either may be wrong
+        fatal += ["own orientation", "magnetometer"]
+    for name in fatal:
+        if problem := against.get(name):
+            advice = " --no-magnetometer leaves it out" if name == "magnetometer" else ""
+            raise InvalidInputError(f"{source}: {problem}{advice}")
     notes += filter(None, against.values())
     field = log.magnetometer_au
     if against.get("magnetometer"):

@@ -168,9 +168,10 @@ FACTORS = (np.rad2deg(1.0), np.deg2rad(1.0), 1.5, 0.6, -1.0, 0.0)
 MIXINGS = [*(factor * np.eye(3) for factor in FACTORS), np.eye(3)[[1, 0, 2]], np.diag([0.0, 1.0, 1.0])]
 
 
+@pytest.mark.parametrize("speed", [1.0, 0.2])
 @pytest.mark.parametrize("mixing", MIXINGS)
-def test_a_gyroscope_in_another_unit_rate_or_axes_or_a_dead_one_raises(mixing):
-    log, _ = swinging(20.0)
+def test_a_gyroscope_in_another_unit_rate_or_axes_or_a_dead_one_raises(mixing, speed):
+    log, _ = swinging(20.0, speed=speed)
     with pytest.raises(Speckle3DError, match="gyroscope"):
         orient(with_rows(log, [VECTORS[1]], lambda rows: rows @ mixing))
 
