@@ -11,7 +11,7 @@ where it is known, ``time_offset_s``. Data sets: ``/sensor_from_image`` (4, 4), 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import Any
 
 import h5py
@@ -38,11 +38,6 @@ from speckle3d.io.records import put, put_fields, read_record, written
 
 FORMAT = "speckle3d.calibration"
 
-_COLUMNS, _NUMBERS = tuple(field.name for field in fields(Parameter)), ("value", "standard_error")
-"""Data sets of /parameters, and those of them that are numbers."""
-_FRAMES = "used", "dropped"
-"""Data sets of /frames, indices of frames."""
-
 
 def write_calibration(path: PathLike, calibration: Calibration) -> None:
     """Write a calibration; the file appears whole or not at all.
@@ -63,10 +58,13 @@ def write_calibration(path: PathLike, calibration: Calibration) -> None:
         put_fields(file, calibration, skip=("rotation", "translation_mm", "parameters", "frames"))
         is_rotation = calibration.translation_mm is None
         put(file, "sensor_from_image", calibration.rotation if is_rotation else calibration.sensor_from_image)
-        columns: dict[str, Any] = {name: [getattr(row, name) for row in rows] for name in _COLUMNS}
-        put(file, "parameters", columns | {name: np.array(columns[name], float) for name in _NUMBERS})
-        counts: dict[str, Any] = {name: np.array([*getattr(frames, name)], np.int64) for name in _FRAMES}
-        put(file, "frames", counts | {"given": frames.given, "reason": list(frames.dropped.values())})
+        columns = {name: [getattr(row, name) for row in rows] for name in ("name", "unit")}
+        put(file, "parameters", columns)
+        for name in ("value", "standard_error"):
+            put(file, f"parameters/{name}", np.array([getattr(row, name) for row in rows], float))
+        put(file, "frames", {"given": frames.given, "reason": list(frames.dropped.values())})
+        put(file, "frames/used", np.array(frames.used, np.int64))
+        put(file, "frames/dropped", np.array([*frames.dropped], np.int64))
 
 
 def read_calibration(path: PathLike) -> Calibration:
@@ -170,13 +168,13 @@ def resized(sweep: Sweep, sizes: dict[str, float]) -> Sweep:
 
 
 def _read_parameters(group: h5py.Group) -> tuple[Parameter, ...]:
-    value, error = (read_array(group, name, ("p",)) for name in _NUMBERS)
+    value, error = (read_array(group, name, ("p",)) for name in ("value", "standard_error"))
     names, units = (read_texts(group, name, value.shape) for name in ("name", "unit"))
     return tuple(map(Parameter, names, value.tolist(), error.tolist(), units))
 
 
 def _read_frames(group: h5py.Group) -> FramesUsed:
-    in_use, left_out = (read_array(group, name, ("n",), np.int64) for name in _FRAMES)
+    in_use, left_out = (read_array(group, name, ("n",), np.int64) for name in ("used", "dropped"))
     reasons = read_texts(group, "reason", left_out.shape)
     count = int(read_attribute(group, "given"))
     return FramesUsed(count, tuple(in_use.tolist()), dict(zip(left_out.tolist(), reasons, strict=True)))

@@ -117,16 +117,15 @@ def read_record(group: h5py.Group, kind: type[Record], **values: Any) -> Record:
     """
     hints = get_type_hints(kind)
     for field in fields(kind):  # type: ignore[arg-type]
-        if field.name in values:
+        name, hint = field.name, hints[field.name]
+        is_there, is_optional = has_member(group, name) or name in group.attrs, NoneType in get_args(hint)
+        has_default = field.default is not MISSING or field.default_factory is not MISSING
+        if name in values:
             continue
-        options = [part for part in get_args(hints[field.name]) if part is not NoneType]
-        is_optional = len(options) < len(get_args(hints[field.name]))
-        lacks_default = field.default is MISSING and field.default_factory is MISSING and not is_optional
-        hint = options[0] if is_optional else hints[field.name]
-        if lacks_default or has_member(group, field.name) or field.name in group.attrs:
-            values[field.name] = _read_value(group, field.name, hint)
-        elif is_optional and field.default is MISSING:
-            values[field.name] = None
+        if is_there or not (has_default or is_optional):
+            values[name] = _read_value(group, name, get_args(hint)[0] if is_optional else hint)
+        elif not has_default:
+            values[name] = None
     with naming(locate(group)):
         return kind(**values)
 
