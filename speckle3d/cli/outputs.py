@@ -79,7 +79,7 @@ def require_own_place(out: Path, kind: str, *inputs: Path) -> None:
 
 def _kinds_of(path: Path) -> set[str]:
     """Kinds that a file may be, by its content."""
-    from speckle3d.io.hdf5 import SIGNATURE, open_hdf5
+    from speckle3d.io.hdf5 import SIGNATURE, file_format, open_hdf5
     from speckle3d.io.tum import is_tum
     from speckle3d.io.voxels.volumes import may_be_volume
 
@@ -87,7 +87,7 @@ def _kinds_of(path: Path) -> set[str]:
         start = stream.read(_FIRST_BYTES)
     if start.startswith(SIGNATURE):
         with open_hdf5(path) as file:
-            kind = str(file.attrs.get("format", "")).removeprefix("speckle3d.")
+            kind = file_format(file).removeprefix("speckle3d.")
             return {kind, *({"simulation"} & {*file})}
     triangles = int.from_bytes(start[80:84], "little")
     signs = {

@@ -5,6 +5,7 @@ from __future__ import annotations
 import fnmatch
 
 import h5py
+import numpy as np
 
 MEANINGS = {
     "rf": "1: echoes before demodulation, (frame, vector, sample)",
@@ -62,4 +63,4 @@ def label(file: h5py.File) -> None:
     for pattern, words in MEANINGS.items():
         for name in fnmatch.filter(names, pattern):
             attributes = file[name].attrs
-            attributes["units"], _, attributes["meaning"] = words.partition(": ")
+            attributes["units"], _, attributes["meaning"] = map(np.bytes_, words.encode().partition(b": "))

@@ -61,12 +61,12 @@ def write_reconstruction(path: PathLike, result: Reconstruction, pairs: Sequence
         put_fields(file, result.grid)
         put(file, "poses", result.poses)
         if trust is not None:
-            put(file, "frame_flags", trust.flags)
             put(file, "pose_covariance/image", trust.covariance)
             file["pose_covariance/image"].attrs.update({} if trust.shared is None else vars(trust.shared))
             for mode, errors in trust.modes.items():
                 put(file, f"pose_covariance/{mode}", errors.covariance)
                 file[f"pose_covariance/{mode}"].attrs["length_sigma"] = errors.length_sigma
+            put(file, "frame_flags", trust.flags)
         put_fields(file, origin, skip=["calibrations", "imported"])
         for calibration in origin.calibrations:
             source = SourceFile(calibration.path, calibration.sha256)

@@ -61,8 +61,9 @@ def written(path: PathLike, format_name: str, version: int = 1) -> Iterator[h5py
     """Yield a new file of the family; it appears whole when the block ends, or not at all."""
     with atomic_path(path) as part:
         with h5py.File(part, "w", locking=False) as file:
-            file.attrs.update({"format": format_name, "version": version})
             reserve(file.id)
+            put(file, "format", format_name)
+            put(file, "version", version)
             yield file
             label(file)
         trim(part)
@@ -90,7 +91,10 @@ def put(group: h5py.Group, name: str, value: Any) -> None:
         inner = group.require_group(name)
         for key, item in value.items():
             put(inner, key, item)
-    elif isinstance(value, str | int | float | tuple):
+    elif isinstance(value, str):
+        # Of fixed length: HDF5 never returns from zeros among texts of variable length.
+        group.attrs[name] = np.bytes_(value.encode("utf-8", "backslashreplace"))
+    elif isinstance(value, int | float | tuple):
         group.attrs[name] = value
     elif isinstance(value, list):
         group.create_dataset(name, data=value, dtype=h5py.string_dtype())

@@ -270,7 +270,7 @@ class GrowingSweep:
             self._file = file = h5py.File(self.path, "x", libver="latest")
             try:
                 reserve(file.id)
-                file.attrs["format"] = FORMAT
+                put(file, "format", FORMAT)
                 put(file, "probe", probe or None)
                 self._frames = _create_frames(file, grid, signal, dtype, compression)
                 for group, shapes in _STREAMS.items():
