@@ -50,12 +50,6 @@ class ProbeSheet(BaseModel):
         description="Where the pulse-echo spectrum of a reflector on the axis is at -6 dB, low and high."
     )
     attenuation_db_cm_mhz: float = Field(0.5, ge=0, le=3, description="Of the tissue, one way.")
-    backscatter_exponent: float = Field(
-        BACKSCATTER_EXPONENT,
-        ge=-1,
-        le=4,
-        description="Of scattered power over frequency: soft tissue 0.6 to 1.6.",
-    )
     transmit_aperture_mm: float | None = Field(
         None,
         ge=0,
@@ -122,7 +116,7 @@ def data_sheet_curves(sheet: ProbeSheet, like: Sweep, config: Config | None = No
     inside = key.patch_height_mm * ((np.arange(SUB_DEPTHS) + 0.5) / SUB_DEPTHS - 0.5)
     depths = np.maximum(rows[:, None] + inside, 1.0)
     if spectra is None:
-        exponents = sheet.attenuation_db_cm_mhz, sheet.backscatter_exponent
+        exponents = sheet.attenuation_db_cm_mhz, BACKSCATTER_EXPONENT
         spectrum = sheet_spectrum(frequency, (probe.low_hz, probe.high_hz), *exponents, depths)
     else:
         spectrum = spectra.at(depths, frequency)
@@ -168,7 +162,7 @@ def sheet_sigma(sheet: ProbeSheet, depth_mm: FloatArray, has_spectrum: bool) -> 
             replace(probe, low_hz=pitch * probe.low_hz, high_hz=pitch * probe.high_hz),
         ]
         variants = variants[:2] if has_spectrum else variants
-        return np.array([log_width(v, depth_mm, sheet.backscatter_exponent).mean() for v in variants])
+        return np.array([log_width(v, depth_mm).mean() for v in variants])
 
     sigma = UNIFORM * (widths(1.0) - widths(-1.0)) / 2.0
     return float(np.sqrt((sigma**2).sum() + MODEL_SIGMA**2))

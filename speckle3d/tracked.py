@@ -113,7 +113,7 @@ class Tracked:
             ("length error", f"{100 * self.scale_sigma:.1f} % claimed (standard deviation)", ""),
             ("direction", f"{self.direction:+d}, from {self.direction_from}", ""),
             ("subset", subset, ""),
-            ("pairs", f"{self.pairs} of frames", ""),
+            ("pairs", f"{len(self.edges)} of frames", ""),
             ("doubts", doubts or "none", ""),
         ]
         return f"Tracked\n{text_rows(rows)}".rstrip()
@@ -122,8 +122,3 @@ class Tracked:
     def scale_sigma(self) -> float:
         """Relative standard deviation of the scale of distances, which all pairs share."""
         return self.shared.length_sigma
-
-    @property
-    def pairs(self) -> int:
-        """Frame pairs that the trajectory was solved from."""
-        return len(self.edges)

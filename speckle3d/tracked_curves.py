@@ -9,7 +9,8 @@ corrected until the images' length is the tracker's, over which jitter counts on
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -146,8 +147,7 @@ def tracker_scale(sweep: Sweep, result: Tracked) -> Length:
     return Length(float(np.log(scale)), sigma)
 
 
-@dataclass(frozen=True)
-class Length:
+class Length(NamedTuple):
     """Logarithm of a sweep's true elevational length over the images', and its standard deviation."""
 
     log_scale: float
@@ -176,7 +176,7 @@ def corrected_curves(
         Of origin "crossing"; their `scale_sigma` is that of the lengths and of tissue that attenuates
         otherwise.
     """
-    scale, sigma = np.array([(length.log_scale, length.sigma) for length in lengths]).T
+    scale, sigma = np.array(lengths).T
     information = sigma**-2.0
     weight = information / information.sum()
     widths = [np.log(curve_widths(c.distance_mm, c.correlation)) for c in (curves, *read_with)]

@@ -35,7 +35,7 @@ def test_progress_images_and_pairs_come_in_order(sweep, curves):
     )
     assert progress == [(i + 1, 12) for i in range(12)]
     assert images == [(i, sweep.grid.vectors) for i in range(12)]
-    assert sum(len(table) for table in pairs) == tracking.pairs
+    assert sum(len(table) for table in pairs) == len(tracking.edges)
     seconds = np.concatenate([table.second for table in pairs])
     assert (np.diff(seconds) >= 0).all()
     assert all((table.first < table.second).all() for table in pairs)

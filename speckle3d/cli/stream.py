@@ -154,7 +154,7 @@ def live(
     first = None
     if crossing_file is not None:
         with s3.progress_bar(f"tracking {crossing_file.name}") as progress:
-            first = CrossingCheck.of(s3.load_sweep(crossing_file), curves, config, progress)
+            first = CrossingCheck(s3.load_sweep(crossing_file), curves, config, progress)
     with ExitStack() as pages, ExitStack() as links:
         relay = None if serve is None else links.enter_context(Server(serve))
         if relay is not None:

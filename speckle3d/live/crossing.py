@@ -10,9 +10,9 @@ from speckle3d.core.errors import InsufficientDataError, MismatchError
 from speckle3d.core.progress import Progress
 from speckle3d.core.sweep import Sweep
 from speckle3d.core.threads import on_one_thread
-from speckle3d.correction.crossing.pair import CrossingSoFar, crossing_so_far
+from speckle3d.correction.crossing.pair import crossing_so_far
 from speckle3d.correction.crossing.stack import ImageStack
-from speckle3d.correction.crossing.sweep import CrossingSettings, CrossingSweep
+from speckle3d.correction.crossing.sweep import CrossingSweep
 from speckle3d.crossing_sweeps import crossing_side, stack_for
 from speckle3d.live.checks import GOOD
 from speckle3d.live.tracking import LiveTracker
@@ -29,50 +29,36 @@ PAUSE_S = 5.0
 """Between two looks, each of which takes seconds."""
 
 
-def words_of(crossing: CrossingSoFar, settings: CrossingSettings) -> str:
-    """Advice on two crossing sweeps, by the limits of the reconstruction."""
-    if crossing.similarity < settings.least_similarity:
-        return NO_PLACE
-    if crossing.angle_deg < settings.least_angle_deg:
-        return TURN_MORE
-    if crossing.overlap_mm < settings.least_overlap_mm:
-        return NOT_YET
-    return GOOD
-
-
 class CrossingCheck:
     """Compares the frames so far with the first sweep, now and then.
 
     Parameters
     ----------
-    first : CrossingSweep
-        The first sweep.
-    settings : CrossingSettings
+    first : Sweep
+        The first sweep, which is tracked.
+    curves : DecorrelationCurves
+    config : Config
+    progress : callable, optional
 
     Attributes
     ----------
     words : str
-        What there is to say by the last look; that it is good before the first one.
+        What there is to say by the last look, by the limits of the reconstruction; that it is good before the
+        first one.
+
+    Raises
+    ------
+    MismatchError, InsufficientDataError
+        As `track`.
     """
 
-    def __init__(self, first: CrossingSweep, settings: CrossingSettings) -> None:
-        self._first, self._settings = first, settings
-        self.words = GOOD
-
-    @classmethod
-    def of(
-        cls, first: Sweep, curves: DecorrelationCurves, config: Config, progress: Progress | None = None
-    ) -> CrossingCheck:
-        """Track the first sweep.
-
-        Raises
-        ------
-        MismatchError, InsufficientDataError
-            As `track`.
-        """
+    def __init__(
+        self, first: Sweep, curves: DecorrelationCurves, config: Config, progress: Progress | None = None
+    ) -> None:
         stack = stack_for(first, config)
         motion = track(first, curves, config, progress, images=stack.keep)
-        return cls(crossing_side(first, motion, stack, config), config.crossing)
+        self._first, self._settings = crossing_side(first, motion, stack, config), config.crossing
+        self.words = GOOD
 
     def look(self, tracker: LiveTracker, volume: GrowingVolume) -> None:
         """Lay the frames whose images are kept against the first sweep."""
@@ -92,13 +78,19 @@ class CrossingCheck:
             TURN_SIGMA_PER_MM,
             flags=flags[numbers],
         )
+        settings = self._settings
         try:
-            self.words = words_of(crossing_so_far(self._first, second, self._settings), self._settings)
-        except MismatchError:
-            self.words = NO_PLACE
-        except InsufficientDataError:
-            # Too little of it so far.
-            self.words = GOOD
+            crossing = crossing_so_far(self._first, second, settings)
+        except (MismatchError, InsufficientDataError) as error:
+            # Too little of it so far is no reason to complain.
+            self.words = NO_PLACE if isinstance(error, MismatchError) else GOOD
+            return
+        faults = {
+            NO_PLACE: crossing.similarity < settings.least_similarity,
+            TURN_MORE: crossing.angle_deg < settings.least_angle_deg,
+            NOT_YET: crossing.overlap_mm < settings.least_overlap_mm,
+        }
+        self.words = next((words for words, applies in faults.items() if applies), GOOD)
 
     def keep_looking(self, tracker: LiveTracker, volume: GrowingVolume, over: threading.Event) -> None:
         """Look again and again, on this thread alone, until it is over."""

@@ -61,8 +61,6 @@ class LivePose:
 
     Attributes
     ----------
-    frame : int
-        Counted from zero over the frames that were matched.
     time_s : float
     world_from_image : RigidTransform
         The first frame's is the identity; in mm.
@@ -70,16 +68,12 @@ class LivePose:
         `FrameFlag`; zero for a frame to be trusted.
     median : float
         Median correlation with the frame before; NaN for the first.
-    best : float
-        The largest median correlation with any earlier frame.
     """
 
-    frame: int
     time_s: float
     world_from_image: RigidTransform
     flags: int
     median: float
-    best: float
 
 
 class LiveTracker:
@@ -202,24 +196,17 @@ class LiveTracker:
             self._place()
         # Without another thread now and then.
         if len(self) <= ANEW or (self._thread is None and len(self) % EVERY == 0):
-            self._revise(LATEST)
+            self.revise()
         with self._growth:
             self._growth.notify_all()
-        best = float(table.median.max(initial=-np.inf))
         before = table.median[table.first == number - 1]
         with self._lock:
             return LivePose(
-                number,
                 time_s,
                 self._poses[number],
                 int(self._flags[number]),
                 float(before[0]) if before.size else float("nan"),
-                best,
             )
-
-    def revise(self) -> None:
-        """Estimate everything anew from all frames, and wait for it."""
-        self._revise(len(self))
 
     def _keep(self, features: FrameFeatures, table: CorrelationTable) -> None:
         """Store a frame's features and pairs, with the pose of the last frame."""
@@ -262,7 +249,7 @@ class LiveTracker:
         solution = solve_trajectory(star, 2, problem.centre_mm, problem.trajectory.huber)
         self._poses = RigidTransform.concatenate([self._poses[:-1], before[0] * solution.poses[-1:]])
 
-    def _revise(self, latest: int) -> None:
+    def revise(self, latest: int = LATEST) -> None:
         """Estimate the motion of the latest frames anew; later frames go along with the last of them."""
         with self._lock:
             tables, flags, before = tuple(self._tables), self._flags, self._poses
@@ -301,7 +288,7 @@ class LiveTracker:
                 frames = 0
                 while self._wait_for_more(frames):
                     frames = len(self)
-                    self._revise(LATEST)
+                    self.revise()
         except Exception as error:  # noqa: BLE001 (raised with the next frame)
             self._failure = error
 

@@ -326,7 +326,7 @@ def _details_of(
             fits[mode] = {"length_over_images": fit.scale, "rests_on": fit.rests_on, **fit.details}
     return {
         "provenance": provenance,
-        "pairs": tracked.pairs,
+        "pairs": len(tracked.edges),
         "flagged_frames": describe(tracked.flags),
         "rejected_patch_share": tracked.rejected_share,
         "direction": tracked.direction,

@@ -37,7 +37,7 @@ def row(sweep, curves, step):
     whole, apart = poses_of(len(sweep)), []
     live = LiveTracker(sweep, curves, background=False)
     first = [live.append(sweep.frames[k], float(k)).world_from_image for k in range(len(sweep))]
-    live.revise()
+    live.revise(len(live))
     last = live.poses
     for k in [*range(2, len(sweep), step), len(sweep) - 1]:
         part, later = poses_of(k + 1)[-1:], whole[k : k + 1]

@@ -54,7 +54,7 @@ def test_each_pose_is_what_the_frames_up_to_it_give(live_sweep):
 
 def test_at_the_end_poses_are_those_of_the_recording(live_sweep):
     sweep, curves, tracker, _ = live_sweep
-    tracker.revise()
+    tracker.revise(len(tracker))
     # What the tissue attenuates (here nothing; read as 0.01 dB/cm/MHz) is told by the whole sweep alone.
     assert distance_mm(sweep, tracker.poses, track(sweep, curves).image).max() < 0.006
 
