@@ -9,6 +9,7 @@ from speckle3d.core.errors import naming
 from speckle3d.core.sweep import Sweep
 from speckle3d.correction.crossing.pair import CrossedPair
 from speckle3d.correction.drift import DriftCorrection
+from speckle3d.correction.fused import fuse
 from speckle3d.correction.modes import CUBIC_MODES, correct_mode, require_modes, sensor_of
 from speckle3d.correction.scale import ScaledPoses
 from speckle3d.examine.sensors import credible_sensors, repair_readings, require_credible
@@ -88,26 +89,19 @@ def correct(
         elif mode == "crossed" and crossed is not None:
             corrections[mode] = crossed.of(sweep.frame_time_s, sweep.name)
         elif mode == "fused":
-            corrections[mode] = _fuse(tracked, sweep, settings, crossed)
+            evidence = None if crossed is None else crossed.of(sweep.frame_time_s, sweep.name).evidence
+            credible = credible_sensors(sweep, tracked.doubts)
+            with naming(f"{sweep.name}: drift mode fused"):
+                corrections[mode] = fuse(
+                    tracked.edges,
+                    tracked.image,
+                    float(tracked.coherence.share.mean()),
+                    tracked.shared,
+                    sweep.grid.centre_mm,
+                    sweep.frame_time_s,
+                    credible.orientation,
+                    credible.tracker,
+                    evidence,
+                    settings.fused,
+                )
     return corrections
-
-
-def _fuse(tracked: Tracked, sweep: Sweep, config: Config, pair: CrossedPair | None) -> ScaledPoses:
-    """Fuse with the sensors that do not contradict themselves."""
-    from speckle3d.correction.fused import fuse
-
-    sweep = credible_sensors(sweep, tracked.doubts)
-    evidence = None if pair is None else pair.of(sweep.frame_time_s, sweep.name).evidence
-    with naming(f"{sweep.name}: drift mode fused"):
-        return fuse(
-            tracked.edges,
-            tracked.image,
-            float(tracked.coherence.share.mean()),
-            tracked.shared,
-            sweep.grid.centre_mm,
-            sweep.frame_time_s,
-            sweep.orientation,
-            sweep.tracker,
-            evidence,
-            config.fused,
-        )

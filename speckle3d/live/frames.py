@@ -59,16 +59,9 @@ class ImageLayout:
         where = f"IMAGE {image.device}"
         pixels = _plane(image, where)
         of_rf = pixels.dtype.name in _ECHOES
-        of_echoes = f"{' or '.join(_ECHOES)} for RF"
         if not of_rf and pixels.dtype.name != _GREY_LEVELS:
-            raise InvalidInputError(
-                f"{where}: expected {_GREY_LEVELS} for B-mode or {of_echoes}, got {pixels.dtype}"
-            )
-        if not of_rf and (settings.sampling_rate_hz or settings.centre_frequency_hz):
-            raise InvalidInputError(
-                f"{where}: expected {of_echoes} with --sampling-rate-hz or --centre-frequency-hz, "
-                f"got {pixels.dtype}"
-            )
+            kinds = f"{_GREY_LEVELS} for B-mode or {' or '.join(_ECHOES)} for RF"
+            raise InvalidInputError(f"{where}: expected {kinds}, got {pixels.dtype}")
         try:
             example = _example(pixels, image, settings, where)
         except MissingSettingsError as error:
@@ -127,10 +120,6 @@ def _plane(image: ImageReceived, where: str) -> npt.NDArray[Any]:
 def _example(pixels: npt.NDArray[Any], image: ImageReceived, settings: ImportSettings, where: str) -> Sweep:
     """Sweep of one black frame; of RF the speed of sound must be given: no message has it."""
     if pixels.dtype != _GREY_LEVELS:
-        if settings.demodulation_frequency_hz is not None:
-            raise InvalidInputError(
-                f"{where}: expected RF, whose samples are real, got --demodulation-frequency-hz"
-            )
         values, black = {"speed_of_sound_m_s": Value()}, np.zeros_like(pixels.T)
     else:
         column_mm, row_mm = image.spacing_mm[:2].tolist()

@@ -6,9 +6,6 @@ from dataclasses import dataclass
 
 from speckle3d.io.igtl.messages import ImageReceived, Received, TransformReceived
 
-_MOST_DEVICES = 64
-"""Of which the line may speak, however many names a peer sends."""
-
 
 @dataclass
 class Progress:
@@ -88,9 +85,8 @@ class Devices:
     def hear(self, message: Received) -> None:
         """Note who sent a message."""
         if isinstance(message, ImageReceived | TransformReceived):
-            sender = ("IMAGE" if isinstance(message, ImageReceived) else "TRANSFORM", message.device)
-            if sender in self._wanted or len(self._heard) < _MOST_DEVICES:
-                self._heard.add(sender)
+            kind = "IMAGE" if isinstance(message, ImageReceived) else "TRANSFORM"
+            self._heard.add((kind, message.device))
 
     @property
     def missing(self) -> str:
