@@ -33,7 +33,7 @@ _HINT = (
 class LinesViewer(PhantomViewer):
     """Lines of a plane in the frames of a recording, found as the sliders say; as `PhantomViewer`."""
 
-    detection = ("columns", "smoothing_mm", "threshold", "tolerance_mm", "consensus", "place")
+    detection = ("columns", "smoothing_mm", "threshold", "tolerance_mm", "consensus")
 
     def __init__(self, recording: Recording, images: Path, settings: ScanSettings) -> None:
         super().__init__(recording, images, settings)

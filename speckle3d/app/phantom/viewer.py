@@ -9,7 +9,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, TypeVar, get_args, get_origin
+from typing import Any, TypeVar
 
 import numpy.typing as npt
 import panel as pn
@@ -284,9 +284,4 @@ def widget(settings: BaseModel, name: str) -> Any:
         value, default = value or 0.0, field.default or 0.0
         ends = {"start": min(low, value), "end": max(high, value), "step": step}
         return kind(name=f"{label} (default {default:g})", value=value, **ends, **look)
-    if get_origin(field.annotation) is Literal:
-        choices = list(get_args(field.annotation))
-        return pn.widgets.Select(
-            name=label, options=choices, value=value, description=field.description, **look
-        )
     return pn.widgets.TextInput(name=label, value=value, placeholder=field.description, **look)

@@ -19,8 +19,8 @@ from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import Speckle3DError
 from speckle3d.core.reconstruction import Reconstruction
 from speckle3d.core.sweep import Sweep
-from speckle3d.report.figures import plot_curves, plot_outlines
-from speckle3d.scoring.references import find_reference, sweep_curves
+from speckle3d.report.figures import plot_outlines
+from speckle3d.scoring.references import find_reference
 from speckle3d.study.figures import RANGE_DB, label_of
 from speckle3d.study.pose_errors import PICKING, caution, how_measured, measure
 from speckle3d.study.posed import PosedSweep, SweepModes, at_modes
@@ -59,9 +59,9 @@ class ReconstructionPage:
         self.reconstruction, self.mode = reconstruction, mode
         poses = reconstruction.poses[mode]
         self._sweep = PosedSweep(sweep, np.arange(len(sweep)), poses, mode, reconstruction)
-        self.reference = find_reference(sweep)
-        whole = self.reference is not None and self.reference.covered.all()
-        self.modes = (*reconstruction.poses, *([self.reference.name] if self.reference and whole else []))
+        reference = find_reference(sweep)
+        whole = reference is not None and reference.covered.all()
+        self.modes = (*reconstruction.poses, *([reference.name] if reference and whole else []))
         source, _ = self._sweep.source(None, RANGE_DB)
         images = max(KEPT_BYTES // (4 * source.grid.vectors * source.grid.samples), 1)
         self.images = replace(source, images=lru_cache(images)(source.read))
@@ -142,7 +142,7 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
         return pn.Row(side, along, frame, third, sizing_mode="stretch_both")
 
     def _trajectories(self) -> Viewable:
-        """Outlines of frames in space, and length and angles over the frames, of all modes."""
+        """Outlines of the frames of all modes in space."""
         page = self._page
         poses = {mode: page.posed(mode, None).poses[mode] for mode in page.modes}
         outlines = plot_outlines(poses, self._grid)
@@ -155,17 +155,7 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
             scene_xaxis_nticks=3,
             scene_yaxis_nticks=3,
         )
-        trust = page.reconstruction.trust
-        covariance = None if trust is None else trust.covariance
-        drift = plot_curves(
-            sweep_curves(page.reconstruction.poses, self._grid.centre_mm, page.reference, covariance)
-        )
-        drift.update_layout(
-            height=None, font_size=9, showlegend=False, updatemenus=[], margin={"t": 10, "r": 10}
-        )
-        figures = {"in space": outlines, "over the frames": drift}
-        panes = [(name, pn.pane.Plotly(plot, sizing_mode="stretch_both")) for name, plot in figures.items()]
-        return pn.Tabs(*panes, sizing_mode="stretch_both")
+        return pn.pane.Plotly(outlines, sizing_mode="stretch_both")
 
     @property
     def _cross_mm(self) -> FloatArray:

@@ -37,7 +37,7 @@ FLAG_COLOUR, _DOUBT_COLOUR, _OUTLIER_COLOUR = "#d55e00", "#7b3fa0", "#ff4d4d"
 _LINES = ("#0072b2", "#d55e00", "#009e73")
 """Of three quantities, told apart by the colour-blind (Okabe and Ito)."""
 _COLUMNS = "x", "y", "angle", "distance", "sigma"
-_PATCHES = *_COLUMNS, "value", "line", "cross", "state"
+_PATCHES = *_COLUMNS, "value", "line", "cross"
 _ROW_PX, _LEFT_PX = 16, 108
 
 
@@ -70,7 +70,6 @@ class PatchPlot(ImagePlot):
             "x", "y", marker="x", size="cross", line_color=_OUTLIER_COLOUR, source=self._patches
         )
         tips = [
-            ("patch", "@state"),
             ("distance", "@distance{0.000} mm"),
             ("standard deviation of the distance", "@sigma{0.000} mm"),
         ]
@@ -84,14 +83,12 @@ class PatchPlot(ImagePlot):
         if patches is None:
             self._patches.data = {name: [] for name in _PATCHES}
             return
-        has_distance = np.isfinite(patches["distance"])
-        outlier = has_distance & ~patches["inliers"]
+        outlier = np.isfinite(patches["distance"]) & ~patches["inliers"]
         self._colours.high = most
         self._patches.data = {name: patches[name] for name in _COLUMNS} | {
             "value": patches[by],
             "line": np.where(outlier, _OUTLIER_COLOUR, "#ffffff"),
             "cross": np.where(outlier, 16, 0),
-            "state": np.where(outlier, "left out", np.where(has_distance, "used", "without a distance")),
         }
 
 
