@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import partial, wraps
+from functools import partial
 from html import escape
 from typing import Any, NamedTuple, TypeVar
 
@@ -40,15 +40,8 @@ class Page(NamedTuple):
     view: Callable[[], Viewable]
 
 
-def batch_changes(act: _Act) -> _Act:
-    """Have the changes of an act sent together; figures may be changed by the event of a widget only so."""
-
-    @wraps(act)
-    def run(*args: Any, **options: Any) -> Any:
-        with pn.io.hold():
-            return act(*args, **options)
-
-    return run  # type: ignore[return-value]
+batch_changes: Callable[[_Act], _Act] = pn.io.hold()
+"""Has the changes of a function sent together; figures may be changed by the event of a widget only so."""
 
 
 def shell(pages: Sequence[Page], title: str = "") -> Viewable:

@@ -9,22 +9,20 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import speckle3d as s3
+import xsens
 from speckle3d.app.look import Page
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
 from speckle3d.io.hdf5 import SIGNATURE
-from speckle3d.io.import_settings import ImportSettings, MissingSettingsError
-from speckle3d.io.load import kind_of, load_sweep
+from speckle3d.io.import_settings import MissingSettingsError
+from speckle3d.io.load import kind_of
 from speckle3d.io.readers import find_reader, first_bytes
-from speckle3d.io.reconstructions import FORMAT, read_reconstruction
-from xsens.logs.read import read_log
+from speckle3d.io.reconstructions import FORMAT
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
     from speckle3d.core.errors import Doubt
-    from speckle3d.core.reconstruction import Reconstruction
-    from speckle3d.core.sweep import Sweep
-    from xsens.logs.samples import ImuLog
 
 RECONSTRUCTION = "reconstruction.h5"
 """File of a results folder."""
@@ -34,7 +32,7 @@ def pages_of(
     path: Path,
     reconstruction: Path | None = None,
     sweep: Path | None = None,
-    settings: ImportSettings | None = None,
+    settings: s3.ImportSettings | None = None,
 ) -> Sequence[Page]:
     """Pages for what a file or folder holds.
 
@@ -73,7 +71,7 @@ def pages_of(
         raise InvalidInputError(
             f"{path}: expected a recording, a log, or a results folder with {RECONSTRUCTION}, got another"
         )
-    return [_sensor(read_log(path))]
+    return [_sensor(xsens.read_log(path))]
 
 
 @contextmanager
@@ -100,12 +98,12 @@ def open_pages(path: Path, record: Path | None = None, **of_file: Any) -> Iterat
     yield pages_of(path, **of_file)
 
 
-def _recording_pages(path: Path, settings: ImportSettings | None) -> list[Page]:
+def _recording_pages(path: Path, settings: s3.ImportSettings | None) -> list[Page]:
     """Pages of a recording; of a package with a sensor's samples but no frames, the sensor's alone."""
     from speckle3d.sensor_logs import held_log
 
     try:
-        sweep = load_sweep(path, settings)
+        sweep = s3.load_sweep(path, settings)
     except MissingSettingsError:
         raise
     except InvalidInputError as error:
@@ -117,9 +115,9 @@ def _recording_pages(path: Path, settings: ImportSettings | None) -> list[Page]:
 
 
 def _sweep_pages(
-    sweep: Sweep,
+    sweep: s3.Sweep,
     path: Path,
-    reconstruction: Reconstruction | None = None,
+    reconstruction: s3.Reconstruction | None = None,
     doubts: Sequence[Doubt] | None = None,
 ) -> list[Page]:
     from speckle3d.app.sweep.page import SweepPage
@@ -140,7 +138,7 @@ def _result_pages(path: Path, sweep_file: Path | None, file: Path) -> list[Page]
     from speckle3d.study.results import recorded_doubts
 
     result, sweep = open_reconstruction(path, sweep_file)
-    result = replace(result, pairs=read_reconstruction(path).pairs)
+    result = replace(result, pairs=s3.load_reconstruction(path).pairs)
     pages = _sweep_pages(sweep, file, result, recorded_doubts(path, result.provenance))
     mode = "image"
     with suppress(MismatchError):  # modes disagree: all can be looked at
@@ -150,7 +148,7 @@ def _result_pages(path: Path, sweep_file: Path | None, file: Path) -> list[Page]
     return [viewer, *pages] if file == path else [pages[0], viewer, *pages[1:]]
 
 
-def _sensor(log: ImuLog, mounting: Rotation | None = None) -> Page:
+def _sensor(log: xsens.ImuLog, mounting: Rotation | None = None) -> Page:
     from speckle3d.app.sensor.log import LogReadings
     from speckle3d.app.sensor.page import sensor_page
 

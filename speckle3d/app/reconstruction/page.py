@@ -13,16 +13,15 @@ import param
 from panel.viewable import Viewable
 from scipy.spatial.transform import RigidTransform
 
+import speckle3d as s3
 from speckle3d.app.look import batch_changes
 from speckle3d.app.reconstruction.cut_plot import CutPlot
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import Speckle3DError
-from speckle3d.core.reconstruction import Reconstruction
-from speckle3d.core.sweep import Sweep
 from speckle3d.report.figures import plot_outlines
 from speckle3d.scoring.references import find_reference
 from speckle3d.study.figures import RANGE_DB, label_of
-from speckle3d.study.pose_errors import PICKING, caution, how_measured, measure
+from speckle3d.study.pose_errors import PICKING, caution, how_measured
 from speckle3d.study.posed import PosedSweep, SweepModes, at_modes
 from speckle3d.study.reslices.cuts import cut_at_modes
 from speckle3d.study.reslices.places import along_sweep, in_frame
@@ -55,7 +54,7 @@ class ReconstructionPage:
         The one that is shown first.
     """
 
-    def __init__(self, reconstruction: Reconstruction, sweep: Sweep, mode: str = "image") -> None:
+    def __init__(self, reconstruction: s3.Reconstruction, sweep: s3.Sweep, mode: str = "image") -> None:
         self.reconstruction, self.mode = reconstruction, mode
         poses = reconstruction.poses[mode]
         self._sweep = PosedSweep(sweep, np.arange(len(sweep)), poses, mode, reconstruction)
@@ -219,7 +218,7 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
         ]
         if len(points) > 1:
             try:
-                lines += [row.line for row in measure(page.reconstruction, points, self.mode)]
+                lines += [row.line for row in s3.measure(page.reconstruction, points, self.mode)]
                 lines.append(how_measured(self.mode, PICKING * self._grid.vector_pitch_mm))
                 lines += filter(None, [caution(page.reconstruction, self.mode)])
             except Speckle3DError as error:

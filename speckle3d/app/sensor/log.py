@@ -7,11 +7,10 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
+import xsens
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from xsens.fusion.field import Trust, dip_rad, field_of
-from xsens.fusion.orient import Orientation, orient
-from xsens.logs.samples import ImuLog
 
 COLUMNS = ("t", "x", "y", "z", "field", "dip", "heading", "half", "doubt")
 NORMAL_95 = 1.96
@@ -44,22 +43,22 @@ class LogReadings:
 
     is_live = False
 
-    def __init__(self, log: ImuLog) -> None:
+    def __init__(self, log: xsens.ImuLog) -> None:
         self._log = log
         self._start_s = float(log.time_s[0])
 
     @cached_property
-    def _orientation(self) -> Orientation | str:
+    def _orientation(self) -> xsens.Orientation | str:
         """Orientation by the readings, or why they tell none; takes a second for ten minutes."""
         try:
-            return orient(self._log)
+            return xsens.orient(self._log)
         except (InvalidInputError, InsufficientDataError) as error:
             return str(error)
 
     @cached_property
     def _stream(self) -> tuple[FloatArray, Rotation, str] | None:
         """Times on the sensor's clock, world from sensor, and whose; None where nothing tells it."""
-        if isinstance(self._orientation, Orientation):
+        if isinstance(self._orientation, xsens.Orientation):
             rotations, whose = self._orientation.rotations, "found from its readings"
         elif self._log.oriented.any():
             rotations, whose = self._log.rotations(), f"the sensor's own: {self._orientation}"
@@ -84,7 +83,7 @@ class LogReadings:
         if field is not None:
             rows = np.flatnonzero(np.isfinite(field).all(axis=1))
             columns["dip"][rows] = np.degrees(dip_rad(stream[1][rows].apply(field[rows])))
-        if isinstance(orientation, Orientation):
+        if isinstance(orientation, xsens.Orientation):
             columns["half"] = NORMAL_95 * np.degrees(orientation.standard_deviation_rad[:, 2])
             doubtful = orientation.disturbed & orientation.magnetic
             columns["doubt"] = np.where(doubtful, columns["field"], np.nan)
@@ -118,7 +117,7 @@ class LogReadings:
         log, orientation, rotation = self._log, self._orientation, self.orientation_at(time_s)
         rows = [] if rotation is None else [angles(rotation)]
         north, notes = "magnetic north, y west", log.notes
-        if isinstance(orientation, Orientation):
+        if isinstance(orientation, xsens.Orientation):
             times_s, last = orientation.rotations.time_s, len(orientation) - 1
             at = min(int(np.searchsorted(times_s, time_s + self._start_s)), last)
             *inclination, heading = NORMAL_95 * np.degrees(orientation.standard_deviation_rad[at])

@@ -13,11 +13,10 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+import xsens
 from speckle3d.app.sensor.log import COLUMNS, NORMAL_95, Columns, angles, heading_rad
 from speckle3d.core.errors import Speckle3DError
 from xsens.fusion.field import Trust, field_now
-from xsens.live.monitor import LiveState
-from xsens.live.recording import Recorder
 
 INTERVAL_S = 0.1
 """Between two states: a display follows a hand, and the filter takes a percent of it."""
@@ -39,7 +38,7 @@ class SensorWatch:
 
     def __init__(self, port: str, record: Path | None = None) -> None:
         self._port, self._record = port, record
-        self.states: deque[LiveState] = deque(maxlen=round(SHOWN_S / INTERVAL_S))
+        self.states: deque[xsens.LiveState] = deque(maxlen=round(SHOWN_S / INTERVAL_S))
         self._end = threading.Event()
         self._failure = ""
 
@@ -56,7 +55,7 @@ class SensorWatch:
             path = self._record
             if path is None:
                 path = Path(stack.enter_context(TemporaryDirectory(prefix="speckle3d-"))) / "sensor.mtb"
-            self._recorder = stack.enter_context(Recorder(self._port, path))
+            self._recorder = stack.enter_context(xsens.Recorder(self._port, path))
             thread = threading.Thread(target=self._ask, daemon=True)
             thread.start()
             try:
@@ -129,7 +128,7 @@ class SensorWatch:
         ]
 
 
-def _row(state: LiveState) -> tuple[float, ...]:
+def _row(state: xsens.LiveState) -> tuple[float, ...]:
     """Values of `COLUMNS`, with the time since the beginning."""
     nan = float("nan")
     rate = [nan] * 3 if state.rate_rad_s is None else np.degrees(state.rate_rad_s).tolist()

@@ -11,6 +11,7 @@ import panel as pn
 import param
 from panel.viewable import Viewable
 
+import speckle3d as s3
 from speckle3d.app.look import batch_changes
 from speckle3d.app.plots import greys
 from speckle3d.app.sweep.plots import (
@@ -22,14 +23,12 @@ from speckle3d.app.sweep.plots import (
     TimePlots,
     patch_values,
 )
-from speckle3d.config import Config, stored_config
+from speckle3d.config import stored_config
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import Doubt
-from speckle3d.core.reconstruction import Reconstruction
-from speckle3d.core.sweep import OrientationSensor, Sweep, Tracker
+from speckle3d.core.sweep import OrientationSensor, Tracker
 from speckle3d.examine.sensors import repair_readings
 from speckle3d.matching.quality import FrameFlag
-from speckle3d.study.images import grey_images
 
 MOST_ROWS = 640
 """Rows that are sent to the browser: more than a screen shows, and a third of what echoes are sampled at."""
@@ -54,14 +53,14 @@ class SweepPage:
 
     def __init__(
         self,
-        sweep: Sweep,
-        reconstruction: Reconstruction | None = None,
+        sweep: s3.Sweep,
+        reconstruction: s3.Reconstruction | None = None,
         doubts: Sequence[Doubt] | None = None,
     ) -> None:
         self.sweep = sweep
         toml = "" if reconstruction is None else reconstruction.config_toml
-        config = stored_config(toml) if toml else Config()
-        self._images = grey_images(sweep, _MOST_DB, reconstruction)
+        config = stored_config(toml) if toml else s3.Config()
+        self._images = s3.grey_images(sweep, _MOST_DB, reconstruction)
         grid = self._images.grid
         # Rows that are shown are means of so many samples.
         self._pooled = -(-grid.samples // MOST_ROWS)
@@ -174,7 +173,7 @@ class _Player(param.Parameterized):  # type: ignore[misc]
             yield f"The reconstruction did not use the pair with frame {partner}."
 
 
-def streams_of(sweep: Sweep) -> Iterator[Stream]:
+def streams_of(sweep: s3.Sweep) -> Iterator[Stream]:
     """Rotation and motion of the image by a sweep's sensors, or of uncalibrated sensors."""
     orientation, tracker = sweep.orientation, sweep.tracker
     if orientation is not None:

@@ -13,12 +13,12 @@ from bokeh.palettes import Viridis256
 from bokeh.plotting import figure
 from scipy.spatial.transform import RigidTransform
 
+import speckle3d as s3
 from speckle3d.app.plots import ImagePlot, time_plot
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import Doubt
 from speckle3d.core.grid import ImageGrid
 from speckle3d.core.reconstruction import FramePairs
-from speckle3d.core.sweep import Sweep
 from speckle3d.matching.quality import FrameFlag
 
 PatchValues = dict[str, npt.NDArray[Any]]
@@ -102,7 +102,7 @@ class TimePlots:
         Called with the frame that is clicked.
     """
 
-    def __init__(self, sweep: Sweep, jump: Callable[[int], None]) -> None:
+    def __init__(self, sweep: s3.Sweep, jump: Callable[[int], None]) -> None:
         self._time_s, self._jump = sweep.frame_time_s, jump
         self.interval_s = float(np.median(np.diff(self._time_s))) if len(sweep) > 1 else 0.04
         self._half_s = self.interval_s / 2
