@@ -98,8 +98,9 @@ class _Player(param.Parameterized):  # type: ignore[misc]
         self.param.colour.objects = {"distance": "distance", "standard deviation": "sigma", "none": "none"}
         super().__init__(colour="distance" if page.pairs is not None and len(page.pairs) else "none")
         self._picture = PatchPlot(page.patch_mm)
-        self._times = TimePlots(page.sweep, lambda frame: setattr(self, "frame", frame))
-        self._times.mark(page.flags, page.doubts)
+        self._times = TimePlots(
+            page.sweep, lambda frame: setattr(self, "frame", frame), page.flags, page.doubts
+        )
         self._text = pn.pane.HTML("", sizing_mode="stretch_width")
         self.param.watch(self._draw, ["frame", "colour", "lag", "range_db"])
         self._draw()

@@ -100,29 +100,20 @@ class TimePlots:
     sweep : Sweep
     jump : callable
         Called with the frame that is clicked.
+    flags : ndarray of int, or None
+        Frames are marked, a row for every kind of flag there is.
+    doubts : sequence of Doubt
+        As are stretches in doubt.
     """
 
-    def __init__(self, sweep: s3.Sweep, jump: Callable[[int], None]) -> None:
+    def __init__(
+        self, sweep: s3.Sweep, jump: Callable[[int], None], flags: IntArray | None, doubts: Sequence[Doubt]
+    ) -> None:
         self._time_s, self._jump = sweep.frame_time_s, jump
         self.interval_s = float(np.median(np.diff(self._time_s))) if len(sweep) > 1 else 0.04
         self._half_s = self.interval_s / 2
-        ends = self._time_s[[0, -1]] + 2 * self._half_s * np.array([-1, 1])
-        self._range = Range1d(start=float(ends[0]), end=float(ends[1]), min_interval=8 * self._half_s)
+        self._range = Range1d(self._time_s[0] - self.interval_s, self._time_s[-1] + self.interval_s)
         self.cursor = Span(dimension="height", line_color="#cc0000", line_width=1.5)
-        self._marks = ColumnDataSource({name: [] for name in ("row", "left", "right", "colour", "words")})
-        self.marks = self._plot("", y_range=FactorRange(factors=["no frame"]))
-        marks = self.marks.hbar(
-            "row", left="left", right="right", height=0.7, color="colour", source=self._marks
-        )
-        self.marks.add_tools(HoverTool(renderers=[marks], tooltips="@words"))
-        self.marks.xaxis.visible = False
-
-    def move(self, frame: int) -> None:
-        """Put the cursor at a frame."""
-        self.cursor.location = float(self._time_s[frame])
-
-    def mark(self, flags: IntArray | None, doubts: Sequence[Doubt]) -> None:
-        """Mark flagged frames, a row for every kind of flag there is, and stretches in doubt."""
         marks = [
             (reason.partition(":")[0], frame, frame, FLAG_COLOUR, reason)
             for flag, reason in REASONS.items()
@@ -132,15 +123,26 @@ class TimePlots:
             (doubt.about, *ends, _DOUBT_COLOUR, str(doubt)) for doubt in doubts for ends in doubt.frames
         ]
         rows = list(dict.fromkeys(row for row, *_ in marks))
-        self.marks.y_range.factors = rows[::-1] or ["no frame"]
-        self.marks.height, self.marks.visible = _ROW_PX * max(len(rows), 1) + 6, bool(rows)
-        self._marks.data = {
+        data = {
             "row": [row for row, *_ in marks],
             "left": [self._time_s[first] - self._half_s for _, first, *_ in marks],
             "right": [self._time_s[last] + self._half_s for _, _, last, *_ in marks],
             "colour": [mark[3] for mark in marks],
             "words": [mark[4] for mark in marks],
         }
+        self.marks = self._plot(
+            "",
+            y_range=FactorRange(factors=rows[::-1] or ["no frame"]),
+            height=_ROW_PX * max(len(rows), 1) + 6,
+            visible=bool(rows),
+        )
+        bars = self.marks.hbar("row", left="left", right="right", height=0.7, color="colour", source=data)
+        self.marks.add_tools(HoverTool(renderers=[bars], tooltips="@words"))
+        self.marks.xaxis.visible = False
+
+    def move(self, frame: int) -> None:
+        """Put the cursor at a frame."""
+        self.cursor.location = float(self._time_s[frame])
 
     def stream(self, label: str, parts: Sequence[str], time_s: FloatArray, values: FloatArray) -> figure:
         """Plot of quantities of a sensor, shape (m, 3)."""

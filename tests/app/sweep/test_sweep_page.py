@@ -88,7 +88,7 @@ def test_flags_and_doubts_are_marked_at_their_frames_and_a_click_goes_there(play
     assert f"{count} of 48 frames flagged" in text(player)
     player.frame = NO_CONTACT.start
     assert "lifted: no contact" in text(player)
-    marks = player._times._marks.data
+    marks = player._times.marks.renderers[0].data_source.data
     (spikes,) = (at for at, words in enumerate(marks["words"]) if "(suspect: spikes)" in words)
     tracker = player._page.sweep.tracker
     assert (
