@@ -143,7 +143,7 @@ class WireSettings(WireFit, ScanSettings):
         None, description="CSV of points picked by hand: frame,column_px,row_px[,wire]."
     )
     validation_points: Path | None = Field(
-        None, description="CSV of points picked by hand in that other recording."
+        None, description="With --validation: CSV of points picked by hand in that other recording."
     )
 
 

@@ -35,8 +35,6 @@ from speckle3d.core.extras import require_extra
 if TYPE_CHECKING:
     from types import FrameType
 
-    from speckle3d.core.grid import ImageGrid
-    from speckle3d.core.sweep import Frames
     from speckle3d.io.igtl.link import Connection, LinkState
     from speckle3d.live.progress import Progress
     from speckle3d.live.session import Session
@@ -242,8 +240,6 @@ def _run(session: Session, duration_s: float | None, connection: Connection, nam
             signal.raise_signal(number)
 
 
-Kind = Literal["rf", "bmode"]
-
 _DEVICES = "Image_Reference", "ProbeToReference", "ProbeToWorld"
 _LAST_S = 5.0
 """Longest wait for a client to take what is left at the end."""
@@ -253,7 +249,7 @@ def play(
     images: Path,
     port: Port = 18944,
     rate: Annotated[float, typer.Option(min=1e-3, max=1e3)] = 1.0,
-    kind: Annotated[Kind | None, typer.Option("--as")] = None,
+    kind: Annotated[Literal["rf", "bmode"] | None, typer.Option("--as")] = None,
 ) -> None:
     """Serve a recorded sweep over OpenIGTLink at its own rate, as PLUS serves a scanner.
 
@@ -267,7 +263,7 @@ def play(
     port
         0: any free one.
     kind
-        Echoes (default, of RF or I/Q) or B-mode made of them.
+        Echoes (default, of RF or I/Q of parallel vectors) or B-mode made of them.
     rate
         Speed, times the sweep's own.
 
@@ -276,12 +272,20 @@ def play(
     $ speckle3d play sweep.h5
     """
     require_extra("live", "play", "pyigtl", "fastcrc")
+    from speckle3d.core.sweep import BModeSettings
     from speckle3d.io.igtl.link import Server
     from speckle3d.io.igtl.played import clock_shift_s, played
 
     read = s3.load_sweep(images)
-    frames, grid, upright = _frames(read, kind)
-    send = partial(played, read, frames, grid, upright, _DEVICES)
+    is_grey = isinstance(read.signal, BModeSettings)
+    has_echoes = not is_grey and read.grid.fan is None
+    if kind == "rf" and not has_echoes:
+        raise InvalidInputError(f"--as rf: expected echoes of parallel vectors, got {read.name}")
+    send = partial(played, read, read.frames, read.grid, False, _DEVICES)
+    if kind == "bmode" or not has_echoes:
+        keep_levels = is_grey and read.frames.dtype == "uint8"
+        images = s3.grey_images(read, levels="stored" if keep_levels else "log")
+        send = partial(played, read, images, images.grid, True, _DEVICES)
     shift_s = clock_shift_s(read)
     next(send(shift_s))  # refused at once if messages cannot hold it
     if shift_s:
@@ -301,19 +305,3 @@ def play(
         losses = server.state.dropped
         slow = f", {losses} messages dropped: a client is too slow" if losses else ""
         note(f"{count} frames sent{slow}")
-
-
-def _frames(sweep: s3.Sweep, kind: Kind | None) -> tuple[Frames, ImageGrid, bool]:
-    """Frames to send, their grid, and whether their vectors are columns."""
-    from speckle3d.core.sweep import BModeSettings
-
-    is_grey = isinstance(sweep.signal, BModeSettings)
-    if kind == "rf" and is_grey:
-        raise InvalidInputError(f"--as rf: expected echoes, got {sweep.name}, which holds B-mode")
-    if is_grey or kind == "bmode":
-        keep_levels = is_grey and sweep.frames.dtype == "uint8"
-        images = s3.grey_images(sweep, levels="stored" if keep_levels else "log")
-        return images, images.grid, True
-    if sweep.grid.fan is not None:
-        raise InvalidInputError(f"{sweep.name}: expected parallel vectors to send, got a fan's: --as bmode")
-    return sweep.frames, sweep.grid, False

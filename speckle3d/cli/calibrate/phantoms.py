@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import speckle3d as s3
 from speckle3d.cli.commands import Fields
 from speckle3d.cli.common import Out, Result, note, report_of
-from speckle3d.core.errors import InvalidInputError, naming
+from speckle3d.core.errors import naming
 
 if TYPE_CHECKING:
     from speckle3d.calibrating.settings import ScanSettings
@@ -88,8 +88,6 @@ def _calibrate(images: Path, settings: ScanSettings, out: Path) -> Result:
         write_outcome,
     )
 
-    if settings.validation is None and getattr(settings, "validation_points", None) is not None:
-        raise InvalidInputError("--validation-points: expected the recording in --validation, got none")
     recording = open_phantom(images, settings)
     with s3.progress_bar(f"looking into {images.name}") as progress, naming(str(images)):
         detections = detect_phantom(recording, settings, progress)

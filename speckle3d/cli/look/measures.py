@@ -13,9 +13,6 @@ from speckle3d.cli.outputs import require_own_place
 from speckle3d.core.errors import naming
 
 if TYPE_CHECKING:
-    from speckle3d.core.grid import ImageGrid
-    from speckle3d.core.poses import PoseErrors
-    from speckle3d.core.volume import Volume
     from speckle3d.imaging.measures.measure import Measurement
 
 
@@ -153,9 +150,20 @@ def surface(
         surfaces_of_labels,
     )
     from speckle3d.io.voxels.volumes import read_states
+    from speckle3d.scoring.trajectories import poses_of
+    from speckle3d.study.pose_errors import caution, errors_of
+    from speckle3d.study.posed import MARK, pose_mark, require_made_at
 
     volume = s3.load_volume(volume_file)
-    errors = _errors(reconstruction, mode, volume, volume_file)
+    errors: tuple[Any, ...] = ()
+    if reconstruction is not None:
+        posed = s3.load_reconstruction(reconstruction, with_pairs=False)
+        volume_mode = mode or volume.fields.get("poses", "image")
+        with naming(f"{volume_file}: made at the poses of {volume_mode}"):
+            mark = pose_mark(poses_of(posed, volume_mode))
+        require_made_at(volume.fields.get(MARK, ""), mark, str(volume_file))
+        note(caution(posed, volume_mode))
+        errors = errors_of(posed, volume_mode), posed.grid
     mask = None if state is None else read_states(state, volume) != EMPTY
     if level is not None:
         surfaces = {out: s3.surface_of(volume, level, "below" if below else "above", mask)}
@@ -174,25 +182,6 @@ def surface(
         about = {"parts": int(mesh.parts().max()) + 1, "size_mm": np.ptp(mesh.vertices_mm, axis=0)}
         sizes.append({"file": str(place), **vars(measures_of(mesh, *errors)), **about})
     return sizes, "\n".join(map(_line, sizes))
-
-
-def _errors(
-    path: Path | None, mode: str | None, volume: Volume, where: Path
-) -> tuple[PoseErrors, ImageGrid] | tuple[()]:
-    """Errors of the poses that a volume was made at, and the grid of the images; empty without a path."""
-    from speckle3d.scoring.trajectories import poses_of
-    from speckle3d.study.pose_errors import caution, errors_of
-    from speckle3d.study.posed import MARK, pose_mark, require_made_at
-
-    if path is None:
-        return ()
-    volume_mode = mode or volume.fields.get("poses", "image")
-    reconstruction = s3.load_reconstruction(path, with_pairs=False)
-    with naming(f"{where}: made at the poses of {volume_mode}"):
-        poses = poses_of(reconstruction, volume_mode)
-    require_made_at(volume.fields.get(MARK, ""), pose_mark(poses), str(where))
-    note(caution(reconstruction, volume_mode))
-    return errors_of(reconstruction, volume_mode), reconstruction.grid
 
 
 def _line(sizes: dict[str, Any]) -> str:

@@ -23,10 +23,9 @@ from speckle3d.cli.common import (
 from speckle3d.core.errors import InvalidInputError
 
 if TYPE_CHECKING:
-    from speckle3d.core.arrays import FloatArray
     from speckle3d.core.grid import Region
     from speckle3d.imaging.voxels.settings import CompoundingSettings
-    from speckle3d.study.posed import PosedSweep, SweepModes
+    from speckle3d.study.posed import PosedSweep
 
 _IMPORTED = (
     "plus_config",
@@ -263,9 +262,9 @@ def reslice(
     $ speckle3d reslice out/reconstruction.h5 -o cut.png --mode image --mode pose
     """
     from speckle3d.imaging.cuts.oblique import spanned_plane
-    from speckle3d.io.points import parse_places
-    from speckle3d.study.posed import at_modes
-    from speckle3d.study.reslices.cuts import cut_as_volume, cut_at_modes
+    from speckle3d.io.points import PICTURE, WORLD, parse_places, read_places
+    from speckle3d.study.posed import at_modes, require_made_at
+    from speckle3d.study.reslices.cuts import cut_as_volume, cut_at_modes, read_plane
     from speckle3d.study.reslices.places import along_curve, along_sweep, in_frame, in_world
     from speckle3d.study.reslices.reslice_figures import save_reslices
 
@@ -280,8 +279,12 @@ def reslice(
     modes = at_modes(first, mode or ())
     source, _ = modes.posed.source(None, dynamic_range_db)
     grid = source.grid
-    if curve is not None:
-        place = along_curve(modes, grid, _curve(curve, on, modes), pixel_mm)
+    if curve is not None and on is not None:
+        picture = read_plane(on, modes.reference)
+        require_made_at(picture.mark, modes.marks[modes.reference], str(on))
+        place = along_curve(modes, grid, picture.world_mm(read_places(curve, PICTURE)), pixel_mm)
+    elif curve is not None:
+        place = along_curve(modes, grid, read_places(curve, WORLD), pixel_mm)
     elif plane is not None:
         place = in_world(modes, grid, plane, pixel_mm)
     elif frame is not None:
@@ -289,21 +292,8 @@ def reslice(
     else:
         place = along_sweep(modes, grid, lateral_mm, depth_mm, pixel_mm)
     with s3.progress_bar(f"reslicing {out.name}"):
-        picture = cut_at_modes(modes, place, source, dynamic_range_db, part)
+        cut = cut_at_modes(modes, place, source, dynamic_range_db, part)
     if out.suffix.lower() == ".png":
-        save_reslices(picture, out)
+        save_reslices(cut, out)
     else:
-        s3.write_volume(out, cut_as_volume(picture))
-
-
-def _curve(path: Path, picture: Path | None, modes: SweepModes) -> FloatArray:
-    """Points of a curve in the world, read as such or as points of a picture of the mode that is cut."""
-    from speckle3d.io.points import PICTURE, WORLD, read_places
-    from speckle3d.study.posed import require_made_at
-    from speckle3d.study.reslices.cuts import read_plane
-
-    if picture is None:
-        return read_places(path, WORLD)
-    plane = read_plane(picture, modes.reference)
-    require_made_at(plane.mark, modes.marks[modes.reference], str(picture))
-    return plane.world_mm(read_places(path, PICTURE))
+        s3.write_volume(out, cut_as_volume(cut))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import typer
 
@@ -23,10 +23,6 @@ from speckle3d.cli.common import (
     status_line,
 )
 from speckle3d.core.errors import InvalidInputError, naming
-
-if TYPE_CHECKING:
-    from scipy.spatial.transform import Rotation
-
 
 World = Annotated[Literal["ENU", "NWU", "NED"] | None, typer.Option(case_sensitive=False)]
 Method = Literal["smoother", "filter", "vqf", "vqf-online", "sensor"]
@@ -275,7 +271,10 @@ def accuracy(
         if mechanism is not None:
             readings, truth = xsens.readings_at(rotations, mechanism), mechanism.base_from_image
         elif optical is not None:
-            readings, truth = _beside_tracker(rotations, optical, time_offset_s, fit_mounting, mountings)
+            readings, truth = xsens.common_readings(rotations, _optical(optical), time_offset_s)
+            if fit_mounting:
+                note("the target's mounting is found from the motion: constant errors do not show")
+                truth = truth * xsens.mounting_from_motion(readings * mountings.mean(), truth)
         errors = xsens.pair_errors(readings, truth, mountings)
     table = xsens.AccuracyTable.of({log_file.stem: errors})
     if figure is not None:
@@ -284,28 +283,16 @@ def accuracy(
     return rows_of(table.values())[0], f"{table.text()}\n{how}"
 
 
-def _beside_tracker(
-    rotations: xsens.TimedRotations,
-    optical: Path,
-    time_offset_s: float,
-    fit_mounting: bool,
-    mountings: Rotation,
-) -> tuple[Rotation, Rotation]:
-    """Readings of the sensor, and the image's orientation by the tracker at the same moments."""
+def _optical(path: Path) -> xsens.TimedRotations:
+    """Orientation by a tracker, of TUM text or of a log that carries its own."""
     from speckle3d.io.tum import is_tum, read_tum
 
-    if is_tum(optical):
-        poses = read_tum(optical)
-        target_stream = xsens.TimedRotations(poses.time_s, poses.world_from_sensor.rotation)
-    else:
-        log = read(optical)
-        note_gaps(log)
-        target_stream = log.rotations()
-    readings, target = xsens.common_readings(rotations, target_stream, time_offset_s)
-    if not fit_mounting:
-        return readings, target
-    note("the target's mounting is found from the motion: constant errors of calibration do not show")
-    return readings, target * xsens.mounting_from_motion(readings * mountings.mean(), target)
+    if is_tum(path):
+        poses = read_tum(path)
+        return xsens.TimedRotations(poses.time_s, poses.world_from_sensor.rotation)
+    log = read(path)
+    note_gaps(log)
+    return log.rotations()
 
 
 def record(
