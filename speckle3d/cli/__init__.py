@@ -19,43 +19,43 @@ from speckle3d.core.errors import NoSpaceError, Speckle3DError
 __all__ = ["app", "main"]
 
 _CALIBRATE: Table = {
-    "curves": "calibrate.curves:curves",
-    "plane": "calibrate.phantoms:plane",
-    "orientation": "calibrate.phantoms:orientation",
-    "wires": "calibrate.phantoms:wires",
-    "images": "calibrate.images:images",
-    "clock": "calibrate.images:clock",
-    "repeatability": "calibrate.phantoms:repeatability",
+    "curves": "speckle3d.cli.calibrate.curves:curves",
+    "plane": "speckle3d.cli.calibrate.phantoms:plane",
+    "orientation": "speckle3d.cli.calibrate.phantoms:orientation",
+    "wires": "speckle3d.cli.calibrate.phantoms:wires",
+    "images": "speckle3d.cli.calibrate.images:images",
+    "clock": "speckle3d.cli.calibrate.images:clock",
+    "repeatability": "speckle3d.cli.calibrate.phantoms:repeatability",
 }
-_TRAJECTORY: Table = {"export": "trajectory:export", "score": "trajectory:score"}
+_TRAJECTORY: Table = {"export": "speckle3d.cli.trajectory:export", "score": "speckle3d.cli.trajectory:score"}
 _IMU: Table = {
-    "info": "sensors.imu:info",
-    "convert": "sensors.imu:convert",
-    "orient": "sensors.imu:orient",
-    "accuracy": "sensors.imu:accuracy",
-    "record": "sensors.imu:record",
+    "info": "speckle3d.cli.sensors.imu:info",
+    "convert": "speckle3d.cli.sensors.imu:convert",
+    "orient": "speckle3d.cli.sensors.imu:orient",
+    "accuracy": "speckle3d.cli.sensors.imu:accuracy",
+    "record": "speckle3d.cli.sensors.imu:record",
 }
 _COMMANDS: Table = {
-    "reconstruct": "reconstruction:reconstruct",
+    "reconstruct": "speckle3d.cli.reconstruction:reconstruct",
     "calibrate": (
         "Calibrate what a reconstruction needs: curves of a probe, mountings of sensors.",
         _CALIBRATE,
     ),
-    "volume": "look.volumes:volume",
-    "view": "look.view:view",
-    "reslice": "look.volumes:reslice",
-    "measure": "look.measures:measure",
-    "surface": "look.measures:surface",
-    "scene": "look.volumes:scene",
-    "info": "files:info",
-    "convert": "files:convert",
+    "volume": "speckle3d.cli.look.volumes:volume",
+    "view": "speckle3d.cli.look.view:view",
+    "reslice": "speckle3d.cli.look.volumes:reslice",
+    "measure": "speckle3d.cli.look.measures:measure",
+    "surface": "speckle3d.cli.look.measures:surface",
+    "scene": "speckle3d.cli.look.volumes:scene",
+    "info": "speckle3d.cli.files:info",
+    "convert": "speckle3d.cli.files:convert",
     "trajectory": ("Trajectories as TUM text, and scores of them.", _TRAJECTORY),
-    "compare": "reconstruction:compare",
+    "compare": "speckle3d.cli.reconstruction:compare",
     "imu": ("The orientation sensor: logs, live data, orientation.", _IMU),
-    "live": "stream:live",
-    "play": "stream:play",
-    "simulate": "files:simulate",
-    "config": "files:config",
+    "live": "speckle3d.cli.stream:live",
+    "play": "speckle3d.cli.stream:play",
+    "simulate": "speckle3d.cli.files:simulate",
+    "config": "speckle3d.cli.files:config",
 }
 """In the order of work: what most sessions need first."""
 
@@ -78,11 +78,11 @@ def main() -> None:
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
     with stoppable() as heard, warnings.catch_warnings():
-        warnings.showwarning = _warn
+        warnings.showwarning = _tell
         _run(heard)
 
 
-def _warn(message: Warning | str, *_: object, **__: object) -> None:
+def _tell(message: Warning | str, *_: object, **__: object) -> None:
     note(f"speckle3d: {' '.join(str(message).split())}")
 
 
@@ -115,5 +115,5 @@ def _run(heard: list[int]) -> None:
 
 
 def _fail(message: str, code: int = 2) -> None:
-    note(f"speckle3d: {' '.join(message.split())}")
+    _tell(message)
     sys.exit(code)

@@ -298,9 +298,8 @@ class Group(TyperGroup):
         """The command or group of that name; None if there is none."""
         if cmd_name in self.table and self.commands[cmd_name] is None:
             entry = self.table[cmd_name]
-            self.commands[cmd_name] = (
-                group(*entry) if isinstance(entry, tuple) else command_of(cmd_name, _function(entry))
-            )
+            is_group = isinstance(entry, tuple)
+            self.commands[cmd_name] = group(*entry) if is_group else command_of(cmd_name, _load(entry))
         return super().get_command(ctx, cmd_name)
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
@@ -309,16 +308,11 @@ class Group(TyperGroup):
         self.format_help_text(ctx, formatter)
         rows = []
         for name, entry in self.table.items():
-            text = entry[0] if isinstance(entry, tuple) else inspect.getdoc(_function(entry)) or ""
+            text = entry[0] if isinstance(entry, tuple) else inspect.getdoc(_load(entry)) or ""
             sentence = re.split(r"[.;](?:\s|$)", text, maxsplit=1)[0]
             rows.append((name, " ".join(sentence.split()) + "."))
         with formatter.section("Commands"):
             formatter.write_dl(rows)
-
-
-def _function(place: str) -> Command:
-    function: Command = _load(f"speckle3d.cli.{place}")
-    return function
 
 
 def group(text: str, table: Table) -> Any:

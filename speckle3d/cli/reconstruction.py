@@ -125,8 +125,6 @@ def reconstruct(
     if save_curves is not None and result.curves is not None:
         s3.write_curves(save_curves, result.curves)
         note(f"curves corrected by the crossing sweep, for this probe: {save_curves}")
-    elif save_curves is not None:
-        note(f"{save_curves}: not written, since the sweeps could not be crossed")
     if volume is not None:
         posed = open_posed(result.directory / "reconstruction.h5", None, sweep_file)
         note(*posed.notes())

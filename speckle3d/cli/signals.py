@@ -31,11 +31,11 @@ class ToldToStopError(KeyboardInterrupt):
 
 
 @contextmanager
-def handle_signals(handler: Callable[[int, FrameType | None], None], *names: str) -> Iterator[None]:
-    """Handle signals in a block; those that the process was started to ignore, as by nohup, stay so."""
+def handle_ends(handler: Callable[[int, FrameType | None], None]) -> Iterator[None]:
+    """Handle signals that ask for the end; those that the process was started to ignore, as by nohup, stay so."""
     before = {}
     if threading.current_thread() is threading.main_thread():  # only the main thread may set handlers
-        numbers = [getattr(signal, name) for name in names if hasattr(signal, name)]
+        numbers = [getattr(signal, name) for name in ENDS if hasattr(signal, name)]
         before = {n: was for n in numbers if (was := signal.getsignal(n)) not in (signal.SIG_IGN, None)}
     try:
         for number in before:
@@ -64,7 +64,7 @@ def stoppable() -> Iterator[list[int]]:
             return
         raise ToldToStopError
 
-    with handle_signals(stop, *ENDS):
+    with handle_ends(stop):
         try:
             yield heard
         finally:

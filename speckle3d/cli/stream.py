@@ -28,7 +28,7 @@ from speckle3d.cli.common import (
     status_line,
 )
 from speckle3d.cli.reconstruction import reconstruct
-from speckle3d.cli.signals import ENDS, handle_signals
+from speckle3d.cli.signals import handle_ends
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.extras import require_extra
 
@@ -233,7 +233,7 @@ def _run(session: Session, duration_s: float | None, connection: Connection, nam
         session.end()
 
     sys.setswitchinterval(_SWITCH_S)
-    with handle_signals(end, *ENDS), status_line() as show_line:
+    with handle_ends(end), status_line() as show_line:
         session.run(duration_s, show)
     for number in signals:
         if number != signal.SIGINT:

@@ -155,7 +155,7 @@ def clock(
     $ speckle3d calibrate clock bath.h5 --calibration tracker.h5 -o timed.h5
     """
     from calibration.clock.images import delay_from_images
-    from calibration.clock.line import FEWEST_FRAMES, delay_from_lines, line_signal
+    from calibration.clock.line import delay_from_lines, line_signal
     from calibration.detection.lines import detect_lines
     from speckle3d.calibrating.recordings import open_recording
 
@@ -186,11 +186,6 @@ def clock(
         with s3.progress_bar(f"finding lines in {images.name}") as progress, naming(str(images)):
             lines = detect_lines(recording.images, recording.pixel_mm, None, scan.corners, progress)
             frames = len(lines)
-            if frames < FEWEST_FRAMES:
-                raise InsufficientDataError(
-                    f"expected a line in at least {FEWEST_FRAMES} frames, got one in {frames} of "
-                    f"{len(times)}: record a plane's echo, for longer; of tissue use --by images"
-                )
             signal = line_signal(lines.pixels, recording.pixel_mm, (columns - 1) / 2)
             readings, around_s = recording.readings, recording.time_offset_s
             delay = delay_from_lines(signal, times[lines.frame], readings, around_s, search_s)
