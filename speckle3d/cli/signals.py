@@ -32,7 +32,7 @@ class ToldToStopError(KeyboardInterrupt):
 
 @contextmanager
 def handle_ends(handler: Callable[[int, FrameType | None], None]) -> Iterator[None]:
-    """Handle signals that ask for the end; those that the process was started to ignore, as by nohup, stay so."""
+    """Handle signals that ask for the end; those that the process must ignore, as by nohup, stay so."""
     before = {}
     if threading.current_thread() is threading.main_thread():  # only the main thread may set handlers
         numbers = [getattr(signal, name) for name in ENDS if hasattr(signal, name)]
