@@ -298,8 +298,8 @@ class Group(TyperGroup):
         """The command or group of that name; None if there is none."""
         if cmd_name in self.table and self.commands[cmd_name] is None:
             entry = self.table[cmd_name]
-            is_group = isinstance(entry, tuple)
-            self.commands[cmd_name] = group(*entry) if is_group else command_of(cmd_name, _load(entry))
+            made = group(*entry) if isinstance(entry, tuple) else command_of(cmd_name, _load(entry))
+            self.commands[cmd_name] = made
         return super().get_command(ctx, cmd_name)
 
     def format_help(self, ctx: Any, formatter: Any) -> None:

@@ -284,8 +284,8 @@ def play(
     send = partial(played, read, read.frames, read.grid, False, _DEVICES)
     if kind == "bmode" or not has_echoes:
         keep_levels = is_grey and read.frames.dtype == "uint8"
-        images = s3.grey_images(read, levels="stored" if keep_levels else "log")
-        send = partial(played, read, images, images.grid, True, _DEVICES)
+        greys = s3.grey_images(read, levels="stored" if keep_levels else "log")
+        send = partial(played, read, greys, greys.grid, True, _DEVICES)
     shift_s = clock_shift_s(read)
     next(send(shift_s))  # refused at once if messages cannot hold it
     if shift_s:
