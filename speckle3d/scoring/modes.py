@@ -41,8 +41,9 @@ def default_mode(reconstruction: Reconstruction) -> tuple[str, str]:
         return "image", ""
     # Of modes that claim as much, the later corrects more.
     best = min(reversed(lengths), key=lambda mode: lengths[mode][1] / lengths[mode][0])
-    length, sigma = lengths[best]
+    words = {mode: f"{length:.2f} +- {1.96 * sigma:.2f}" for mode, (length, sigma) in lengths.items()}
+    alone = "" if best == "image" else f"; the images alone: {words['image']}"
     return best, (
-        f"mode {best}: claims the smallest error of length, {length:.2f} +- {1.96 * sigma:.2f} mm (95 %); "
+        f"mode {best}: claims the smallest error of length, {words[best]} mm (95 %){alone}; "
         "--mode takes another"
     )
