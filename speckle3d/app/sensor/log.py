@@ -115,7 +115,7 @@ class LogReadings:
     def facts(self, time_s: float) -> list[tuple[str, str]]:
         """Facts about the log and the orientation at a time."""
         log, orientation, rotation = self._log, self._orientation, self.orientation_at(time_s)
-        rows = [] if rotation is None else [angles(rotation)]
+        rows = [("time", f"{time_s:.1f} s"), *([] if rotation is None else [angles(rotation)])]
         north, notes = "magnetic north, y west", log.notes
         if isinstance(orientation, xsens.Orientation):
             times_s, last = orientation.rotations.time_s, len(orientation) - 1

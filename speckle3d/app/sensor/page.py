@@ -43,7 +43,9 @@ Source = LogReadings | SensorWatch
 _REFRESH_MS, _STEP_S = 125, 0.1
 _LEFT_PX = 350
 _KEY = (
-    '<span style="color:#6b7780"><span style="color:#e8a33d">&#9632;</span> the field is not believed &emsp;'
+    '<span style="color:#6b7780">rate: <span style="color:#b3261e">&mdash; x</span> '
+    '<span style="color:#2e7d32">&mdash; y</span> <span style="color:#20507a">&mdash; z</span> &emsp;'
+    '<span style="color:#e8a33d">&#9632;</span> the field is not believed &emsp;'
     '<span style="color:#b3261e">|</span> samples are missing &emsp;'
     '<span style="background:#20507a40">&emsp;</span> 95 % interval</span>'
 )
@@ -76,7 +78,7 @@ def sensor_page(source: Source, sensor_from_image: Rotation | None = None) -> Pa
 class _Viewer(param.Parameterized):  # type: ignore[misc]
     """View of a sensor for one viewer."""
 
-    step = param.Integer(0, label="time / 0.1 s")
+    step = param.Integer(0, label="step of 0.1 s")
 
     def __init__(self, source: Source, mounting: Rotation | None) -> None:
         super().__init__()
@@ -131,14 +133,11 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
     def _plot(self, label: str, names: tuple[str, ...]) -> figure:
         plot = time_plot(label, self._range, self._cursor, self._go, min_border_left=64)
         for name in names:
-            legend = {"legend_label": name} if len(names) > 1 else {}
-            plot.line("t", name, source=self._data, color=_LINES.get(name, "#1c2730"), **legend)
+            plot.line("t", name, source=self._data, color=_LINES.get(name, "#1c2730"))
         if names == ("field",):
             plot.scatter("t", "doubt", source=self._data, color="#e8a33d", size=6, marker="square")
         if names == ("heading",):
             plot.varea("t", "low", "high", source=self._data, fill_color="#20507a", fill_alpha=0.25)
-        for legend in plot.legend:
-            legend.update(orientation="horizontal", location="top_left", padding=2, margin=2)
         if gaps := self._source.gaps_s():
             plot.vspan(x=gaps, line_color="#b3261e", line_width=1.5)
         return plot
