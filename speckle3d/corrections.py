@@ -69,8 +69,8 @@ def correct(
     >>> [len(corrected[mode].poses) for mode in ("orientation", "pose")]
     [32, 32]
     """
-    require_kind(tracked, Tracked, "tracked", "track(sweep, curves)")
-    require_kind(sweep, Sweep, "sweep", "load_sweep(path)")
+    require_kind(tracked, Tracked, "track(sweep, curves)")
+    require_kind(sweep, Sweep, "load_sweep(path)")
     settings, modes = config or Config(), [modes] if isinstance(modes, str) else modes
     require_modes(sweep, modes, crossed is not None)
     for mode in modes:

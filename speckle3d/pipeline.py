@@ -86,7 +86,7 @@ def track(
     >>> len(tracked.image), tracked.direction_from, bool(tracked.flags.any())
     (32, 'tracker', False)
     """
-    require_kind(sweep, Sweep, "sweep", "load_sweep(path)")
+    require_kind(sweep, Sweep, "load_sweep(path)")
     settings = config or Config()
     if curves is None:
         if sweep.path is None:
@@ -96,7 +96,7 @@ def track(
         path = curves_beside(sweep.path)
         curves = read_curves(path)
         warnings.warn(trust_words(path, curves, settings.curves.same_probe), stacklevel=2)
-    require_kind(curves, DecorrelationCurves, "curves", "load_curves(path)")
+    require_kind(curves, DecorrelationCurves, "load_curves(path)")
     with naming(sweep.name):
         return _track(sweep, curves, settings, progress, sink, images)
 
@@ -163,7 +163,7 @@ def _track(
     )
 
 
-def require_kind(value: Any, kind: type, name: str, made_by: str) -> None:
+def require_kind(value: Any, kind: type, made_by: str) -> None:
     """Raise `InvalidInputError` unless an argument has a type.
 
     Parameters
@@ -171,8 +171,6 @@ def require_kind(value: Any, kind: type, name: str, made_by: str) -> None:
     value : object
         The argument.
     kind : type
-    name : str
-        Of the argument.
     made_by : str
         What makes such an object, as ``load_sweep(path)``.
 
@@ -182,5 +180,5 @@ def require_kind(value: Any, kind: type, name: str, made_by: str) -> None:
         If it is something else.
     """
     if not isinstance(value, kind):
-        kind_name = type(value).__name__
-        raise InvalidInputError(f"{name}: expected a {kind.__name__}, as {made_by} gives it, got {kind_name}")
+        name = type(value).__name__
+        raise InvalidInputError(f"expected a {kind.__name__}, as {made_by} gives it, got {name}")

@@ -16,8 +16,6 @@ from speckle3d.cli.common import emit, note
 from speckle3d.cli.signals import stoppable
 from speckle3d.core.errors import NoSpaceError, Speckle3DError
 
-__all__ = ["app", "main"]
-
 _CALIBRATE: Table = {
     "curves": "speckle3d.cli.calibrate.curves:curves",
     "plane": "speckle3d.cli.calibrate.phantoms:plane",

@@ -5,8 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import typer
-
 import speckle3d as s3
 from speckle3d.cli.commands import Fields
 from speckle3d.cli.common import (
@@ -63,7 +61,7 @@ def config() -> None:
 
 
 def convert(
-    source: Annotated[Path, typer.Argument(metavar="IN")],
+    source: Path,
     out: Annotated[OutArgument, "sweep sequence"],
     settings: Annotated[
         Any,

@@ -29,8 +29,8 @@ Triple = tuple[float, float, float]
 
 
 def images(
-    first: Annotated[Path, typer.Argument(metavar="A")],
-    second: Annotated[Path, typer.Argument(metavar="B")],
+    first: Path,
+    second: Path,
     out: Annotated[Out, "calibration"],
     *,
     start: MaybePath = None,
@@ -53,7 +53,7 @@ def images(
     out
         Calibration file to write; .txt and .png beside it.
     start
-        Calibration to start from; by default A's own, if it has one. Not with --start-mm.
+        Calibration to start from; by default FIRST's own, if it has one. Not with --start-mm.
     start_mm
         With --start-deg: start by ruler, the image's top left corner seen from the sensor, x y z.
     start_deg
@@ -63,7 +63,7 @@ def images(
     Other Parameters
     ----------------
     poses
-        File with readings, if not in A and B; once for each.
+        File with readings, if not in FIRST and SECOND; once for each.
     transform, pixel_mm
     time_offset_s
         The sensor's clock offset, in place of the files' own; see `speckle3d calibrate clock --by images`.
@@ -83,7 +83,7 @@ def images(
     from speckle3d.core.geometry import rotation_from_fixed_angles
 
     if poses and len(poses) != 2:
-        raise InvalidInputError(f"--poses: expected it twice, for A and for B, got {len(poses)}")
+        raise InvalidInputError(f"--poses: expected it twice, for FIRST and SECOND, got {len(poses)}")
     calibration = None if start is None else s3.load_calibration(start)
     if time_offset_s is None and calibration is not None:
         time_offset_s = calibration.time_offset_s

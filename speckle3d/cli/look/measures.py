@@ -13,7 +13,7 @@ from speckle3d.cli.outputs import require_own_place
 from speckle3d.core.errors import naming
 
 if TYPE_CHECKING:
-    from speckle3d.imaging.measures.measure import Measurement
+    pass
 
 
 def measure(
@@ -68,27 +68,22 @@ def measure(
     pick_mm = PICKING * reconstruction.grid.vector_pitch_mm if pick_mm is None else pick_mm
     measurements = s3.measure(reconstruction, places, mode, pick_mm)
     note(why, caution(reconstruction, mode))
-    numbers = {"mode": mode, "pick_mm": pick_mm, "measurements": [_record(m) for m in measurements]}
+    records = [
+        {
+            "kind": row.kind,
+            "points": [number + 1 for number in row.points],
+            "value": row.value * row.shown_in[0],
+            "standard_error": row.sigma * row.shown_in[0],
+            "by_poses": row.pose_sigma * row.shown_in[0],
+            "by_picking": row.pick_sigma * row.shown_in[0],
+            "interval_95": [end * row.shown_in[0] for end in row.interval],
+            "unit": row.shown_in[1],
+        }
+        for row in measurements
+    ]
+    numbers = {"mode": mode, "pick_mm": pick_mm, "measurements": records}
     lines = [*(measurement.line for measurement in measurements), how_measured(mode, pick_mm)]
     return numbers, "\n".join(lines)
-
-
-def _record(measurement: Measurement) -> dict[str, Any]:
-    """A measurement as JSON has it, angles in degrees."""
-    scale, unit = measurement.shown_in
-    numbers = {
-        "value": measurement.value,
-        "standard_error": measurement.sigma,
-        "by_poses": measurement.pose_sigma,
-        "by_picking": measurement.pick_sigma,
-    }
-    return {
-        "kind": measurement.kind,
-        "points": [number + 1 for number in measurement.points],
-        **{name: value * scale for name, value in numbers.items()},
-        "interval_95": [end * scale for end in measurement.interval],
-        "unit": unit,
-    }
 
 
 def surface(

@@ -82,10 +82,9 @@ def info(log_file: Path, rate_hz: MaybeNumber = None, world: World = None) -> Re
     --------
     $ speckle3d imu info log.mtb
     """
-    import numpy as np
-
     from speckle3d.core.sweep import INERTIAL
     from xsens.logs.contradictions import contradictions
+    from xsens.logs.samples import median_norm
 
     log = read(log_file, rate_hz, world)
     rate = (f"{log.rate_hz:.2f}", "samples/s") if math.isfinite(log.rate_hz) else ("unknown", "")
@@ -98,11 +97,8 @@ def info(log_file: Path, rate_hz: MaybeNumber = None, world: World = None) -> Re
     ]
     for name, unit in zip(INERTIAL, ("m/s^2", "rad/s", "a.u."), strict=True):
         values, noun = getattr(log, name), name.split("_")[0]
-        if values is None or np.isnan(values).all():
-            rows.append((noun, "none", ""))
-        else:
-            norm = np.nanmedian(np.linalg.norm(values, axis=1))
-            rows.append((f"{noun}, median norm", f"{norm:.4f}", unit))
+        norm = math.nan if values is None else median_norm(values)
+        rows.append((f"{noun}, median norm", f"{norm:.4f}", unit) if norm == norm else (noun, "none", ""))
     notes = [*log.notes, *filter(None, contradictions(log).values())]
     return rows_of([*rows, *(("note", text, "") for text in notes)])
 
