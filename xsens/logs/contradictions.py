@@ -38,9 +38,6 @@ if the unit is deg/s, another if the rate of samples is, -1 or about 0 if axes a
 and simulated hands show 0.78 to 1.16, by the field 0.91 to 1.16; rocking once a second about a point 0.07 m
 above the sensor shows 0.7, 0.12 m below it 1.5."""
 
-_TIMES_LARGER = 3.0
-"""Share from which the other's turn counts, not the gyroscope's: no hand's movement makes so much."""
-
 _ABOUT_AXIS = 0.9
 """Share of the turn missed by a gyroscope that is about an axis which stands still. By the field, BROAD's
 trials with an axis set to zero show 0.8 to 1.0, and any axis as it is 0.4 to 0.91."""
@@ -177,13 +174,13 @@ def _against_gyroscope(name: str, turns: FloatArray, change: FloatArray) -> str 
     for axis, turn in (("", whole), *zip((" x", " y", " z"), turns, strict=True)):
         rate, square = _rms(turn), max((turn**2).sum(), 1e-12)
         share = 1.0 + (turn * missed).sum() / square
-        scatter = (turn * (missed + (1.0 - share) * turn)).sum(axis=1)
-        scatter = np.add.reduceat(scatter, np.arange(0, len(scatter), _BLOCK))
+        rest = missed + (1.0 - share) * turn
+        scatter = np.add.reduceat((turn * rest).sum(axis=1), np.arange(0, len(turn), _BLOCK))
         error = _ERRORS * float(np.sqrt((scatter**2).sum())) / square
         low, high = _HONEST_SHARES
         agrees |= not axis and low < share - error and share + error < high
-        larger = share if share > _TIMES_LARGER else 1.0
-        if rate * larger > _LEAST_TURN * _rms(missed) and (share + error < low or share - error > high):
+        clear = rate * max(share, 1.0) > _LEAST_TURN * _rms(rest)
+        if clear and (share + error < low or share - error > high):
             doubt = "are rate, axes and signs as they are told"
             if 0.0 < share < 0.05 or share > 20.0:
                 doubt = f"is the gyroscope in {'rad' if share > 1.0 else 'deg'}/s"
