@@ -115,7 +115,7 @@ def usable_samples(log: ImuLog) -> tuple[IntArray, Samples, list[str]]:
             f"{median_s:.4g} s: times in milliseconds?"
         )
     against = contradictions(log)
-    fatal = ["gravity", "gyroscope", "accelerometer"]
+    fatal = ["gravity", "gyroscope", "accelerometer's axis", "accelerometer"]
     if against.get("accelerometer") != "":  # nor does it agree: either may be wrong
         fatal += ["own orientation", "magnetometer"]
     for name in fatal:
@@ -124,7 +124,7 @@ def usable_samples(log: ImuLog) -> tuple[IntArray, Samples, list[str]]:
             raise InvalidInputError(f"{source}: {problem}{advice}")
     notes += filter(None, against.values())
     field = log.magnetometer_au
-    if against.get("magnetometer"):
+    if against.get("magnetometer") or against.get("magnetometer's axis"):
         field = None
         notes.append("the magnetometer is left out")
     if left_out := int((~rows).sum()):

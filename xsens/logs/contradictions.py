@@ -67,7 +67,9 @@ def contradictions(log: ImuLog) -> dict[str, str | None]:
         if rate is None or direction is None:
             continue
         if dead := _dead_axis(rate, direction):
-            sentences[name] = f"the {name}'s {dead} axis reads the same while the gyroscope turns it"
+            sentences[f"{name}'s axis"] = (
+                f"the {name}'s {dead} axis reads the same while the gyroscope turns it"
+            )
             continue
         if not (turns := _turns(log.time_s, rate, direction)):
             continue
