@@ -34,11 +34,6 @@ def test_reversed_curves_are_refused(part, curves):
         track(part, reverse(curves))
 
 
-def test_scaled_distances_are_refused(part, curves):
-    with pytest.raises(MismatchError, match="tilt"):
-        track(part, replace(curves, distance_mm=1.5 * curves.distance_mm))
-
-
 def test_curves_of_other_depths_are_refused(part, curves):
     deeper = replace(curves, depth_mm=curves.depth_mm + 60.5)
     with pytest.raises(MismatchError, match=r"^phantom: .*64\.0 to 100\.2 mm, got 3\.5 to 39\.7 mm"):

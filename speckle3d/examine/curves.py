@@ -7,7 +7,7 @@ another factor at each depth, since all depths of one image move together.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -17,7 +17,6 @@ from speckle3d.core.arrays import FloatArray
 from speckle3d.core.curves import DecorrelationCurves, SpeckleSize, curve_widths
 from speckle3d.core.errors import Doubt, MismatchError, Speckle3DError
 from speckle3d.core.sweep import RFSettings
-from speckle3d.matching.intensity import two_way_wavenumber
 from speckle3d.matching.patches import PatchGrid
 from speckle3d.matching.texture import Texture
 from speckle3d.motion.coherence import NOISY_GAIN, ROW_SIGMA, RowScales
@@ -26,11 +25,11 @@ from speckle3d.motion.estimate import Motion
 BEND_DOUBT, BEND_LIMIT = 0.12, 0.25
 """Standard deviation over depth of the logarithm of distances. Simulated: right curves up to 0.06 in phantom,
 tissue and noise; of a lens whose focus is 10 % off 0.11; shipped ones 10 mm too high 0.20, reversed 0.53."""
-SIZE_DOUBT = {"lateral_mm": 0.13, "axial_mm": 0.3}
-SIZE_LIMIT = {"lateral_mm": 0.3, "axial_mm": 0.6}
-"""Median over depth of the logarithm of speckle sizes over the phantom's, either sign. Simulated: lateral up
-to 0.03 in phantom, 0.10 in tissue, 0.19 to 0.31 at depths wrong by 10 mm; axial 0.08, with attenuation wrong
-by 0.3 dB/cm/MHz 0.17, with a sampling rate wrong by a factor of two 0.69."""
+SIZE_LIMITS = {"lateral_mm": (0.13, 0.3), "axial_mm": (0.3, 0.6)}
+"""From which sizes are doubted, and refuted: median over depth of the logarithm of speckle sizes over the
+phantom's, either sign. Simulated: lateral up to 0.03 in phantom, 0.10 in tissue, 0.19 to 0.31 at depths wrong
+by 10 mm; axial 0.08, with attenuation wrong by 0.3 dB/cm/MHz 0.17, with a sampling rate wrong by a factor of
+two 0.69."""
 LEAST_ROWS = 4
 """Rows of patches from which doubts arise."""
 _LEAST_RISE = 0.04
@@ -39,8 +38,6 @@ by 0.14 in 4 cm."""
 WIDEST_MM = 8.0
 """Distance over which no beam keeps 0.6 of its correlation: that of an unfocused element 35 mm high, which
 keeps (1 - d / 35)^2 of the echo's. Probes' elements are 2 to 15 mm high, and focused."""
-TILT_FACTOR = 1.4
-"""Of tilt's spread over that of the curves' width, from which it is calculated when curves are measured."""
 
 
 def examine_key(curves: DecorrelationCurves, all_patches: PatchGrid, patches: PatchGrid) -> tuple[Doubt, ...]:
@@ -51,7 +48,7 @@ def examine_key(curves: DecorrelationCurves, all_patches: PatchGrid, patches: Pa
     MismatchError
         If the curves are no beam's.
     """
-    return require_usable((doubt_depths(curves, all_patches, patches), *doubt_widths(curves)), MismatchError)
+    return require_usable((doubt_depths(curves, all_patches, patches), doubt_width(curves)), MismatchError)
 
 
 def doubt_depths(curves: DecorrelationCurves, all_patches: PatchGrid, patches: PatchGrid) -> Doubt | None:
@@ -66,17 +63,11 @@ def doubt_depths(curves: DecorrelationCurves, all_patches: PatchGrid, patches: P
     return Doubt("curves", "depths", evidence, False)
 
 
-def doubt_widths(curves: DecorrelationCurves) -> Iterator[Doubt]:
-    """Doubt curves that no beam has."""
-    width = curve_widths(curves.distance_mm, curves.correlation)
-    if curves.tilt is not None and isinstance(curves.key.signal, RFSettings):
-        ratio = float(np.median(curves.tilt.spread_mm / (two_way_wavenumber(curves.key.signal) * width**2)))
-        if abs(np.log(ratio)) > np.log(TILT_FACTOR):
-            evidence = f"expected tilt to spread echoes as the curves' width has it, got {ratio:.2f} times it"
-            yield Doubt("curves", "distances changed after the curves were measured", evidence, True)
-    if np.median(width) > WIDEST_MM:
-        evidence = f"expected correlation to fall within {WIDEST_MM:g} mm, got {np.median(width):.3g} mm"
-        yield Doubt("curves", "units", evidence, True)
+def doubt_width(curves: DecorrelationCurves) -> Doubt | None:
+    """Refute curves that no beam has."""
+    width = float(np.median(curve_widths(curves.distance_mm, curves.correlation)))
+    evidence = f"expected correlation to fall within {WIDEST_MM:g} mm, got {width:.3g} mm"
+    return Doubt("curves", "units", evidence, True) if width > WIDEST_MM else None
 
 
 def require_usable(doubts: Iterable[Doubt | None], error: type[Speckle3DError]) -> tuple[Doubt, ...]:
@@ -155,21 +146,20 @@ def doubt_size(
     if reference is None:
         return ()
     doubts = []
-    for name in ("lateral_mm", "axial_mm"):
+    for name, (least, most) in SIZE_LIMITS.items():
         # Noise differs from sample to sample, so that speckle under it looks finer.
         fair = np.isfinite(getattr(speckle, name)) & (gain >= NOISY_GAIN)
         if fair.sum() < LEAST_ROWS:
             continue
         size, phantom = (getattr(source, name)[fair] for source in (speckle, reference))
         off = float(np.median(np.abs(np.log(size / phantom))))
-        if off > SIZE_DOUBT[name]:
+        if off > least:
             evidence = (
                 f"expected {name.removesuffix('_mm')} speckle of {np.median(phantom):.3f} mm, as in the "
                 f"curves' phantom, got {np.median(size):.3f} mm ({100 * off:.0f} % off at "
                 "the median depth)"
             )
-            is_refuted = bool(off > SIZE_LIMIT[name])
-            doubts.append(Doubt("curves", "another probe, depth or sampling rate", evidence, is_refuted))
+            doubts.append(Doubt("curves", "another probe, depth or sampling rate", evidence, off > most))
     return tuple(doubts)
 
 

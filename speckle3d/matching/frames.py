@@ -94,8 +94,8 @@ class FrameByFrame:
 
     def __init__(self, matcher: FrameMatcher, schedule: PairSchedule | KnownSchedule) -> None:
         self._matcher, self._schedule = matcher, schedule
-        self._frames: dict[int, Frame] = {}
-        self._motion: dict[int, FloatArray] = {}
+        self._frames: dict[int, tuple[Frame, FloatArray]] = {}
+        self._motion = np.zeros(3)
 
     def advance(self, number: int, frame: Frame) -> CorrelationTable:
         """Match a frame with the earlier ones of the schedule; pairs by increasing first frame.
@@ -107,24 +107,23 @@ class FrameByFrame:
         """
         table = self._pairs(number, frame)
         self._schedule.settle(number, dict(zip(table.first.tolist(), table.median.tolist(), strict=True)))
-        keep, self._frames[number] = self._schedule.needed(number), frame
-        self._frames = {k: v for k, v in self._frames.items() if k in keep}
-        self._motion = {k: v for k, v in self._motion.items() if k in keep}
+        self._frames[number] = frame, self._motion
+        self._frames = {k: self._frames[k] for k in self._schedule.needed(number) if k in self._frames}
         return table
 
     def _pairs(self, number: int, frame: Frame) -> CorrelationTable:
         """Match a frame with its references, from a start found against the first that it resembles."""
         references, least = self._schedule.references(number), self._schedule.least_correlation
-        self._motion[number] = self._motion.get(number - 1, np.zeros(3))
-        fixed = {first: self._frames[first] for first in sorted(references)}
+        fixed = {first: self._frames[first][0] for first in sorted(references)}
         table = self._matcher.match({}, number, frame, [])
         for anchor in references[:SEARCHES]:
-            motion = compose(self._motion[anchor], self._matcher.search(fixed[anchor], frame))
-            starts = [compose(inverse(self._motion[first]), motion) for first in fixed]
+            before = self._frames[anchor][1]
+            motion = compose(before, self._matcher.search(fixed[anchor], frame))
+            starts = [compose(inverse(self._frames[first][1]), motion) for first in fixed]
             table = self._matcher.match(fixed, number, frame, starts)
             if table.median.max() >= least:
-                row = sorted(references).index(anchor)
+                row = list(fixed).index(anchor)
                 close = table.median[row] >= least
-                self._motion[number] = compose(self._motion[anchor], table.inplane[row]) if close else motion
+                self._motion = compose(before, table.inplane[row]) if close else motion
                 break
         return table

@@ -179,9 +179,7 @@ def correlation(a: Float32Array, b: Float32Array) -> FloatArray:
 
 def _clipping(frame: npt.NDArray[Any], is_bmode: bool, settings: QualitySettings) -> float:
     """Share of samples at a frame's extremes over its limit; a constant frame has none."""
-    samples = np.ascontiguousarray(frame)
-    if np.iscomplexobj(samples):
-        samples = samples.view(samples.real.dtype)
+    samples = np.ascontiguousarray(frame).view(frame.real.dtype)
     low, high = samples.min(), samples.max()
     if low == high:
         return 0.0

@@ -68,7 +68,7 @@ class Texture:
 
     def __init__(self, matcher: FrameMatcher) -> None:
         self.signal, self._patches = matcher.signal, matcher.patches
-        self._edge_fraction, self._of_echo = matcher.key.edge_fraction, matcher.of_echo
+        self._edge_fraction = matcher.key.edge_fraction
         self._looks: dict[int, _Look] = {}
 
     def keep(self, number: int, ready: ReadyFrame) -> None:
@@ -130,12 +130,12 @@ class Texture:
         return np.asarray(np.median([middle - low, high - middle], axis=1))
 
     def spectra(self) -> EchoSpectra | None:
-        """Power spectrum within the band that is matched, at each row of patches; None without phase.
+        """Power spectrum within the band that is matched, at each row of patches; None of grey levels.
 
         RF and I/Q of one sweep have the same: both are band-passed and resampled alike before they are
         matched. Every patch counts the same, however bright.
         """
-        if not (self._of_echo and isinstance(self.signal, RFSettings)):
+        if not isinstance(self.signal, RFSettings):
             return None
         power = self._rows("power").mean(axis=(0, 3)).T
         has_echo = ~np.ma.getmaskarray(power).any(axis=1)
@@ -148,7 +148,7 @@ class Texture:
         edge = self._edge_fraction * (high - low)
         band = (frequency > low - edge) & (frequency < high + edge)
         return EchoSpectra(
-            self._patches.row_depth_mm[has_echo], frequency[band], power.data[np.ix_(has_echo, band)]
+            self._patches.row_depth_mm[has_echo], frequency[band], power.data[has_echo][:, band]
         )
 
     def sample_spectrum(self) -> tuple[FloatArray, FloatArray] | None:

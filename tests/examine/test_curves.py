@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 import speckle
 
-from speckle3d.core.curves import SpeckleSize, TiltResponse
+from speckle3d.core.curves import SpeckleSize
 from speckle3d.core.grid import ImageGrid
-from speckle3d.examine.curves import doubt_bend, doubt_size, doubt_widths
-from speckle3d.matching.intensity import two_way_wavenumber
+from speckle3d.examine.curves import doubt_bend, doubt_size, doubt_width
 from speckle3d.matching.patches import lay_patches
 from speckle3d.motion.coherence import RowScales
 
@@ -22,17 +21,8 @@ CLEAR = np.ones(ROWS.size)
 
 @pytest.mark.parametrize(("factor", "refutes"), [(1.0, False), (5.0, False), (1000.0, True)])
 def test_curves_wider_than_any_beam_are_refuted(factor, refutes):
-    doubts = doubt_widths(replace(CURVES, distance_mm=factor * CURVES.distance_mm))
-    assert [d.refuted for d in doubts] == [True] * refutes
-
-
-@pytest.mark.parametrize(("factor", "refutes"), [(1.0, False), (1.1, False), (1.5, True), (0.5, True)])
-def test_distances_scaled_after_the_measurement_contradict_the_tilt(factor, refutes):
-    # 0.45 mm: where -ln(rho) of `speckle.gaussian_correlation` is a half.
-    spread = np.full(ROWS.size, two_way_wavenumber(speckle.RF) * 0.45**2)
-    tilt_curves = replace(CURVES, tilt=TiltResponse(np.zeros(ROWS.size), spread))
-    doubts = doubt_widths(replace(tilt_curves, distance_mm=factor * tilt_curves.distance_mm))
-    assert [d.refuted for d in doubts] == [True] * refutes
+    doubt = doubt_width(replace(CURVES, distance_mm=factor * CURVES.distance_mm))
+    assert (doubt is not None and doubt.refuted) == refutes
 
 
 def row_scales(by, gain=1.0):
