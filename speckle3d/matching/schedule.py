@@ -81,9 +81,8 @@ class PairSchedule:
 
     def references(self, frame: int) -> list[int]:
         """Earlier frames to measure `frame` against: the last sound one, then latest first."""
-        recent = range(max(0, frame - self.settings.recent), frame)
-        keys = self._keys if frame % 2 else self._keys[-self.settings.key_frames :]
-        latest_first = sorted({*recent, *keys, *self._sound}, reverse=True)
+        far = () if frame % 2 else self._keys[: -self.settings.key_frames]
+        latest_first = sorted(self.needed(frame - 1).difference(far), reverse=True)
         return sorted(latest_first, key=lambda earlier: earlier not in self._sound[-1:])
 
     def settle(self, frame: int, correlations: dict[int, float]) -> None:
