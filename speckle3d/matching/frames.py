@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from speckle3d.core.images import spread_frames
 from speckle3d.core.sweep import Sweep
 from speckle3d.core.threads import ahead
 from speckle3d.kernels.inplane import Frame
@@ -15,7 +16,7 @@ from speckle3d.matching.matcher import FrameMatcher, compose, inverse
 from speckle3d.matching.quality import FrameFeatures, FrameFlag, flag_frames
 from speckle3d.matching.schedule import KnownSchedule, PairSchedule
 from speckle3d.matching.table import CorrelationTable
-from speckle3d.matching.texture import Texture, measured_texture
+from speckle3d.matching.texture import FRAMES, Texture
 
 SEARCHES = 3
 """References against which the in-plane motion of a frame is searched, if it resembles none before: the last
@@ -72,10 +73,14 @@ def match_sweep(
     images : callable, optional
         Called with every intensity image.
     """
-    pairing, texture = FrameByFrame(matcher, schedule), measured_texture(sweep, matcher)
+    pairing, texture = FrameByFrame(matcher, schedule), Texture(matcher)
+    texture_frames = spread_frames(len(sweep), FRAMES).tolist()
+    matcher.leave_out([matcher.extractor.echo(sweep.frames[number]) for number in texture_frames])
     features, tables = [], []
     frames = ahead(lambda number: matcher.ready(sweep.frames[number]), range(len(sweep)))
     for number, ready in enumerate(frames):
+        if number in texture_frames:
+            texture.keep(number, ready)
         if images:
             images(number, ready.echo.intensity)
         features.append(ready.features)

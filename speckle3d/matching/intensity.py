@@ -144,10 +144,10 @@ class IntensityExtractor:
             return np.ones_like(intensity)
         sides = (self.grid.vector_pitch_mm, self.grid.sample_spacing_mm)
         wide, high = (2 * int(self.settings.equalise_mm / 2 / side) + 1 for side in sides)
-        mean, share = (
-            uniform_filter(values, (wide, high), mode="nearest")
-            for values in (intensity * counted, counted.astype(np.float32))
-        )
+        mean = uniform_filter(intensity * counted, (wide, high), mode="nearest")
+        share = counted.astype(np.float32)
+        if not counted.all():
+            share = uniform_filter(share, (wide, high), mode="nearest")
         # Less than half a sample is rounding: nothing counts near.
         share[share <= 0.5 / (wide * high)] = 0.0
         return np.divide(share, np.maximum(mean, np.finfo(np.float32).tiny), out=share)

@@ -193,12 +193,10 @@ class Texture:
 
 
 def measured_texture(sweep: Sweep, matcher: FrameMatcher) -> Texture:
-    """Read some frames of a sweep, leave out of all what stands still in them, and measure their texture."""
-    texture, numbers = Texture(matcher), spread_frames(len(sweep), FRAMES).tolist()
-    frames = [sweep.frames[number] for number in numbers]
-    matcher.leave_out([matcher.extractor.echo(frame) for frame in frames])
-    for number, frame in zip(numbers, frames, strict=True):
-        texture.keep(number, matcher.ready(frame))
+    """Read some frames of a sweep, and measure their texture."""
+    texture = Texture(matcher)
+    for number in spread_frames(len(sweep), FRAMES).tolist():
+        texture.keep(number, matcher.ready(sweep.frames[number]))
     return texture
 
 
