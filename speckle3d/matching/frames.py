@@ -37,7 +37,7 @@ class MatchedSweep:
     features : sequence of FrameFeatures
         Of every frame.
     texture : Texture
-        Of some frames, those without a flag if there are any.
+        Of the usable patches of some frames.
     flags : ndarray of int, shape (n,)
         `FrameFlag` of every frame, by what is in it and what it shares with others.
     echoless : ndarray, shape (p,)
@@ -89,7 +89,6 @@ def match_sweep(
             progress(number + 1, len(sweep))
     table, flags = CorrelationTable.joined(tables), flag_frames(features, matcher.quality)
     flags[table.unmatched(len(sweep), schedule.least_correlation)] |= FrameFlag.UNMATCHED
-    texture.leave_out(flags != 0)
     echoless = matcher.patches.inside - np.mean([frame.usable for frame in features], axis=0)
     return MatchedSweep(table, features, texture, flags, echoless)
 

@@ -105,10 +105,9 @@ class QualitySettings(BaseModel):
 class FrameFeatures:
     """Quality features of one frame."""
 
-    mean: FloatArray
-    """Mean intensity of each patch, shape (p,): a frame that repeats the one before has the same."""
     contrast: FloatArray
-    """Standard deviation of intensity over its mean, shape (p,)."""
+    """Standard deviation of intensity over its mean, shape (p,): a frame that repeats the one before has the
+    same."""
     lateral: FloatArray
     """Correlation of neighbouring vectors, shape (p,)."""
     clipped: float
@@ -147,8 +146,7 @@ def inspect_frame(
     tiles = patches.tiles(intensity)[..., ::step]
     wide, high = tiles.shape[1] // 2, tiles.shape[2] // 2
     with np.errstate(divide="ignore", invalid="ignore"):  # Of flat patches.
-        mean = tiles.mean(axis=(1, 2))
-        tiles = tiles / mean[:, None, None] - np.float32(1.0)
+        tiles = tiles / tiles.mean(axis=(1, 2), keepdims=True) - np.float32(1.0)
         contrast, alike = tiles.std(axis=(1, 2)), correlation(tiles[:, :-1], tiles[:, 1:])
         across = correlation(tiles[:, :wide], tiles[:, -wide:])
         along = correlation(tiles[..., :high], tiles[..., -high:])
@@ -167,7 +165,7 @@ def inspect_frame(
         with np.errstate(divide="ignore"):  # Black patches have none.
             spread = np.log(patches.tiles(frame)[..., :: 4 * step].std(axis=(1, 2), dtype=np.float64))
     shares = share(together & fine), share(~together)
-    return FrameFeatures(mean, contrast, alike, _clipping(frame, is_bmode, s), *shares, spread, usable)
+    return FrameFeatures(contrast, alike, _clipping(frame, is_bmode, s), *shares, spread, usable)
 
 
 def correlation(a: Float32Array, b: Float32Array) -> FloatArray:
@@ -204,7 +202,7 @@ def flag_frames(features: Sequence[FrameFeatures], settings: QualitySettings | N
     """
     s = settings or QualitySettings()
     flags = np.zeros(len(features), dtype=np.int64)
-    repeats = [np.array_equal(frame.mean, before.mean, True) for before, frame in pairwise(features)]
+    repeats = [np.array_equal(frame.contrast, before.contrast, True) for before, frame in pairwise(features)]
     flags[1:][repeats] |= FrameFlag.FROZEN
     for k, frame in enumerate(features):
         if frame.clipped >= 1:

@@ -45,7 +45,7 @@ class CorrelationTable:
         ordered = np.sort(self.correlation.astype(float), axis=1)  # NaN comes last.
         count = np.isfinite(ordered).sum(axis=1, keepdims=True)
         middle = np.maximum(np.hstack([count - 1, count]) // 2, 0)
-        return np.nan_to_num(np.take_along_axis(ordered, middle, axis=1).mean(axis=1))
+        return np.asarray(np.nan_to_num(np.take_along_axis(ordered, middle, axis=1).mean(axis=1)))
 
     def among(self, usable: BoolArray) -> CorrelationTable:
         """Copy of the table without the correlations of some patches."""

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy import fft
 
-from speckle3d.core.arrays import BoolArray, Complex64Array, Float32Array, FloatArray, IntArray
+from speckle3d.core.arrays import Complex64Array, Float32Array, FloatArray, IntArray
 from speckle3d.core.curves import EchoSpectra, SpeckleSize
 from speckle3d.core.images import spread_frames
 from speckle3d.core.sweep import BModeSettings, RFSettings, Sweep
@@ -90,10 +90,6 @@ class Texture:
         size = _sizes(intensity, ready.features, patches.spacing_mm)
         size, power = (np.where(usable, values, np.nan) for values in (size, power))
         self._looks[number] = _Look(size, power, level, sample_power, _unit_echoes(local_tiles), step)
-
-    def leave_out(self, bad: BoolArray) -> None:
-        """Forget the frames of a sweep, shape (n,), that are bad, unless all are."""
-        self._looks = {k: look for k, look in self._looks.items() if not bad[k]} or self._looks
 
     @property
     def frames(self) -> IntArray:
