@@ -21,7 +21,6 @@ import numpy as np
 
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError, MismatchError
-from speckle3d.core.geometry import require_finite
 from speckle3d.io.hdf5 import PathLike, atomic_path
 from speckle3d.io.text import numbers, table
 
@@ -46,9 +45,6 @@ class PickedPoints:
     frame: IntArray
     pixels: FloatArray
     wire: IntArray | None = None
-
-    def __post_init__(self) -> None:
-        require_finite(self.pixels, "pixels")
 
     def __len__(self) -> int:
         return len(self.frame)

@@ -75,10 +75,10 @@ class Layout:
         InvalidInputError
         """
         path, dtype = header.path, header.dtype.newbyteorder("=")
-        if header.channels > 1 or self.kind not in (*RF_TYPES, "BRIGHTNESS"):
+        content = "colour" if header.channels > 1 else self.kind
+        if content not in (*RF_TYPES, "BRIGHTNESS"):
             raise InvalidInputError(
-                f"{path}: expected grey B-mode or RF, no colour, got {self.kind} of {header.channels} "
-                "number(s) a pixel: export them as grey"
+                f"{path}: expected grey B-mode or RF images, got {content}: export them as grey"
             )
         if self.kind == "BRIGHTNESS" and dtype != np.uint8:
             raise InvalidInputError(f"{path}: expected B-mode of type uint8, got {dtype}")
