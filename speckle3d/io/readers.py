@@ -17,7 +17,6 @@ from typing import Any
 
 import h5py
 
-from speckle3d.core.errors import FileError
 from speckle3d.core.files import PathLike, open_regular
 from speckle3d.core.sweep import Sweep
 from speckle3d.io.hdf5 import SIGNATURE, open_hdf5, reading
@@ -106,8 +105,6 @@ def first_bytes(path: PathLike) -> bytes:
     """
     if Path(path).is_dir():
         return b""
-    if not Path(path).exists():
-        raise FileError(f"{path}: expected a file, got none")
     with open_regular(path) as stream:
         return stream.read(START_BYTES)
 

@@ -142,12 +142,11 @@ def read_samples(member: Member) -> SensorSamples:
         facts = [
             ("quaternion, off the vertical", f"{off:.2f}", "deg RMS"),
             ("accelerometer taken as", meaning, ""),
-            ("quaternion", f"{MEANING} (checked against the accelerometer)", ""),
+            ("quaternion taken as", MEANING, ""),
         ]
         if off >= _MOST_OFF_DEG:
             rotation, sign, fault = None, -1.0, "does not agree with gravity"
     if rotation is None:
-        facts = facts[:2]
         remarks.append(
             f"the sensor's quaternion {fault}: the sweep has no orientation, which `speckle3d imu orient "
             f"{member.path} --into SWEEP.h5` finds"

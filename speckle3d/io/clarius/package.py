@@ -71,7 +71,7 @@ class Member:
 
 def is_package(path: Path, _: bytes) -> bool:
     """Whether a file or folder looks like a package, or one file of one."""
-    with suppress(FileError, OSError):
+    with suppress(FileError):
         return bool(_members(path))
     return path.suffix.lower() == ".tar"  # one that is cut says so when it is read
 
@@ -110,8 +110,8 @@ def _members(path: Path) -> list[Member]:
             places = [(file, file.name, 0, file.stat().st_size) for file in sorted(path.iterdir())]
         elif part := _NAME.fullmatch(path.name):
             kinds = {"rf", "iq", "env", "imu"} if part["kind"] == "imu" else {part["kind"], "imu"}
-            members = _members(path.parent)
-            return [file for file in members if file.recording == (part["name"] or "") and file.kind in kinds]
+            recording, members = str(Path(part["name"] or "")), _members(path.parent)
+            return [file for file in members if file.recording == recording and file.kind in kinds]
         else:
             # It is read to its end, so that one cut short is refused.
             with open_regular(path) as stream, tarfile.open(fileobj=stream, mode="r:") as archive:
@@ -120,6 +120,6 @@ def _members(path: Path) -> list[Member]:
     members = []
     for file, name, start, size in places:
         if part := _NAME.fullmatch(Path(name).name):
-            recording = str(Path(name).with_name(part["name"])) if part["name"] else str(Path(name).parent)
+            recording = str(Path(name).parent / (part["name"] or ""))
             members.append(Member(file, name, start, size, recording, part["kind"], part["content"]))
     return members
