@@ -74,8 +74,8 @@ def open_package(path: Path, settings: ImportSettings) -> Facts:
             remarks.append(f"the sensor is left out: {error}")
     ymls = {kind: Description.of(file) for kind, file in sidecars.items() if kind != "imu"}
     for kind, yml in ymls.items():
-        facts = ((name, yml.fields[name]) for name in _FACTS if yml.fields.get(name))
-        yield from ((f"{kind}: {name}", str(text)[:60], "") for name, text in facts)
+        facts = ((fact, yml.fields[fact]) for fact in _FACTS if yml.fields.get(fact))
+        yield from ((f"{kind}: {fact}", str(text)[:60], "") for fact, text in facts)
     if (kinds := raw.keys() - ymls.keys()) or not raw:
         start, suffix = f"{name}_" if name else "", "yml" if kinds else "raw"
         lacks = " or ".join(f"{start}{kind}.{suffix}" for kind in sorted(kinds or ymls)) or "samples (.raw)"
@@ -87,12 +87,12 @@ def open_package(path: Path, settings: ImportSettings) -> Facts:
     shape = records["samples"].shape[:3]
     elements = _elements(yml, shape[1])
     yield "first line at element", f"{elements[0]:g}, taken as the image's left", ""
+    if (count := yml.number("frames")) not in (None, len(records)):
+        remarks.append(f"the yml says {count:g} frames, the raw file holds {len(records)}")
 
-    yml_rate_hz, speed_m_s = (
-        yml.require("sampling rate"),
-        yml.number("vsound") or yml.number("speed of sound"),
-    )
-    rate_hz, transmit_hz = settings.sampling_rate_hz or yml_rate_hz, yml.number("transmit frequency")
+    yml_rate_hz, transmit_hz = yml.require("sampling rate"), yml.number("transmit frequency")
+    rate_hz = settings.sampling_rate_hz or yml_rate_hz
+    speed_m_s = yml.number("vsound") or yml.number("speed of sound")
     spacing_mm = 1e3 * (settings.speed_of_sound_m_s or speed_m_s or SPEED_OF_SOUND_M_S) / (2.0 * rate_hz)
     first_mm, model = None, _model(settings.probe or yml.model)
     if (delay := yml.number("delay samples")) is not None:
@@ -110,9 +110,8 @@ def open_package(path: Path, settings: ImportSettings) -> Facts:
         shift_hz, receive = settings.demodulation_frequency_hz, yml.receive
         if receive is not None:
             start_mm = first_mm or settings.first_sample_depth_mm or 0.0
-            middle_hz, slide = _oscillator(
-                receive, start_mm + spacing_mm * np.arange(shape[2], dtype=np.float64), rate_hz
-            )
+            depths_mm = start_mm + spacing_mm * np.arange(shape[2], dtype=np.float64)
+            middle_hz, slide = _oscillator(receive, depths_mm, rate_hz)
             values["demodulation_frequency_hz"] = Value(middle_hz, "of the lines' middle")
             if shift_hz is None and slide.any():
                 turns = np.exp(2j * np.pi * slide)
