@@ -167,11 +167,9 @@ class _Candidates:
     def samples(self, rng: np.random.Generator, count: int) -> FloatArray:
         """Models of candidates drawn from four frames each, the likelier more often, shape (count, 12)."""
         frames = np.argsort(rng.random((count, len(self.frames))), axis=1)[:, :_SAMPLE]
-        rank = np.arange(len(self.of_frame)) - self.start[self.of_frame]
-        weight = np.append(0.0, np.cumsum(1.0 / (1.0 + rank)))
-        before, after = weight[self.start], weight[self.start + self.count]
-        draw = before[frames] + rng.random(frames.shape) * (after - before)[frames]
-        sample = np.minimum(np.searchsorted(weight[1:], draw, side="right"), len(rank) - 1)
+        # Uniform in the rank's logarithm.
+        rank = (self.count[frames] + 1.0) ** rng.random(frames.shape) - 1.0
+        sample = self.start[frames] + rank.astype(int)
         return self._solve(self.rows[sample].reshape(count, -1, 12), self.target[sample].reshape(count, -1))
 
     def _solve(self, matrix: FloatArray, target: FloatArray) -> FloatArray:

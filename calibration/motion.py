@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from calibration.points import ANGLES, CHAIN, PROBE, SCALES, columns_of
+from calibration.points import ANGLES, PROBE, SCALES, columns_of, in_chain
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError
 
@@ -237,14 +237,11 @@ def extents(solution: Solution) -> dict[str, float]:
 
 def _independent_covariance(solution: Solution) -> FloatArray:
     """Covariance of `CHAIN` if errors are independent, as large as detection's, and answers plausible."""
-    widths = dict(zip(SCALES, solution.chain.pixel_mm * _UNKNOWN, strict=True))
-    before = np.array([widths.get(name, _UNKNOWN_MM if name[0] in "xyz" else _UNKNOWN_RAD) for name in CHAIN])
-    before = np.minimum(before, solution.prior.sigma)
+    poses = np.tile(np.repeat([_UNKNOWN_MM, _UNKNOWN_RAD], 3), 2)
+    before = np.minimum([*(solution.chain.pixel_mm * _UNKNOWN), *poses], solution.prior.sigma)
     sigma, columns = max(solution.sigma, _LEAST_SIGMA[int(solution.angular)]), columns_of(solution.free)
     information = solution.jacobian.T @ solution.jacobian / sigma**2 + np.diag(before[columns] ** -2.0)
-    full = np.zeros((len(CHAIN), len(CHAIN)))
-    full[np.ix_(columns, columns)] = np.linalg.inv(information)
-    return full
+    return in_chain(solution.free, np.linalg.inv(information))
 
 
 def _errors(solution: Solution, covariance: FloatArray) -> FloatArray:

@@ -141,10 +141,8 @@ def fit_wandering(
     grid : ndarray
         The part of the grid that has a say.
     """
-    scale = np.linalg.norm(jacobian, axis=0)
-    scale = np.where(scale > 0, scale, 1.0)
-    information = np.broadcast_to(certainty / scale**2, scale.shape)
-    columns = np.ascontiguousarray(np.column_stack([jacobian / scale, residuals]))
+    information = np.broadcast_to(certainty, jacobian.shape[1])
+    columns = np.ascontiguousarray(np.column_stack([jacobian, residuals]))
     pauses_s = np.maximum(np.diff(frame_time_s, prepend=frame_time_s[0]), 0.0)
     effects = np.ascontiguousarray(effects)
 
@@ -157,7 +155,7 @@ def fit_wandering(
         return white.T @ white, volume
 
     normal, log_determinant = map(np.array, zip(*ahead(whiten, range(len(grid))), strict=True))
-    free = max(len(residuals) - len(scale), 1)
+    free = max(len(residuals) - jacobian.shape[1], 1)
     sizes, axes = np.linalg.eigh(normal[:, :-1, :-1])
     along = np.einsum("gij,gi->gj", axes, normal[:, :-1, -1])
     firm = np.where(sizes > _SINGULAR * sizes[:, -1:], sizes, np.inf)
@@ -171,7 +169,7 @@ def fit_wandering(
     weight = weight[likely] / weight[likely].sum()
     inverse = normal[:, :-1, :-1] / variance[:, None, None] + np.diag(information)
     spread = np.linalg.pinv(inverse, rcond=_SINGULAR, hermitian=True)
-    pull = normal[:, :-1, -1] / variance[:, None] + information * excess * scale
+    pull = normal[:, :-1, -1] / variance[:, None] + information * excess
     steps = -np.einsum("gij,gj->gi", spread, pull)
     step = weight @ steps
     away = steps - step
@@ -179,8 +177,8 @@ def fit_wandering(
     spread *= free / max(free - 2, 1)
     covariance = np.einsum("g,gij->ij", weight, spread) + (weight * away.T) @ away
     noise = Noise(
-        step / scale,
-        covariance / np.outer(scale, scale),
+        step,
+        covariance,
         float(np.sqrt(weight @ variance)),
         (weight * variance * np.sum(grid[:, :2] ** 2, axis=1)) @ grid[:, 4:],
     )
@@ -250,16 +248,15 @@ def fit_noise(
     frame_time_s = points.times[starts[:-1] // several]
     further_slopes = np.zeros((equations.offsets.size, 0)) if slopes is None else slopes
     further, count = np.zeros(further_slopes.shape[1]), len(free)
-    exact, expected = equations, np.zeros(len(further_slopes))
+    exact = equations
     effects = error_effects(equations, chain)
     axes, proportions = _error_axes(effects, seen_as)
     effects = effects.reshape(-1, 7) @ axes.T
     # Of one residual a frame, jitter is white noise.
     grid = make_grid(effects, frame_time_s, proportions, JITTER[:1] if seen_as == "direction" else JITTER)
     for _ in range(_STEPS):
-        values, derivatives = exact.at(chain)
-        # What was taken out of the points, put back as the small thing that it is.
-        residuals = values.ravel() + expected + further_slopes @ further
+        derivatives = exact.at(chain)[1]
+        residuals = equations.residuals(chain).ravel() + further_slopes @ further
         jacobian = np.hstack([derivatives.reshape(len(further_slopes), -1)[:, columns], further_slopes])
         effects = error_effects(exact, chain).reshape(-1, 7) @ axes.T
         beliefs = prior.sigma[columns] ** -2.0, prior.displacement(chain)[columns]
@@ -270,7 +267,7 @@ def fit_noise(
         step = np.zeros(derivatives.shape[-1])
         step[columns] = noise.step[:count]
         chain, further = chain.displace(step), further + noise.step[count:]
-        exact, expected = _denoise(equations, chain, residuals, effects, axes, starts, noise)
+        exact = _denoise(equations, chain, residuals, effects, axes, starts, noise)
     return chain, further, noise.covariance
 
 
@@ -282,35 +279,31 @@ def _denoise(
     axes: FloatArray,
     starts: IntArray,
     noise: Noise,
-) -> tuple[Equations, FloatArray]:
-    """Take expected errors out of poses and pixels; return also what that takes out of the residuals.
+) -> Equations:
+    """Take expected errors out of poses and pixels.
 
     Residuals, shape (m,), are divided between the errors of a frame, which along `axes` have these effects,
     and noise in the image, each frame by itself.
     """
     points, (n, several) = equations.points, equations.offsets.shape
-    size = np.diff(starts)
-    frame = np.repeat(np.arange(len(size)), size)
-    place = np.arange(len(residuals)) - starts[frame]
-    slopes, values = np.zeros((len(size), size.max(), effects.shape[1])), np.zeros((len(size), size.max()))
-    slopes[frame, place], values[frame, place] = effects, residuals
-    white = max(noise.white, _SMALLEST) ** 2
-    covariance = (slopes * noise.spread) @ np.swapaxes(slopes, 1, 2) + white * np.eye(size.max())
-    pull = np.linalg.solve(covariance, values[..., None])[..., 0]
-    error = ((noise.spread * np.einsum("fa,fak->fk", pull, slopes)) @ axes)[frame[::several]]
+    root, white = np.sqrt(noise.spread), max(noise.white, _SMALLEST) ** 2
+    shapes = effects * root
+    normal = np.add.reduceat(shapes[:, :, None] * shapes[:, None], starts[:-1]) + white * np.eye(len(root))
+    pull = np.add.reduceat(shapes * residuals[:, None], starts[:-1])
+    of_frame = root * np.linalg.solve(normal, pull[..., None])[..., 0]
+    of_row = np.repeat(of_frame, np.diff(starts), axis=0)
+    error = of_row[::several] @ axes
     poses = points.world_from_sensor.as_matrix()
     poses[:, :3, :3] = Rotation.from_rotvec(-error[:, :3]).as_matrix() @ points.turns
     poses[:, :3, 3] -= error[:, 3:6]
     in_image = equations.rows @ chain.target[:3, :3] @ points.turns @ chain.probe[:3, :2]
     # The smallest displacement in the image, mm, that explains what is left to it.
     square = in_image @ np.swapaxes(in_image, 1, 2) + 1e-9 * np.eye(several)
-    image = (white * pull[frame, place]).reshape(n, several, 1)
+    image = (residuals - (effects * of_row).sum(axis=1)).reshape(n, several, 1)
     shift_mm = np.einsum("nr,nri->ni", np.linalg.solve(square, image)[..., 0], in_image)
     places = replace(
         points,
         world_from_sensor=RigidTransform(poses, normalize=False),
         pixels=points.pixels - (shift_mm + error[:, 6:] * [1.0, 0.0]) / chain.pixel_mm,
     )
-    exact = replace(equations, points=places)
-    expected = np.einsum("nrk,nk->nr", error_effects(exact, chain), error)
-    return exact, (expected + np.einsum("nri,ni->nr", in_image, shift_mm)).ravel()
+    return replace(equations, points=places)

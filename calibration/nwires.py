@@ -52,7 +52,7 @@ def middle_wires(points: ImagePoints, phantom: WirePhantom) -> tuple[ImagePoints
     Returns
     -------
     middle : ImagePoints, length n
-        The middle dots.
+        The middle dots, one N after another.
     phantom_mm : ndarray, shape (n, 3)
         Where they are in the phantom's frame, from the distances of the outer dots.
 
@@ -72,9 +72,7 @@ def middle_wires(points: ImagePoints, phantom: WirePhantom) -> tuple[ImagePoints
         share = np.linalg.norm(to_middle, axis=1) / np.linalg.norm(between, axis=1)
         middles.append(middle)
         places.append(crossings[0] + share[:, None] * (crossings[1] - crossings[0]))
-    index = np.concatenate(middles)
-    order = np.argsort(points.frame[index], kind="stable")
-    return points[index[order]], np.concatenate(places)[order]
+    return points[np.concatenate(middles)], np.concatenate(places)
 
 
 def nwire_errors_mm(

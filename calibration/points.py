@@ -40,6 +40,13 @@ def columns_of(names: Sequence[str]) -> list[int]:
     return [CHAIN.index(name) for name in names]
 
 
+def in_chain(names: Sequence[str], covariance: FloatArray) -> FloatArray:
+    """Covariance of all of `CHAIN` from that of some, zero for the others, shape (14, 14)."""
+    full, columns = np.zeros((len(CHAIN), len(CHAIN))), columns_of(names)
+    full[np.ix_(columns, columns)] = covariance
+    return full
+
+
 @dataclass(frozen=True)
 class Recording:
     """Images and the readings of a sensor on the probe.

@@ -13,7 +13,7 @@ from calibration.clock.fitted import estimate_offset, with_uncertain_offset
 from calibration.clock.offset import ClockOffset, covered
 from calibration.consensus import GATES_MM, Consensus, find_consensus
 from calibration.points import Detections, ImagePoints, Recording
-from calibration.report import Snapshot, as_calibration
+from calibration.report import as_calibration
 from calibration.solution import Solution
 from speckle3d.core.calibration import Calibration, FramesUsed
 from speckle3d.core.errors import InsufficientDataError
@@ -42,7 +42,7 @@ class Outcome:
     solution: Solution
     calibration: Calibration
     detections: Detections
-    snapshots: tuple[Snapshot, ...]
+    recording: Recording
     beam: tuple[BeamBias, ...] = ()
     offset: ClockOffset | None = None
 
@@ -83,9 +83,7 @@ def calibrate_recording(
     frames = FramesUsed(recording.images.shape[0], (), reasons)
     has_offset = time_offset_s is not None or offset_s != 0.0
     calibration = as_calibration(solution, method, frames, offset_s if has_offset else None)
-    return Outcome(
-        solution, calibration, detections, _snapshots(recording, detections, calibration), offset=offset
-    )
+    return Outcome(solution, calibration, detections, recording, offset=offset)
 
 
 def with_poses(
@@ -149,21 +147,3 @@ def choose_crossings(recording: Recording, detections: Detections, offsets_s: Se
     unread = np.setdiff1d(detections.frame, candidates.frame)
     reasons |= dict.fromkeys((int(n) for n in unread), _UNREAD)
     return replace(candidates[consensus.choice[near]], dropped={**detections.dropped, **reasons})
-
-
-def _snapshots(
-    recording: Recording, detections: Detections, calibration: Calibration
-) -> tuple[Snapshot, ...]:
-    """A used frame from the middle, one from the end, and the first that was dropped."""
-    frames, reasons = calibration.frames.used, calibration.frames.dropped
-    numbers = [frames[len(frames) // 2], frames[-1], *sorted(reasons)[:1]]
-    return tuple(
-        Snapshot(
-            number,
-            recording.images[number],
-            detections.pixels[detections.frame == number].reshape(-1, 2),
-            detections.are_lines,
-            reasons.get(number, ""),
-        )
-        for number in dict.fromkeys(numbers)
-    )

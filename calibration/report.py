@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from textwrap import fill
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from calibration.beam import BeamBias
-from calibration.points import CHAIN, SCALES
+from calibration.points import CHAIN, SCALES, Detections, Recording
 from calibration.solution import Solution
-from speckle3d.core.arrays import FloatArray
 from speckle3d.core.calibration import Calibration, FramesUsed, Parameter
 from speckle3d.core.geometry import roll_yaw_tilt, skew
 from speckle3d.core.text import text_rows
@@ -27,26 +24,6 @@ IMAGE_POSE = ("gamma", "beta", "alpha", "x", "y", "z")
 """Tilt, yaw, roll and displacements: small angles in frames that lie on the image."""
 
 _MOST_ROWS = 20
-
-
-@dataclass(frozen=True)
-class Snapshot:
-    """An image with its detections, for the report.
-
-    Attributes
-    ----------
-    image : ndarray, shape (columns, rows)
-    marks_px : ndarray, shape (k, 2)
-        Column and row of points on a line, or of dots; none if nothing was found.
-    note : str
-        Why the frame was dropped; empty if it was used.
-    """
-
-    frame: int
-    image: npt.NDArray[Any]
-    marks_px: FloatArray
-    as_line: bool
-    note: str = ""
 
 
 def as_calibration(
@@ -154,7 +131,9 @@ def json_report(calibration: Calibration, beam: Sequence[BeamBias] = ()) -> dict
     }
 
 
-def figure_report(solution: Solution, calibration: Calibration, snapshots: Sequence[Snapshot]) -> Figure:
+def figure_report(
+    solution: Solution, calibration: Calibration, recording: Recording, detections: Detections
+) -> Figure:
     """One page: images with what was found in them, residuals, and the motion."""
     figure = Figure(figsize=(12.0, 7.5), layout="constrained")
     FigureCanvasAgg(figure)
@@ -163,17 +142,20 @@ def figure_report(solution: Solution, calibration: Calibration, snapshots: Seque
         axes.set_axis_off()
     # For an orientation sensor, only the ratio of the pixel sizes is known; no more is needed.
     aspect = float(solution.chain.pixel_mm[1] / solution.chain.pixel_mm[0])
-    for axes, snapshot in zip(panels[0], snapshots, strict=False):
-        axes.imshow(np.asarray(snapshot.image).T, cmap="gray", aspect=aspect)
-        colour = DROPPED_COLOUR if snapshot.note else USED_COLOUR
-        if snapshot.as_line and len(snapshot.marks_px):
-            axes.axline(snapshot.marks_px[0], snapshot.marks_px[-1], color=colour, lw=1.0)
+    # A used frame from the middle, one from the end, and the first that was dropped.
+    frames, reasons = calibration.frames.used, calibration.frames.dropped
+    numbers = dict.fromkeys([frames[len(frames) // 2], frames[-1], *sorted(reasons)[:1]])
+    for axes, number in zip(panels[0], numbers, strict=False):
+        image, note = np.asarray(recording.images[number]), reasons.get(number, "")
+        marks_px = detections.pixels[detections.frame == number].reshape(-1, 2)
+        axes.imshow(image.T, cmap="gray", aspect=aspect)
+        colour = DROPPED_COLOUR if note else USED_COLOUR
+        if detections.are_lines and len(marks_px):
+            axes.axline(*marks_px, color=colour, lw=1.0)
         else:
-            axes.plot(*snapshot.marks_px.T, "o", mfc="none", color=colour, ms=8)
-        axes.set(xlim=(0, snapshot.image.shape[0] - 1), ylim=(snapshot.image.shape[1] - 1, 0))
-        axes.set_title(
-            f"frame {snapshot.frame}" + (f"\n{snapshot.note[:60]}" if snapshot.note else ""), fontsize=8
-        )
+            axes.plot(*marks_px.T, "o", mfc="none", color=colour, ms=8)
+        axes.set(xlim=(0, image.shape[0] - 1), ylim=(image.shape[1] - 1, 0))
+        axes.set_title(f"frame {number}" + (f"\n{note[:60]}" if note else ""), fontsize=8)
     worst = np.abs(solution.residuals).argmax(axis=1)
     values = solution.residuals[np.arange(len(worst)), worst]
     values, unit = (np.rad2deg(values), "deg") if solution.angular else (values, "mm")

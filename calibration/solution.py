@@ -14,7 +14,7 @@ from scipy.special import ndtr, stdtrit
 
 from calibration.motion import DOUBTS, Adequacy, judge
 from calibration.noise import fit_noise
-from calibration.points import CHAIN, POSE, PROBE, SOME_FRAMES, ImagePoints, columns_of
+from calibration.points import CHAIN, POSE, PROBE, SOME_FRAMES, ImagePoints, columns_of, in_chain
 from calibration.settings import OUTLIER_SIGMA, PixelSettings
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
@@ -41,8 +41,8 @@ _STATED = 0.5, np.deg2rad(1.0)
 """Standard errors of a phantom's stated place: of styluses, half a millimetre, and a degree over 50 mm."""
 _CUT = 3.0
 """Residuals count up to so many standard deviations where answers are compared."""
-_APART_RAD, _APART = np.deg2rad(5.0), 0.1
-"""Two answers differ by this angle, or by this share of the image's size."""
+_APART = 0.06
+"""Share of the image's size by which two answers differ somewhere: turned by 3.5 degrees about a corner."""
 
 
 @dataclass(frozen=True)
@@ -181,9 +181,7 @@ class Solution:
     @cached_property
     def full_covariance(self) -> FloatArray:
         """Covariance of all of `CHAIN`, zero for parameters held, shape (14, 14)."""
-        full, columns = np.zeros((len(CHAIN), len(CHAIN))), columns_of(self.free)
-        full[np.ix_(columns, columns)] = self.covariance
-        return full
+        return in_chain(self.free, self.covariance)
 
     def image_covariance(self, names: Sequence[str]) -> FloatArray:
         """Covariance of some of the parameters, zero for those held."""
@@ -397,19 +395,13 @@ def half_turns(chain: Chain, points: ImagePoints, phantom: Phantom) -> list[Chai
 
 
 def are_distinct(first: Chain, second: Chain, points: ImagePoints, phantom: Phantom) -> bool:
-    """Whether two chains are two answers, not one."""
-
-    def angle(chain: Chain) -> float:
-        # Of matrices: SciPy's rotations check themselves, which takes as long as a step of the solver.
-        cosine = (np.sum(first.probe[:3, :3] * chain.probe[:3, :3]) - 1.0) / 2.0
-        return float(np.arccos(np.clip(cosine, -1.0, 1.0)))
-
-    if phantom.seen_as == "direction":
-        return bool(min(angle(second), angle(second.mirror())) > _APART_RAD)
-    corners = _corners(points)
-    places = [c.probe[:3, :2] @ (corners * c.pixel_mm).T + c.probe[:3, 3:] for c in (first, second)]
-    far = float(np.linalg.norm(places[0] - places[1], axis=0).max())
-    return bool(angle(second) > _APART_RAD or far > _APART * np.linalg.norm(corners[2] * first.pixel_mm))
+    """Whether two chains are two answers, not one: by where the image's corners are, or its axes point."""
+    directions = phantom.seen_as == "direction"
+    flat = np.eye(2) if directions else _corners(points)
+    alike = [second, second.mirror()] if directions else [second]
+    at, *others = (c.probe[:3, :2] @ (flat * c.pixel_mm).T + c.probe[:3, 3:] for c in (first, *alike))
+    away = min(float(np.linalg.norm(places - at, axis=0).max()) for places in others)
+    return away > _APART * float(np.linalg.norm(flat.max(axis=0) * first.pixel_mm))
 
 
 def _corners(points: ImagePoints) -> FloatArray:

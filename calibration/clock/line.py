@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from calibration.clock.offset import SEARCH_S, ClockOffset, covered, delays_around, least_between, peak_of
+from calibration.clock.offset import SEARCH_S, ClockOffset, covered, delays_around, peak_of
 from calibration.clock.smoothing import SmoothReadings
 from calibration.solution import autocorrelation_time
 from speckle3d.core.arrays import FloatArray
@@ -108,8 +108,11 @@ def delay_from_lines(
             "delay lies outside the range searched: --search-s"
         )
     best = peak_of(delays, misfits, f"the motion repeats itself, or does not return: {_IRREGULARLY}")
-    seconds, least, curvature = least_between(misfit, delays, best)
+    near = slice(best - 1, best + 2)
+    bend, tilt, _ = np.polyfit(delays[near] - delays[best], misfits[near], 2)
+    seconds, curvature = float(delays[best] - tilt / (2.0 * bend)), float(2.0 * bend)
     left, rank = fit(seconds)
+    least = float(left @ left / (target @ target))
     # Of few independent values any slow motion explains a line at some delay, which is fitted too: the share
     # explained is adjusted for the numbers fitted [2]_.
     count, unknowns = len(target) / autocorrelation_time(target), rank + 1

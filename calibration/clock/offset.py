@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
+from math import ceil
 
 import numpy as np
-from scipy.optimize import minimize_scalar
 from scipy.signal import find_peaks
 
 from speckle3d.core.arrays import BoolArray, FloatArray
@@ -41,12 +40,9 @@ def covered(
     readings: TimedPoses | TimedRotations, frame_time_s: FloatArray, offset_s: float, slack_s: float = 0.0
 ) -> BoolArray:
     """Mask of frames with a reading, for any offset within `slack_s` of `offset_s`."""
-    times, sample_s = np.asarray(frame_time_s) - offset_s, readings.time_s
-    inside = (times - slack_s >= sample_s[0]) & (times + slack_s <= sample_s[-1])
-    gaps = np.flatnonzero(np.diff(sample_s) > readings.max_gap_s)
-    first, last = times[:, None] - slack_s, times[:, None] + slack_s
-    in_gap = (last > sample_s[gaps]) & (first < sample_s[gaps + 1])
-    return np.asarray(inside & ~in_gap.any(axis=1))
+    # Steps too small to miss a gap.
+    steps = np.linspace(-slack_s, slack_s, 1 + ceil(2.0 * slack_s / readings.max_gap_s))
+    return np.all([readings.covers(frame_time_s - offset_s - step) for step in steps], axis=0)
 
 
 def delays_around(around_s: float, search_s: float, step_s: float) -> FloatArray:
@@ -82,15 +78,3 @@ def peak_of(tried_s: FloatArray, misfit: FloatArray, doubt: str) -> int:
             pair = f"{tried_s[best]:+.3f} and {tried_s[rival]:+.3f} s"
             raise InsufficientDataError(f"expected one delay, got {pair} nearly as good: {doubt}")
     return best
-
-
-def least_between(
-    cost: Callable[[float], float], tried_s: FloatArray, best: int
-) -> tuple[float, float, float]:
-    """Delay of least cost between the neighbours of the best one tried, that cost, and its curvature."""
-    low, middle, high = tried_s[best - 1 : best + 2]
-    fit = minimize_scalar(
-        lambda delay: cost(float(delay)), bounds=(low, high), method="bounded", options={"xatol": 1e-5}
-    )
-    seconds, least, step = float(fit.x), float(fit.fun), float(high - middle)
-    return seconds, least, (cost(seconds - step) - 2.0 * least + cost(seconds + step)) / step**2

@@ -19,13 +19,10 @@ import numpy.typing as npt
 from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 
 from calibration.detection.region import (
-    DENSELY,
     Columns,
     checked_pixel,
+    choose_columns,
     detect_in_frames,
-    lay_columns,
-    spread,
-    without_standing,
 )
 from calibration.points import Detections
 from calibration.settings import LineSettings, Place
@@ -33,7 +30,8 @@ from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.sweep import Frames
 
-_ROUNDS = 20
+_ROUNDS = 5
+"""Fits of the line to the points that agree on it, which then hardly change."""
 _FINE = 0.25
 """Smoothing for placing an echo, as a share of that for finding it: enough against noise, little against
 the rise of an echo."""
@@ -120,14 +118,7 @@ class LineFinder:
         """Choose the columns from all frames; see `detect_lines`."""
         s = settings or LineSettings()
         pixel = checked_pixel(pixel_mm)
-        columns = lay_columns(frames.shape[1:], s.columns, region_px)
-        if region_px is None and frames.shape[0] > 0:
-            dense = lay_columns(frames.shape[1:], DENSELY * s.columns, None)
-            dense = without_standing(dense, frames, s.smoothing_mm / pixel[1])
-            place = np.flatnonzero(dense.inside.any(axis=1))
-            place = place[spread(place.size, s.columns)] if place.size else place
-            columns = Columns(dense.column[place], dense.inside[place])
-        return cls(pixel, s, columns)
+        return cls(pixel, s, choose_columns(frames, s.columns, region_px, s.smoothing_mm / pixel[1]))
 
     def line(self, image: npt.NDArray[Any]) -> EchoLine:
         """Find the line in one frame, shape (column, row).
@@ -238,7 +229,7 @@ def detect_lines(
 def consensus_line(
     column: FloatArray, row: FloatArray, inside: BoolArray, tolerance: float
 ) -> tuple[BoolArray, int, float, float]:
-    """Fit a line to the points that agree on it: those of the best pair's line, until they stay the same.
+    """Fit a line to the points that agree on it, at first those of the best pair's line.
 
     Most points agree with the best pair's line; of equals, it is the one closest to them.
 
@@ -278,13 +269,9 @@ def consensus_line(
     start, slope = float(starts[best]), float(slopes[best])
     agree, could, _ = compare(start, slope)
     for _ in range(_ROUNDS):
-        if agree.sum() < 3:
-            break
-        before = agree
-        slope, start = np.polyfit(column[agree], row[agree], 1).tolist()
-        agree, could, _ = compare(start, slope)
-        if np.array_equal(agree, before):
-            break
+        if agree.sum() >= 3:
+            slope, start = np.polyfit(column[agree], row[agree], 1).tolist()
+            agree, could, _ = compare(start, slope)
     return agree, int(could.sum()), start, slope
 
 
@@ -296,20 +283,17 @@ def _echo_rows(
     steepest = edge + peak_between(slope, column, edge)
     if place == "slope":
         return steepest
-    rows = edge[:, None] + np.arange(-int(2.5 * sigma) - 2, int(2.0 * sigma) + 3)
-    window = (rows >= np.floor(steepest - 2.5 * sigma)[:, None]) & (
-        rows <= np.ceil(steepest + 2.0 * sigma)[:, None]
-    )
-    window &= (rows >= 0) & (rows < levels.shape[1])
+    away = np.arange(-int(2.5 * sigma) - 1, int(2.0 * sigma) + 2)
+    rows = edge[:, None] + away
+    window = (rows >= 0) & (rows < levels.shape[1])
     rows = np.clip(rows, 0, levels.shape[1] - 1)
     window &= inside[column[:, None], rows]
     level = levels[column[:, None], rows].astype(float)
     # Up to `sigma` above the echo, where the edge is found, it is dark.
-    above = window & (
-        rows <= np.maximum(np.floor(steepest - sigma), rows[column, window.argmax(axis=1)])[:, None]
-    )
+    above = window & (away <= -sigma)
+    above[column, window.argmax(axis=1)] = True
     dark = (level * above).sum(axis=1) / np.maximum(above.sum(axis=1), 1)
-    echo = np.where(window & (rows >= np.floor(steepest - 0.5 * sigma)[:, None]), level, -np.inf)
+    echo = np.where(window & (away >= -0.5 * sigma), level, -np.inf)
     at = echo.argmax(axis=1)
     half = 0.5 * (dark + level[column, at])
     bright = level[column, at] > half

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.ndimage import distance_transform_edt, gaussian_filter1d
+from scipy.ndimage import gaussian_filter1d
 
 from calibration.points import Detections
 from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
@@ -20,8 +19,6 @@ from speckle3d.core.sweep import Frames
 
 _GLANCES = 48
 """Frames compared to see what stands still in all of them."""
-DENSELY = 4
-"""Columns looked at to see which show anything, for each that is then sampled."""
 _LIVELY = 0.25
 """Change that counts, as a share of the 90th percentile of the columns' strongest changes."""
 
@@ -41,19 +38,11 @@ class Columns:
     column: IntArray
     inside: BoolArray
 
-    @cached_property
-    def _nearest(self) -> IntArray:
-        """The row inside that is nearest to each row."""
-        apart = (2 * self.inside.shape[1], 1)
-        return np.asarray(
-            distance_transform_edt(~self.inside, apart, return_distances=False, return_indices=True)[1]
-        )
-
     def fill(self, samples: Float32Array) -> Float32Array:
-        """Samples, shape (n, r), with the nearest inside repeated beyond the region."""
-        if self.inside.all():
-            return samples
-        return np.take_along_axis(samples, self._nearest, axis=1)
+        """Samples, shape (n, r), with the region's first and last in each column repeated beyond it."""
+        rows, last = np.arange(samples.shape[1]), samples.shape[1] - 1
+        ends = self.inside.argmax(axis=1), last - self.inside[:, ::-1].argmax(axis=1)
+        return np.take_along_axis(samples, np.clip(rows, *(end[:, None] for end in ends)), axis=1)
 
 
 def region_mask(shape: tuple[int, ...], region_px: npt.ArrayLike | None) -> BoolArray:
@@ -81,48 +70,53 @@ def region_mask(shape: tuple[int, ...], region_px: npt.ArrayLike | None) -> Bool
     return mask
 
 
-def lay_columns(shape: tuple[int, ...], count: int, region_px: npt.ArrayLike | None) -> Columns:
-    """Spread columns over an image, or over a polygon in it, symmetric about its middle.
+def choose_columns(
+    frames: Frames, count: int, region_px: npt.ArrayLike | None, smoothing_rows: float
+) -> Columns:
+    """Spread columns over a polygon in the images, or over what changes in them, symmetric about its middle.
 
     Parameters
     ----------
-    shape, region_px
+    frames, region_px
         See `region_mask`.
     count : int
         Columns to sample; fewer where there are not so many.
+    smoothing_rows : float
+        Standard deviation of the smoothing with which changes are looked for.
 
     Raises
     ------
     InvalidInputError
         If the region is not a polygon, or covers nothing.
     """
-    mask = region_mask(shape, region_px)
+    mask = region_mask(frames.shape[1:], region_px)
+    if region_px is None and frames.shape[0] > 0:
+        mask = _changing(frames, smoothing_rows)
     column = np.flatnonzero(mask.any(axis=1))
-    column = column[spread(column.size, count)]
+    column = column[spread(column.size, count)] if column.size else column
     return Columns(column, mask[column])
 
 
-def without_standing(columns: Columns, frames: Frames, smoothing_rows: float) -> Columns:
-    """Leave out columns in which nothing changes, and what is bright and stands still above all change.
+def _changing(frames: Frames, smoothing_rows: float) -> BoolArray:
+    """Mask without columns in which nothing changes, and what is bright and stands still above all change.
 
     The floor's echo moves; lettering, a screen's border and the transducer's ring-down do not. Dark water
     stays in, since the floor may be shallower in frames that were not compared. If all frames are alike,
     everything stays in.
     """
-    glances = np.unique(np.linspace(0, frames.shape[0] - 1, _GLANCES).astype(int))
-    low, high = np.full((2, *columns.inside.shape), np.nan, np.float32)
-    for index in glances:
-        image = np.asarray(frames[int(index)][columns.column], np.float32)
+    low, high = np.full((2, *frames.shape[1:]), np.nan, np.float32)
+    for index in np.unique(np.linspace(0, frames.shape[0] - 1, _GLANCES).astype(int)):
+        image = np.asarray(frames[int(index)], np.float32)
         low, high = np.fmin(low, image), np.fmax(high, image)
     low, high = np.nan_to_num(low), np.nan_to_num(high)
     change, level = (gaussian_filter1d(x, smoothing_rows / 2, axis=1) for x in (high - low, low - low.min()))
     limit = _LIVELY * np.percentile(change.max(axis=1), 90)
     if not limit > 0:
-        return columns
+        return np.ones_like(low, dtype=bool)
     lively = change > limit
     standing = (level > limit) & ~np.logical_or.accumulate(lively, axis=1)
     under = ~np.logical_or.accumulate(standing[:, ::-1], axis=1)[:, ::-1]
-    return Columns(columns.column, columns.inside & under & lively.any(axis=1)[:, None])
+    return np.asarray(under & lively.any(axis=1)[:, None])
 
 
 def spread(size: int, count: int) -> IntArray:

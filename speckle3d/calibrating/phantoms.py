@@ -46,6 +46,7 @@ from speckle3d.core.errors import InvalidInputError, MismatchError, naming
 from speckle3d.core.progress import Progress
 from speckle3d.core.streams import TimedPoses
 from speckle3d.core.wires import WirePhantom
+from speckle3d.io.load import SIZED, kind_of
 from speckle3d.io.plus.wires import read_wire_phantom
 from speckle3d.io.points import PickedPoints, read_points, write_points
 
@@ -103,7 +104,7 @@ def open_phantom(images: Path, settings: ScanSettings) -> Recording:
     """Open a recording of a phantom; for errors see `open_recording`."""
     sensor = settings.sensor if isinstance(settings, OrientationSettings) else "tracker"
     pixel_mm = settings.pixel_mm
-    if pixel_mm is None and isinstance(settings, WireSettings):
+    if pixel_mm is None and isinstance(settings, WireSettings) and kind_of(images) not in SIZED:
         pixel_mm = WireSetup.of(settings.phantom).pixel_mm
     return open_recording(images, settings.poses, pixel_mm, sensor, settings.transform)
 
@@ -227,7 +228,7 @@ def write_outcome(
         outcome.calibration,
         [images],
         out,
-        lambda calibration: figure_report(outcome.solution, calibration, outcome.snapshots),
+        lambda calibration: figure_report(outcome.solution, calibration, outcome.recording, dots),
         [*notes, f"made by: {command_line(settings, images, out)}"],
         outcome.beam,
         None if dots.are_lines else lambda path: write_points(path, points, names),

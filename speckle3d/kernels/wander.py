@@ -68,13 +68,14 @@ def innovations(
                     total += effects[first + b, i] * (gain[a, i] + effects[first + a, i] * shaken[i])
                 for q in range(b):
                     total -= root[a, q] * root[b, q]
-                root[a, b] = math.sqrt(total) if a == b else total / root[b, b]
-            log_determinant += 2.0 * math.log(root[a, a])
+                # The diagonal's reciprocals, by which rows are multiplied.
+                root[a, b] = 1.0 / math.sqrt(total) if a == b else total * root[b, b]
+            log_determinant += math.log(total)
         for a in range(n):
             for i in range(size):
                 for b in range(a):
                     gain[a, i] -= root[a, b] * gain[b, i]
-                gain[a, i] /= root[a, a]
+                gain[a, i] *= root[a, a]
             # Columns innermost, which the compiler takes several at a time.
             for c in range(wide):
                 white[first + a, c] = columns[first + a, c]
@@ -85,7 +86,7 @@ def innovations(
                 for c in range(wide):
                     white[first + a, c] -= root[a, b] * white[first + b, c]
             for c in range(wide):
-                white[first + a, c] /= root[a, a]
+                white[first + a, c] *= root[a, a]
         for a in range(n):
             for i in range(size):
                 for c in range(wide):

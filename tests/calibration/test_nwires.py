@@ -32,5 +32,5 @@ def test_published_errors_are_reproduced_for_every_frame(realdata, kind):
     points = labels.points(poses[labels.frame])
     errors_mm = nwire_errors_mm(points, phantom, matrix, phantom.world_from_phantom)
     # Six digits of pixels, poses and matrix leave 0.0002 mm.
-    np.testing.assert_allclose(errors_mm.reshape(-1, 3), errors, atol=1e-3)
+    np.testing.assert_allclose(errors_mm.reshape(3, -1).T, errors, atol=1e-3)
     np.testing.assert_allclose(trimmed_mean_mm(errors_mm), PLUS_ERRORS_MM[kind], atol=1e-4)
