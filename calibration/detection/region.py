@@ -19,6 +19,8 @@ from speckle3d.core.sweep import Frames
 
 _GLANCES = 48
 """Frames compared to see what stands still in all of them."""
+_DENSELY = 4
+"""Columns looked at to see which show anything, for each that is then sampled."""
 _LIVELY = 0.25
 """Change that counts, as a share of the 90th percentile of the columns' strongest changes."""
 
@@ -90,23 +92,25 @@ def choose_columns(
         If the region is not a polygon, or covers nothing.
     """
     mask = region_mask(frames.shape[1:], region_px)
-    if region_px is None and frames.shape[0] > 0:
-        mask = _changing(frames, smoothing_rows)
     column = np.flatnonzero(mask.any(axis=1))
+    if region_px is None and frames.shape[0] > 0:
+        column = column[spread(column.size, _DENSELY * count)]
+        mask[column] = _changing(frames, column, smoothing_rows)
+        column = column[mask[column].any(axis=1)]
     column = column[spread(column.size, count)] if column.size else column
     return Columns(column, mask[column])
 
 
-def _changing(frames: Frames, smoothing_rows: float) -> BoolArray:
-    """Mask without columns in which nothing changes, and what is bright and stands still above all change.
+def _changing(frames: Frames, column: IntArray, smoothing_rows: float) -> BoolArray:
+    """Mask of columns without those that never change, and without what stands still above all change.
 
     The floor's echo moves; lettering, a screen's border and the transducer's ring-down do not. Dark water
     stays in, since the floor may be shallower in frames that were not compared. If all frames are alike,
     everything stays in.
     """
-    low, high = np.full((2, *frames.shape[1:]), np.nan, np.float32)
+    low, high = np.full((2, column.size, frames.shape[2]), np.nan, np.float32)
     for index in np.unique(np.linspace(0, frames.shape[0] - 1, _GLANCES).astype(int)):
-        image = np.asarray(frames[int(index)], np.float32)
+        image = np.asarray(frames[int(index)][column], np.float32)
         low, high = np.fmin(low, image), np.fmax(high, image)
     low, high = np.nan_to_num(low), np.nan_to_num(high)
     change, level = (gaussian_filter1d(x, smoothing_rows / 2, axis=1) for x in (high - low, low - low.min()))
