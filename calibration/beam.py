@@ -62,8 +62,6 @@ def predict_bias(solution: Solution, width_mm: float) -> BeamBias:
     probe = tuple(name for name in solution.free if name not in solution.phantom.unknowns)
     refit = Problem(solution.phantom, probe, np.inf).solve(thick, chain)
     middle = points.pixels.mean(axis=0)
-    before, after = (
-        c.sensor_from_image.apply(np.append(middle * c.pixel_mm, 0.0)) for c in (chain, refit.chain)
-    )
-    shift = chain.sensor_from_image.rotation.inv().apply(after - before)
+    before, after = (np.append(middle * c.pixel_mm, 0.0) for c in (chain, refit.chain))
+    shift = (chain.sensor_from_image.inv() * refit.chain.sensor_from_image).apply(after) - before
     return BeamBias(width_mm, shift, refit.rms)

@@ -135,15 +135,13 @@ def choose_crossings(recording: Recording, detections: Detections, offsets_s: Se
     """
     if len(detections) == len(np.unique(detections.frame)):
         return detections
-    trials: list[tuple[Consensus, Detections]] = []
+    trials: list[tuple[Consensus, dict[int, str]]] = []
     for offset_s in offsets_s:
-        with_reading = covered(recording.readings, recording.frame_time_s[detections.frame], offset_s)
-        consensus = find_consensus(with_poses(recording, detections, offset_s)[0], recording.pixel_mm)
-        trials.append((consensus, detections[with_reading]))
-    consensus, candidates = min(trials, key=lambda trial: trial[0].false_alarms)
+        points, reasons = with_poses(recording, detections, offset_s)
+        trials.append((find_consensus(points, recording.pixel_mm), reasons))
+    consensus, reasons = min(trials, key=lambda trial: trial[0].false_alarms)
+    candidates = detections[~np.isin(detections.frame, list(reasons))]
     near = consensus.require().away_mm <= GATES_MM[-1]
     elsewhere = f"nothing within {GATES_MM[-1]:g} mm of the other frames' crossing"
-    reasons = dict.fromkeys((int(n) for n in candidates.frame[consensus.choice[~near]]), elsewhere)
-    unread = np.setdiff1d(detections.frame, candidates.frame)
-    reasons |= dict.fromkeys((int(n) for n in unread), _UNREAD)
-    return replace(candidates[consensus.choice[near]], dropped={**detections.dropped, **reasons})
+    reasons |= dict.fromkeys((int(n) for n in candidates.frame[consensus.choice[~near]]), elsewhere)
+    return replace(candidates[consensus.choice[near]], dropped=reasons)

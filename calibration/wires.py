@@ -33,6 +33,10 @@ _REGISTRATIONS = {"held": (), "turned": TARGET[3:], "free": TARGET, "auto": TARG
 """What is estimated of a stated place."""
 _STARTS = 6
 _TINY, _LEAST_PIXEL_MM = np.finfo(float).tiny, 1e-6
+_OUTWARD = 0.005
+"""Share by which crossings are placed too far from the middle of the columns, beyond whose sides filters see
+nothing: 0.46 % (standard error 0.11) in 80 simulated scans of two threads. Of 40 other scans, 72 and 95 % of
+the errors of s_x then lie within 68 and 95 % intervals (without it 68 and 92)."""
 _AS_IT_IS = Rotation.identity()
 """A point has no orientation."""
 
@@ -100,7 +104,8 @@ def _beside(solution: Solution, beside_mm: float) -> Solution:
     """Allow for a hand that misses the point by `beside_mm`, at the pace at which it turns the probe.
 
     So slow an error the fit takes for tilt and yaw, and residuals tell nothing of it: its size is assumed,
-    its autocorrelation is that of the motions that it is taken for.
+    its autocorrelation is that of the motions that it is taken for. Places that lean outwards are taken for
+    wider pixels.
     """
     points, free, jacobian = solution.points_used, solution.free, solution.jacobian
     out_of_plane = solution.chain.target_from_image(points).rotation.as_matrix()[:, :, 2]
@@ -109,6 +114,8 @@ def _beside(solution: Solution, beside_mm: float) -> Solution:
     of_pose = motion[[free.index(name) for name in POSE]]
     correlation = sum(np.correlate(p, p, "full")[len(p) - 1 :] / max(p @ p, _TINY) for p in of_pose)
     covariance = beside_mm**2 * motion @ toeplitz(correlation / max(correlation[0], _TINY)) @ motion.T
+    outward = _OUTWARD * solution.chain.pixel_mm[0] * (np.array(free) == "s_x")
+    covariance += np.outer(outward, outward)
     return replace(solution, covariance=solution.covariance + covariance)
 
 

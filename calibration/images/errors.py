@@ -14,8 +14,7 @@ from scipy.linalg import eigh
 from scipy.spatial.transform import RigidTransform
 
 from calibration.images.angulation import PARAMETERS, Angulation, point_motion
-from calibration.images.fit import Fit, refine
-from calibration.images.search import distance_mm
+from calibration.images.search import Fit, distance_mm, refine
 from calibration.images.similarity import (
     Comparison,
     CrossingSweeps,

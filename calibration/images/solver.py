@@ -23,8 +23,7 @@ from calibration.images.errors import (
     require_accuracy,
     require_one_answer,
 )
-from calibration.images.fit import refine
-from calibration.images.search import DECISION, search
+from calibration.images.search import DECISION, refine, search
 from calibration.images.similarity import CrossingSweeps, Level, prepare
 from calibration.points import Recording
 from calibration.settings import ImageFit
