@@ -138,7 +138,8 @@ class ImagePoints:
         return len(self.pixels)
 
     def __getitem__(self, index: BoolArray | IntArray | slice) -> ImagePoints:
-        wire, time_s = (None if values is None else values[index] for values in (self.wire, self.time_s))
+        wire = None if self.wire is None else self.wire[index]
+        time_s = None if self.time_s is None else self.time_s[index]
         return ImagePoints(self.pixels[index], self.frame[index], self.world_from_sensor[index], wire, time_s)
 
     @cached_property
@@ -224,7 +225,8 @@ class Detections:
         return len(self.frame)
 
     def __getitem__(self, index: BoolArray | IntArray) -> Detections:
-        wire, score = (None if values is None else values[index] for values in (self.wire, self.score))
+        wire = None if self.wire is None else self.wire[index]
+        score = None if self.score is None else self.score[index]
         return Detections(self.frame[index], self.pixels[index], wire, self.dropped, score)
 
     def without(self, frames: Collection[int], reason: str) -> Detections:
