@@ -42,7 +42,7 @@ def covered(
     """Mask of frames with a reading, for any offset within `slack_s` of `offset_s`."""
     # Steps too small to miss a gap.
     steps = np.linspace(-slack_s, slack_s, 1 + ceil(2.0 * slack_s / readings.max_gap_s))
-    return np.asarray([readings.covers(frame_time_s - offset_s - step) for step in steps]).all(axis=0)
+    return np.asarray(np.all([readings.covers(frame_time_s - offset_s - step) for step in steps], axis=0))
 
 
 def delays_around(around_s: float, search_s: float, step_s: float) -> FloatArray:
