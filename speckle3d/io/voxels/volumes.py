@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import re
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -15,16 +18,18 @@ from speckle3d.core.arrays import AnyArray, ByteArray, FloatArray
 from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.files import PathLike
 from speckle3d.core.geometry import transforms_from_matrices
-from speckle3d.core.volume import VOXEL_TYPES, LabelMap, Volume
+from speckle3d.core.volume import VOXEL_TYPES, LabelMap, Segment, Volume
 from speckle3d.io.hdf5 import reading
 from speckle3d.io.images.headers import is_image, mm_per, read_header
 from speckle3d.io.readers import first_bytes
-from speckle3d.io.text import unescape
-from speckle3d.io.voxels.segments import is_segmentation, read_segments
+from speckle3d.io.text import numbers, unescape
 from speckle3d.io.voxels.volume_writer import COMMENT, LABELS, PREFIX, RAS_FROM_LPS
 
 _SIZES = {size.to_bytes(4, order) for size in (348, 540) for order in ("little", "big")}
 """First bytes of NIfTI-1 and NIfTI-2: the length of the header."""
+_FIELD = re.compile(r"Segment(\d{1,5})_(\w+)")
+_UNNAMED_COLOUR = "0.5 0.5 0.5"
+"""Fields of Slicer's labels, and a colour where they have none."""
 _SAME_PLACE_MM = 1e-3
 """Two grids are one if they differ by less: NIfTI keeps places to single precision."""
 
@@ -80,10 +85,10 @@ def read_volume(path: PathLike) -> Volume:
     start = first_bytes(path)
     if _is_nifti(Path(path), start):
         voxels, matrix, fields, is_labels = _read_nifti(Path(path))
-        remarks = {name: text for name, text in fields.items() if not is_segmentation([name])}
+        remarks = {name: text for name, text in fields.items() if not _is_segmentation([name])}
     elif is_image(start):
         voxels, matrix, fields = _read_image(path)
-        is_labels = is_segmentation(fields)
+        is_labels = _is_segmentation(fields)
         own = {name: text for name, text in fields.items() if name.startswith(PREFIX)}
         remarks = {name.removeprefix(PREFIX): unescape(text) for name, text in own.items()}
     else:
@@ -99,7 +104,7 @@ def read_volume(path: PathLike) -> Volume:
             voxels.astype(voxels.dtype.newbyteorder("="), copy=False), matrix
         )
         if is_labels:
-            segments = tuple(read_segments(fields, str(path)))
+            segments = tuple(_read_segments(fields, str(path)))
             return LabelMap(_labels(voxels), spacing, pose, remarks, segments)
         if voxels.dtype.name not in VOXEL_TYPES:
             voxels = voxels.astype(np.float32)
@@ -151,6 +156,35 @@ def _right_handed(
         matrix[:3, :3] /= spacing
     pose: RigidTransform = transforms_from_matrices(matrix[None], "direction")[0]
     return voxels, tuple(spacing.tolist()), pose
+
+
+def _is_segmentation(fields: Iterable[str]) -> bool:
+    """Whether names of a header's fields tell of segments."""
+    return any(name.startswith("Segmentation_") or _FIELD.fullmatch(name) for name in fields)
+
+
+def _read_segments(fields: Mapping[str, str], where: str) -> Iterator[Segment]:
+    """Read what labels mean; those without a name or colour get one.
+
+    Raises
+    ------
+    InvalidInputError
+        Naming the field that does not make sense, or of a file whose segments overlap.
+    """
+    rows = defaultdict[int, dict[str, str]](dict)
+    for name, value in fields.items():
+        if match := _FIELD.fullmatch(name):
+            rows[int(match[1])][match[2]] = unescape(value)
+    for i, row in sorted(rows.items()):
+        place = f"{where}: Segment{i}"
+        (label,) = numbers(row.get("LabelValue", "1"), 1, f"{place}_LabelValue")
+        red, green, blue = numbers(row.get("Color", _UNNAMED_COLOUR), 3, f"{place}_Color")
+        if label % 1 or row.get("Layer", "0") != "0":
+            raise InvalidInputError(
+                f"{place}: expected a whole LabelValue in Layer 0, got {label} in another"
+            )
+        name = row.get("Name") or row.get("ID") or f"Segment {i}"
+        yield Segment(int(label), name, (red, green, blue))
 
 
 def _labels(voxels: AnyArray) -> AnyArray:
