@@ -135,7 +135,7 @@ def hand_sweep(
     number : int
         Of crossed sweeps.
     """
-    fan, turned, crossing = np.deg2rad([settings.fan_deg, settings.turn_deg, settings.crossing_deg])
+    fan, turn, crossing = np.deg2rad([settings.fan_deg, settings.turn_deg, settings.crossing_deg])
     time = _knot_times(duration_s)
     columns = np.zeros((time.size, 6))
     columns[:, 0] = face_mm / 2.0
@@ -143,17 +143,17 @@ def hand_sweep(
     phase = np.clip(time / duration_s, 0.0, 1.0)
     share = phase * phase * (3.0 - 2.0 * phase)
     if settings.preset == "rotation":
-        columns[:, 3 if settings.turn_axis == "tilt" else 4] = share * turned
+        columns[:, 3 if settings.turn_axis == "tilt" else 4] = share * turn
     elif settings.preset == "crossed":
         columns[:, 3] = (share - 0.5) * fan
     slow = (
         column + wander * _band_noise(time, (0.0, 1.0 / duration_s), rng) if wander > 0 else column
         for column, wander in zip(columns.T, _WANDER, strict=True)
     )
-    turn = Rotation.from_rotvec([0.0, crossing * number, 0.0])
+    across = Rotation.from_rotvec([0.0, crossing * number, 0.0])
     # A crossing sweep is turned about the beam axis through the middle of the first.
     centre_mm = np.array([face_mm / 2.0, 0.0, settings.length_mm / 2.0])
-    start = RigidTransform.from_components(centre_mm - turn.apply(centre_mm), turn)
+    start = RigidTransform.from_components(centre_mm - across.apply(centre_mm), across)
     return Trajectory(_curves(time, slow, rng), "ZYX", np.ones(3), face_mm, world, start)
 
 

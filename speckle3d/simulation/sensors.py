@@ -73,8 +73,8 @@ def simulate_orientation(
     field = rotation.inv().apply([np.cos(_DIP_RAD), 0.0, -np.sin(_DIP_RAD)])
 
     def noisy(true: FloatArray, bias: float, white: float) -> FloatArray:
-        biased = true + noise * bias * rng.standard_normal(3)
-        return np.asarray(biased + noise * white * rng.standard_normal(true.shape))
+        level = true + noise * bias * rng.standard_normal(3)
+        return np.asarray(level + noise * white * rng.standard_normal(true.shape))
 
     return OrientationSensor(
         TimedRotations(clock - _OFFSET_S, readings),
