@@ -1,7 +1,5 @@
 """A calibration: pose of the image relative to a sensor, with covariance and provenance."""
 
-from __future__ import annotations
-
 from collections import Counter
 from dataclasses import dataclass, field, replace
 from typing import Any

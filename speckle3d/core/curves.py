@@ -12,9 +12,6 @@ from speckle3d.core.errors import InvalidInputError, MismatchError
 from speckle3d.core.sweep import BModeSettings, RFSettings
 from speckle3d.core.text import shown
 
-EDGE_FRACTION = 0.1
-"""Of `CurveKey.edge_fraction` in files that do not give it: all that versions before wrote by default."""
-
 Origin = Literal["phantom", "tracked", "data sheet", "crossing"]
 """What curves' distances come from: exact steps, a tracker, diffraction, or a sweep that crosses another."""
 ATTENUATION_SIGMA = 0.03
@@ -38,7 +35,7 @@ class CurveKey:
     Attributes
     ----------
     edge_fraction : float
-        Width of the band's edges over its width.
+        Width of the band's edges over its width; the default is what all versions wrote before files gave it.
     probe : str
         Name of probe and preset as the recording has it; empty if it has none, and then not compared.
     lines : {"parallel", "fan", ""}
@@ -54,7 +51,7 @@ class CurveKey:
     patch_height_mm: float
     equalise_mm: float
     correlation_of: str = "intensity"
-    edge_fraction: float = EDGE_FRACTION
+    edge_fraction: float = 0.1
     probe: str = ""
     lines: str = ""
     array_radius_mm: float = 0.0

@@ -76,8 +76,8 @@ class ImageGrid:
 
     def __post_init__(self) -> None:
         require_positive(self, ("vectors", "samples", "vector_pitch_mm", "sample_spacing_mm"))
-        fan, first_mm = self.fan, self.first_sample_depth_mm + self.first_vector_mm
-        if not np.isfinite(first_mm):
+        fan = self.fan
+        if not np.isfinite(self.first_sample_depth_mm + self.first_vector_mm):
             raise InvalidInputError("first_sample_depth_mm, first_vector_mm: expected finite values")
         if fan is not None and not (
             np.isfinite(sum(fan.apex_mm, fan.radius_mm))

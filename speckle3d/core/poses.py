@@ -161,8 +161,14 @@ def plot_poses(
             sigma = columns.get(f"sigma_{name}".replace("length", "z"))
             if sigma is not None:
                 half = 1.96 * sigma
-                low, high = columns[name] - half, columns[name] + half
-                look = {"color": line.get_color(), "alpha": 0.15, "lw": 0, "label": "its 95 % interval"}
-                panel.fill_between(range(half.size), low, high, **look)
+                panel.fill_between(
+                    range(half.size),
+                    columns[name] - half,
+                    columns[name] + half,
+                    color=line.get_color(),
+                    alpha=0.15,
+                    lw=0,
+                    label="its 95 % interval",
+                )
     axes[0].legend(fontsize="small", frameon=False)
     return figure

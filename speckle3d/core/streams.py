@@ -1,14 +1,11 @@
 """A sensor's samples on its own clock, validated once, interpolated on demand."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Generic, TypeVar
 
 import numpy as np
 import numpy.typing as npt
-from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import RigidTransform, Rotation, Slerp
 
 from speckle3d.core.arrays import BoolArray, FloatArray
@@ -61,8 +58,8 @@ class TimedSamples(Generic[Samples]):
             return samples[np.zeros(t.shape, dtype=int)]
         if not isinstance(samples, RigidTransform):
             return self._slerp(t)
-        translation = make_interp_spline(self.time_s, samples.translation, k=1)(t)
-        return RigidTransform.from_components(translation, self._slerp(t))
+        moved = np.stack([np.interp(t, self.time_s, column) for column in samples.translation.T], axis=-1)
+        return RigidTransform.from_components(moved, self._slerp(t))
 
     def require_covered(self, times_s: npt.ArrayLike) -> FloatArray:
         """Return `times_s` as an array if `at` can read them.

@@ -90,7 +90,7 @@ class Surface:
     def of_triangles(self, chosen: IntArray | BoolArray) -> Surface:
         """Subset of the triangles (indices or a mask), with their vertices only."""
         vertices, triangles = np.unique(self.triangles[chosen], return_inverse=True)
-        return Surface(self.vertices_mm[vertices], triangles.reshape(-1, 3), self.fields)
+        return Surface(self.vertices_mm[vertices], triangles, self.fields)
 
     def _edges(self) -> IntArray:
         """Edges of all triangles, round each, shape (3 m, 2)."""

@@ -11,8 +11,6 @@ from typing import Any, TypeVar
 
 Record = TypeVar("Record", bound=type)
 
-_MOST_LETTERS = 72
-
 
 def printable(text: str, kept: str = "") -> str:
     r"""Escape every character that is no letter, mark, number, sign or blank, as Python writes it.
@@ -103,4 +101,4 @@ def _brief(value: Any) -> str:
         text = ", ".join(map(_brief, value)) if len(value) <= 4 else f"{len(value)}"
     else:
         text = f"{value:.4g}" if isinstance(value, float) else "" if value is None else str(value)
-    return textwrap.shorten(text or "none", _MOST_LETTERS, placeholder="…")
+    return textwrap.shorten(text or "none", 72, placeholder="…")

@@ -1,7 +1,5 @@
 """Volumes of grey levels or labels: voxels on a regular grid, with the grid's pose in the world."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 

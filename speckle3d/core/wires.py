@@ -1,7 +1,5 @@
 """Phantoms made of stretched wires: the line of each wire, and which wires form an N."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 
