@@ -248,12 +248,11 @@ class Recording:
         if self.frames is None:
             return None, np.arange(0), []
         times, rate_hz, count = None, self.settings.frame_rate_hz, self.frames.shape[0]
-        faults = self.faults or [""] * count
         if self.time_s is not None:
-            rows, notes = usable("images", self.time_s, faults)
+            rows, notes = usable("images", self.time_s, self.faults)
             times = self.time_s[rows] if rows.size >= min(2, count) else None
         if times is None or rate_hz is not None:
-            rows, notes = usable("images", np.arange(count) / (rate_hz or 1.0), faults)
+            rows, notes = usable("images", np.arange(count) / (rate_hz or 1.0), self.faults)
         return times, rows, notes
 
     @cached_property

@@ -32,12 +32,17 @@ def text_lines(path: PathLike) -> Iterator[tuple[int, str]]:
                     yield number, text
 
 
-def numbers(text: str, count: int | None, where: str) -> tuple[float, ...]:
-    """Read finite numbers separated by blanks, `count` of them unless it is None; commas are decimal ones."""
+def parse_number(word: str) -> float:
+    """Number that a word is, whose comma is a decimal one; NaN where it is none."""
     try:
-        values = tuple(float(word.replace(",", ".")) for word in text.split())
+        return float(word.replace(",", "."))
     except ValueError:
-        values = ()
+        return np.nan
+
+
+def numbers(text: str, count: int | None, where: str) -> tuple[float, ...]:
+    """Read finite numbers separated by blanks, `count` of them unless it is None."""
+    values = tuple(map(parse_number, text.split()))
     if not values or (count is not None and len(values) != count) or not np.isfinite(values).all():
         raise InvalidInputError(f"{where}: expected {count or 'some'} finite number(s), got {text!r:.40}")
     return values

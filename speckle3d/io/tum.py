@@ -19,7 +19,7 @@ from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.streams import TimedPoses
 from speckle3d.io.hdf5 import PathLike, atomic_path
 from speckle3d.io.pose_paths import usable
-from speckle3d.io.text import numbers, text_lines
+from speckle3d.io.text import parse_number, text_lines
 
 LengthUnit = Literal["m", "mm"]
 
@@ -93,14 +93,12 @@ def read_tum(path: PathLike, length_unit: LengthUnit | None = None) -> TimedPose
 
 def is_tum(path: PathLike) -> bool:
     """Whether the first line that is not a comment holds eight numbers."""
-    with suppress(FileError, InvalidInputError, StopIteration):
+    with suppress(FileError, StopIteration):
         return all(np.isfinite(next(_eight(text) for _, text in text_lines(path) if text[0] != "#")))
     return False
 
 
-def _eight(text: str) -> tuple[float, ...]:
+def _eight(text: str) -> list[float]:
     """Numbers of a line; NaN unless there are eight."""
-    try:
-        return numbers(text, _COLUMNS, "")
-    except InvalidInputError:
-        return (np.nan,) * _COLUMNS
+    values = [parse_number(word) for word in text.split()]
+    return values if len(values) == _COLUMNS else [np.nan] * _COLUMNS

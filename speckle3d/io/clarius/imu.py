@@ -44,6 +44,7 @@ from speckle3d.core.sweep import OrientationSensor
 from speckle3d.io.clarius.package import Member
 from speckle3d.io.pose_paths import usable
 from speckle3d.io.recordings import Row
+from speckle3d.io.text import parse_number
 
 G_M_S2 = 9.80665
 MEANING = "scalar first, world from sensor"
@@ -111,7 +112,7 @@ def read_samples(member: Member) -> SensorSamples:
     """
     documents = filter(str.strip, re.split(r"^---.*$", member.text(), flags=re.MULTILINE))
     fields = map(dict, map(_FIELD.findall, documents))
-    rows = [[_number(sample.get(name, "")) for name in _NAMES] for sample in fields]
+    rows = [[parse_number(sample.get(name, "")) for name in _NAMES] for sample in fields]
     stamps, table = np.split(np.array(rows).reshape(-1, len(_NAMES)), [1], axis=1)
     # A magnetometer and a quaternion are in some files alone.
     has_column = np.isfinite(table).sum(axis=0) > 0.5 * len(table)
@@ -160,11 +161,3 @@ def read_samples(member: Member) -> SensorSamples:
         facts,
         remarks,
     )
-
-
-def _number(text: str) -> float:
-    """Number that a text holds; NaN where it is none."""
-    try:
-        return float(text)
-    except ValueError:
-        return np.nan
