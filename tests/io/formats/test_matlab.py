@@ -86,3 +86,8 @@ def test_an_element_of_an_array_of_structs(tmp_path):
     np.testing.assert_array_equal(frames_of(load_sweep(path, settings_of(rf="Receive(2).data"))), rf(1))
     with pytest.raises(InvalidInputError, match=r"Receive\.data"):
         load_sweep(path, settings_of(rf="Receive.data"))
+    structs = np.empty((1, 3), [("data", object)])
+    for k in range(3):
+        structs[0, k]["data"] = matlab_order(rf(k))
+    old = load_sweep(save(tmp_path, Receive=structs), settings_of(rf="Receive(2).data"))
+    np.testing.assert_array_equal(frames_of(old), rf(1))
