@@ -32,21 +32,17 @@ _COLOURS = {"roll": "#009E73", "yaw": "#D55E00", "tilt": "#0072B2"}
 
 
 class Turn(NamedTuple):
-    """Frames that differ in one angle only, in the order of that angle.
+    """Frames that differ in one angle only, in the order of that angle, with one calibration.
 
-    The reference's angle from the first frame, shape (m,), starts at zero and grows; errors of the angle
-    measured with every calibration have shape (k, m).
+    The reference's angle from the first frame, shape (m,), starts at zero and grows; `error_rad` is that of
+    the angle measured, likewise, `drift_rad` the largest of them.
     """
 
-    experiment: str
+    name: str
     angle: str
     reference_rad: FloatArray
     error_rad: FloatArray
-
-    @property
-    def drift_rad(self) -> FloatArray:
-        """Largest error along the turn by every calibration, shape (k,)."""
-        return np.asarray(np.abs(self.error_rad).max(axis=1))
+    drift_rad: float
 
 
 def turns_about(angle: str, experiments: Mapping[str, PairErrors]) -> list[Turn]:
@@ -60,7 +56,9 @@ def turns_about(angle: str, experiments: Mapping[str, PairErrors]) -> list[Turn]
             frames = np.flatnonzero(alone[start] & (angles >= 0))
             frames = frames[np.argsort(angles[frames], kind="stable")]
             if frames.size >= FEWEST_FRAMES and angles[frames[-1]] > 0:
-                turns.append(Turn(name, angle, angles[frames], error[:, start, frames]))
+                for k, row in enumerate(error[:, start, frames]):
+                    label = f"{name}, calibration {k + 1}"
+                    turns.append(Turn(label, angle, angles[frames], row, float(np.abs(row).max())))
     longest = max((turn.reference_rad[-1] for turn in turns), default=0.0)
     return [turn for turn in turns if turn.reference_rad[-1] >= _SHORTEST * longest]
 
@@ -105,23 +103,20 @@ def figure_turns(experiments: Mapping[str, PairErrors], title: str = "") -> Figu
     figure = Figure(figsize=(9.0, 2.8 * len(panels_of_turns)), layout="constrained")
     FigureCanvasAgg(figure)
     panels = figure.subplots(len(panels_of_turns), 2, squeeze=False)
-    for (left, right), turns in zip(panels, panels_of_turns, strict=True):
-        worst = max(turns, key=lambda turn: float(turn.drift_rad.max()))
-        best = min(turns, key=lambda turn: float(turn.drift_rad.min()))
-        _draw(left, "worst", worst, int(worst.drift_rad.argmax()))
-        _draw(right, "best", best, int(best.drift_rad.argmin()))
+    for row, turns in zip(panels, panels_of_turns, strict=True):
+        for axes, rank, choose in zip(row, ("worst", "best"), (max, min), strict=True):
+            _draw(axes, rank, choose(turns, key=lambda turn: turn.drift_rad))
     panels[0, 0].legend(frameon=False, fontsize="small")
     figure.suptitle(printable(title), parse_math=False)
     return figure
 
 
-def _draw(axes: Axes, rank: str, turn: Turn, calibration: int) -> None:
+def _draw(axes: Axes, rank: str, turn: Turn) -> None:
     reference = np.rad2deg(turn.reference_rad)
-    sensed = reference + np.rad2deg(turn.error_rad[calibration])
+    sensed = reference + np.rad2deg(turn.error_rad)
     axes.plot(reference, color="black", linewidth=2.2, alpha=0.55, label="reference")
     axes.plot(sensed, "o--", color=_COLOURS[turn.angle], markersize=4, linewidth=1.3, label="sensor")
-    title = f"{rank} {turn.angle}: {turn.experiment}, calibration {calibration + 1}"
-    axes.set_title(title, fontsize="medium", parse_math=False)
+    axes.set_title(f"{rank} {turn.angle}: {turn.name}", fontsize="medium", parse_math=False)
     axes.set_xlabel("orientation in the turn")
     axes.set_ylabel(f"{turn.angle} / degrees")
     axes.grid(visible=True, alpha=0.3)

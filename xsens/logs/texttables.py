@@ -9,7 +9,7 @@ import csv
 import math
 import re
 from array import array
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -146,9 +146,8 @@ def column_of(name: str) -> tuple[str, float | None] | None:
     return None
 
 
-def describe_unknown(names: Iterable[str]) -> str:
+def describe_unknown(names: Sequence[str]) -> str:
     """Sentence on names of columns, with some of those that are understood."""
-    names = list(names)
     rest_count = f" and {len(names) - 9} more" if len(names) > 9 else ""
     examples = ", ".join(name[:40] for name in names[:9])
     return f"columns not understood: {examples}{rest_count} (expected time_s, acc_x, gyr_x_rad_s, mag_x)"
