@@ -95,8 +95,9 @@ STEP = np.dtype(
 _SHOCK_M_S2 = 60.0
 """Mean force of an increment beyond which it is not believed: a board shaken by hand in BROAD reads 51."""
 
-_START_S, _MOVING_START_S = 1.0, 3.0
-"""Inclination at the start is that of the mean force over this time, at rest and in movement."""
+_START_S, _MOVING_START_S, _LARGEST_START = 1.0, 3.0, 3.0
+"""Inclination at the start is that of the mean force over this time, at rest and in movement. A hand's speed
+over a shorter time is a larger acceleration: so many times the error, up to 17 degrees (3 m/s^2)."""
 
 _REST_SPEED_M_S, _REST_TIME_S = 0.02, 0.5
 """Standard deviation of a resting sensor's velocity, and how long the accelerometer's error persists."""
@@ -214,6 +215,8 @@ def _complete(s: Any, r: Any, step: Any, f: FloatArray) -> None:
     step.resting, step.started = s.resting, not s.starting
     for i in range(6):
         step.sd[i] = math.sqrt(s.p[i, i])
+    if s.starting and s.still_s < s.start_s:
+        step.sd[:2] = step.sd[:2] * min(_START_S / s.start_s, _LARGEST_START)
 
 
 @compiled
