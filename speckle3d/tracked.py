@@ -106,13 +106,11 @@ class Tracked:
         z = self.image.translation[:, 2]
         flag_count = int(np.count_nonzero(self.flags))
         doubts = "; ".join(f"{doubt.about}: {doubt.suspect or doubt.evidence}" for doubt in self.doubts)
-        subset = "none" if self.subset is None else f"{1 - self.rejected_share:.0%} of patches agree"
         rows = [
             ("frames", f"{len(self.image)}, {flag_count} of them flagged", ""),
             ("travel", f"{np.abs(np.diff(z)).sum():.2f} mm along the image's normal, in mode image", ""),
             ("length error", f"{100 * self.scale_sigma:.1f} % claimed (standard deviation)", ""),
             ("direction", f"{self.direction:+d}, from {self.direction_from}", ""),
-            ("subset", subset, ""),
             ("pairs", f"{len(self.edges)} of frames", ""),
             ("doubts", doubts or "none", ""),
         ]

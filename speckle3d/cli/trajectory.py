@@ -86,10 +86,12 @@ def _table(scores: dict[str, Any]) -> str:
     from speckle3d.scoring.displacements import MEANINGS
 
     rows = [(name, str(scores[name]), "") for name in ("estimate", "poses")]
-    for name, words in (("APE", "absolute pose error (APE)"), ("RPE", "relative pose error (RPE)")):
+    for name, noun in (("APE", "absolute pose error (APE)"), ("RPE", "relative pose error (RPE)")):
         error = scores[name]
-        rows.append((f"{words}, RMS", f"{error.rmse_mm:.4f} mm, {error.rmse_deg:.4f}", "deg"))
-        rows.append((f"{words}, largest", f"{error.max_mm:.4f} mm, {error.max_deg:.4f}", "deg"))
+        rows += [
+            (f"{noun}, RMS", f"{error.rmse_mm:.4f} mm, {error.rmse_deg:.4f}", "deg"),
+            (f"{noun}, largest", f"{error.max_mm:.4f} mm, {error.max_deg:.4f}", "deg"),
+        ]
     for name, meaning in {**MEANINGS, "score": "TUS-REC score, 2025"}.items():
         if scores[name] is not None:
             words = f"{meaning.split(':')[0]} ({name.split('_')[0]})"

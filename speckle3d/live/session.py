@@ -15,7 +15,7 @@ from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any, Protocol, TypeGuard
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -176,7 +176,11 @@ class Session:
         while layout is None and not self._is_over(until_s):
             for message in self._source.receive(_LOOK_S):
                 self._devices.hear(message)
-                if layout is None and self._is_image(message):
+                if (
+                    layout is None
+                    and isinstance(message, ImageReceived)
+                    and self._settings.image in (None, message.device)
+                ):
                     layout, first = ImageLayout.of(message, self._settings.importing, message.device), message
                 if layout is not None or isinstance(message, TransformReceived):
                     waiting.append(message)
@@ -207,9 +211,6 @@ class Session:
         self.progress.missing = self._devices.missing
         if show:
             show(self.progress)
-
-    def _is_image(self, message: Received) -> TypeGuard[ImageReceived]:
-        return isinstance(message, ImageReceived) and self._settings.image in (None, message.device)
 
     def _take_all(self, messages: Sequence[Received], recording: Recording, layout: ImageLayout) -> None:
         """Record messages, and have frames matched."""

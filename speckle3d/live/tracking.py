@@ -93,6 +93,8 @@ class LiveTracker:
     ----------
     image_grid : ImageGrid
         Of the intensity images.
+    flags : ndarray of int
+        `FrameFlag` of all frames; zero for those to be trusted.
     images : callable or None
         Called with every frame's intensity image, if set before the first frame.
     hurry : bool
@@ -122,7 +124,7 @@ class LiveTracker:
         self._texture = Texture(matcher)
         self._features: list[FrameFeatures] = []
         self._tables: list[CorrelationTable] = []
-        self._flags = np.zeros(0, dtype=np.int64)
+        self.flags: IntArray = np.zeros(0, dtype=np.int64)
         self._poses = RigidTransform.identity(0)
         self._motion: Motion | None = None
         self._lock, self._growth = threading.Lock(), threading.Condition()
@@ -155,11 +157,6 @@ class LiveTracker:
         # Nor are curves stretched for structure: lengths are up to exp(2 structure) times as long.
         short = 0.0 if curves.of_tissue else np.expm1(2.0 * structure_openness(self._texture))
         return float(np.linalg.norm([motion.coherence.scale_sigma, curves_sigma, short]))
-
-    @property
-    def flags(self) -> IntArray:
-        """`FrameFlag` of all frames; zero for those to be trusted."""
-        return self._flags
 
     def close(self) -> None:
         """End the thread that revises."""
@@ -204,7 +201,7 @@ class LiveTracker:
             return LivePose(
                 time_s,
                 self._poses[number],
-                int(self._flags[number]),
+                int(self.flags[number]),
                 float(before[0]) if before.size else float("nan"),
             )
 
@@ -217,7 +214,7 @@ class LiveTracker:
         least = self._config.trajectory.least_correlation
         if len(table) and table.median.max() < least:
             flag |= FrameFlag.UNMATCHED
-        self._flags = np.append(self._flags, flag)
+        self.flags = np.append(self.flags, flag)
         self._poses = self._poses[[*range(number), number - 1]] if number else RigidTransform.identity(1)
 
     def _place(self) -> None:
@@ -252,7 +249,7 @@ class LiveTracker:
     def revise(self, latest: int = LATEST) -> None:
         """Estimate the motion of the latest frames anew; later frames go along with the last of them."""
         with self._lock:
-            tables, flags, before = tuple(self._tables), self._flags, self._poses
+            tables, flags, before = tuple(self._tables), self.flags, self._poses
         count = len(tables)
         begin = max(0, count - latest)
         if count - begin < 2:

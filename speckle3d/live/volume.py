@@ -30,19 +30,20 @@ class GrowingVolume:
     ----------
     grid : ImageGrid
         Of the intensity images.
+
+    Attributes
+    ----------
+    grid : ImageGrid
+        Of the small images.
     """
 
     def __init__(self, grid: ImageGrid) -> None:
         self._pooled = ImageStack(grid)
+        self.grid = self._pooled.grid
         self._images: dict[int, Float16Array] = {}
         self._every = 1
         self._latest: Float16Array | None = None
         self._lock = threading.Lock()
-
-    @property
-    def grid(self) -> ImageGrid:
-        """Grid of the small images."""
-        return self._pooled.grid
 
     def keep(self, index: int, intensity: Float32Array) -> None:
         """Keep a frame's image, unless those of its neighbours are enough."""

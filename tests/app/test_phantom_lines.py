@@ -42,8 +42,8 @@ def test_a_region_drawn_with_the_mouse_changes_the_line(page, recording):
     page.mouse.down()
     page.mouse.move(*end, steps=4)
     page.mouse.up()
-    page.wait_for_timeout(700)
     region = page.get_by_label("region")
+    page.wait_for_function("field => field.value", arg=region.element_handle())
     places = [tuple(map(float, corner.split(","))) for corner in region.input_value().split()]
     assert places == [pytest.approx(at, abs=1.0) for at in ((104, top), (184, top), (184, 285), (104, 285))]
     text_match(page, "phantom-told", f"row {int(row)}")

@@ -68,19 +68,21 @@ def measure(
     pick_mm = PICKING * reconstruction.grid.vector_pitch_mm if pick_mm is None else pick_mm
     measurements = s3.measure(reconstruction, places, mode, pick_mm)
     note(why, caution(reconstruction, mode))
-    records = [
-        {
-            "kind": row.kind,
-            "points": [number + 1 for number in row.points],
-            "value": row.value * row.shown_in[0],
-            "standard_error": row.sigma * row.shown_in[0],
-            "by_poses": row.pose_sigma * row.shown_in[0],
-            "by_picking": row.pick_sigma * row.shown_in[0],
-            "interval_95": [end * row.shown_in[0] for end in row.interval],
-            "unit": row.shown_in[1],
-        }
-        for row in measurements
-    ]
+    records = []
+    for row in measurements:
+        scale, unit = row.shown_in
+        records.append(
+            {
+                "kind": row.kind,
+                "points": [number + 1 for number in row.points],
+                "value": row.value * scale,
+                "standard_error": row.sigma * scale,
+                "by_poses": row.pose_sigma * scale,
+                "by_picking": row.pick_sigma * scale,
+                "interval_95": [end * scale for end in row.interval],
+                "unit": unit,
+            }
+        )
     numbers = {"mode": mode, "pick_mm": pick_mm, "measurements": records}
     lines = [*(measurement.line for measurement in measurements), how_measured(mode, pick_mm)]
     return numbers, "\n".join(lines)
