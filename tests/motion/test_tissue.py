@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -84,6 +85,12 @@ def test_processed_images_claim_by_how_far_their_grey_levels_are_from_speckles(g
     assert claims[0] < claim < claims[1]
     assert abs(length) == pytest.approx(abs(true), rel=0.1)
     assert any(doubt.suspect == "filtered images" for doubt in tracking.doubts) == (process is not np.copy)
+
+
+@pytest.mark.parametrize(("dark_db", "factor"), [(8.2, 1.0), (0.7 * 5.0, 1.0), (0.4 * 5.0, 2.0)])
+def test_filtered_speckle_is_not_taken_for_structure(dark_db, factor):
+    texture = SimpleNamespace(grey_spread_db=lambda: np.array([dark_db, 5.0]))
+    assert structure_openness(texture) == pytest.approx(np.log(factor))
 
 
 def test_images_black_for_the_most_part_leave_lengths_open(grey):
