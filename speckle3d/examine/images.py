@@ -94,12 +94,15 @@ def doubt_band(texture: Texture) -> Doubt | None:
     Tissue takes high frequencies away and adds none, so most of the echo above the noise cannot lie above the
     band; below it lies what attenuation or a harmonic leaves, which is no contradiction.
     """
-    signal, spectrum = texture.signal, texture.sample_spectrum()
-    if spectrum is None or not isinstance(signal, RFSettings):
+    signal, power = texture.signal, texture.sample_power()
+    if not isinstance(signal, RFSettings):
         return None
     low, high = signal.bandwidth_hz
+    frequency = signal.bin_frequency_hz(power.size)
+    rising = np.argsort(frequency)
     # Mains, gain control and steps between samples are below.
-    frequency, power = (values[spectrum[0] >= low / 4] for values in spectrum)
+    rising = rising[frequency[rising] >= low / 4]
+    frequency, power = frequency[rising], power[rising]
     echo = np.maximum(power - 2 * np.quantile(power, NOISE_QUANTILE), 0.0)
     if echo.sum() <= LEAST_ECHO * power.sum():
         return None

@@ -167,7 +167,7 @@ def _plan_resampling(signal: RFSettings, samples: int, edge_fraction: float) -> 
     frequency = signal.bin_frequency_hz(length)
     weights = band_weights(frequency, low, high, edge)
     bins = np.flatnonzero(weights)
-    bins = bins[np.argsort(frequency[bins])][:out_length]
+    bins = bins[np.argsort(frequency[bins])]
     destination = (np.arange(bins.size) - bins.size // 2) % out_length
     # Over the lengths' ratio for the inverse transform; the analytic signal is twice the positive half of a
     # real signal's spectrum.

@@ -147,14 +147,9 @@ class Texture:
             self._patches.row_depth_mm[has_echo], frequency[band], power.data[has_echo][:, band]
         )
 
-    def sample_spectrum(self) -> tuple[FloatArray, FloatArray] | None:
-        """Frequencies, Hz, increasing, and the power of the samples as read; None of grey levels."""
-        if not isinstance(self.signal, RFSettings):
-            return None
-        power = np.mean([look.sampled for look in self._looks.values()], axis=0)
-        frequency = self.signal.bin_frequency_hz(power.size)
-        rising = np.argsort(frequency)
-        return frequency[rising], power[rising]
+    def sample_power(self) -> FloatArray:
+        """Power of the samples as read, by `RFSettings.bin_frequency_hz`."""
+        return np.asarray(np.mean([look.sampled for look in self._looks.values()], axis=0))
 
     def standing_share(self, pairs: IntArray) -> FloatArray:
         """Share of each patch's power that is the same in all frames: median over pairs of them, shape (p,).
