@@ -184,9 +184,10 @@ class Texture:
 
 
 def measured_texture(sweep: Sweep, matcher: FrameMatcher) -> Texture:
-    """Read some frames of a sweep, and measure their texture."""
-    texture = Texture(matcher)
-    for number in spread_frames(len(sweep), FRAMES).tolist():
+    """Read some frames of a sweep, leave out what stands still in them, and measure their texture."""
+    texture, numbers = Texture(matcher), spread_frames(len(sweep), FRAMES).tolist()
+    matcher.leave_out([matcher.extractor.echo(sweep.frames[number]) for number in numbers])
+    for number in numbers:
         texture.keep(number, matcher.ready(sweep.frames[number]))
     return texture
 
