@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import typer
+
 import speckle3d as s3
 from speckle3d.cli.commands import Fields
 from speckle3d.cli.common import (
@@ -68,7 +70,9 @@ def convert(
         Fields("speckle3d.io.import_settings:ImportSettings", without=("image_to_probe", "arrays")),
     ],
     calibration: Paths = None,
-    compression: Literal["gzip", "lzf", "none"] | None = None,
+    compression: Annotated[
+        Literal["gzip", "lzf", "none"] | None, typer.Option("--compression", "--compress")
+    ] = None,
     mode: MaybeText = None,
     sweep_file: MaybePath = None,
 ) -> None:

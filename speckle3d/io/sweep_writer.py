@@ -26,12 +26,23 @@ from speckle3d.core.grid import ImageGrid
 from speckle3d.core.progress import Progress
 from speckle3d.core.sweep import BModeSettings, OrientationSensor, RFSettings, Sweep, Tracker, stored_dtype
 from speckle3d.core.threads import ahead
-from speckle3d.io.hdf5 import PathLike, atomic_path, open_family, require_target
+from speckle3d.io.frames import FileFrames
+from speckle3d.io.hdf5 import (
+    PathLike,
+    atomic_path,
+    file_format,
+    find_member,
+    open_family,
+    open_hdf5,
+    reading,
+    require_target,
+)
 from speckle3d.io.meanings import label
 from speckle3d.io.records import put, put_fields, reserve, trim, written
 from speckle3d.io.sweeps import (
     FORMAT,
     GROWING,
+    MEMBERS,
     SAMPLE_TYPES,
     SENSORS,
     VERSIONS,
@@ -106,7 +117,7 @@ def write_sweep(
     compression: Compression = None,
     simulation: Mapping[str, Any] | None = None,
 ) -> None:
-    """Write a sweep; what its own file holds beyond the format stays behind.
+    """Write a sweep; what its own file holds beyond the format is copied along.
 
     Parameters
     ----------
@@ -155,6 +166,19 @@ def write_sweep(
         for name, value in (simulation or {}).items():
             plain = value if isinstance(value, str | int | float) else json.dumps(value, sort_keys=True)
             put(file, "simulation", {name: plain})
+        if isinstance(frames, FileFrames):
+            _copy_other_groups(frames.path, file)
+
+
+def _copy_other_groups(source: PathLike, file: h5py.File) -> None:
+    """Copy what another sweep file holds beyond the format."""
+    with reading(source), naming(str(source)):
+        if not h5py.is_hdf5(source):
+            return
+        with open_hdf5(source) as origin:
+            names = {*origin} - MEMBERS - {*file} if file_format(origin) == FORMAT else ()
+            for name in names:
+                origin.copy(find_member(origin, name), file, name)
 
 
 def attach_orientation(path: PathLike, sensor: OrientationSensor) -> None:

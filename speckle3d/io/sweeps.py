@@ -52,6 +52,8 @@ SENSORS: dict[str, tuple[str, str, tuple[int, ...], Callable[[FloatArray, str], 
     "tracker": ("world_from_sensor", "sensor_from_image", (4, 4), transforms_from_matrices),
 }
 """Of each sensor, its data set of readings, its attribute of the image's place, and the shape of both."""
+MEMBERS = frozenset({*SAMPLE_TYPES, *SENSORS, "frame_time_s", "truth", "fan", GROWING})
+"""Members of the root that these versions of the format give a meaning to."""
 
 
 def from_pairs(pairs: npt.NDArray[np.int16]) -> npt.NDArray[np.complex64]:

@@ -65,7 +65,11 @@ def test_attaching_a_sensor_changes_nothing_else(path, tmp_path):
     changed = load_sweep(path)
     assert (changed.orientation.time_offset_s, changed.grid) == (0.5, sweep.grid)
     np.testing.assert_array_equal(changed.frames[5], sweep.frames[5])
-    assert list(tmp_path.iterdir()) == [path]
+    write_sweep(tmp_path / "again.h5", replace(changed, tracker=None))
+    with h5py.File(tmp_path / "again.h5") as file:
+        np.testing.assert_array_equal(file["annotations/landmarks_mm"], np.eye(3))
+        assert "tracker" not in file
+    assert sorted(tmp_path.iterdir()) == [tmp_path / "again.h5", path]
 
 
 def test_a_fan_of_vectors_is_stored_whole(tmp_path):
