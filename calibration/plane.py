@@ -393,7 +393,9 @@ def _with_distances(lines: ImagePoints, angles: Chain, pixel_mm: FloatArray | No
 
 def _facing_up(solution: Solution) -> Solution:
     """Solution with the plane's normal on the probe's side: heights of images are positive."""
-    if np.median(solution.chain.target_from_image(solution.points).translation[:, 2]) >= 0:
+    chain, points = solution.chain, solution.points
+    origins = points.turns @ chain.probe[:3, 3] + points.shifts_mm
+    if np.median(origins @ chain.target[2, :3]) + chain.target[2, 3] >= 0:
         return solution
-    chain = replace(solution.chain, target=_HALF_TURN_X @ solution.chain.target)
+    chain = replace(chain, target=_HALF_TURN_X @ chain.target)
     return replace(solution, chain=chain, residuals=-solution.residuals)

@@ -35,7 +35,7 @@ _STARTS = 6
 _TINY, _LEAST_PIXEL_MM = np.finfo(float).tiny, 1e-6
 _OUTWARD = 0.005
 """Share by which crossings are placed too far from the middle of the columns, beyond whose sides filters see
-nothing: 0.46 % (standard error 0.11) in 80 simulated scans of two threads. Of 40 other scans, 72 and 95 % of
+nothing: 0.46 % (standard error 0.11) in 80 simulated scans of two threads. Of 40 other scans, 70 and 95 % of
 the errors of s_x then lie within 68 and 95 % intervals (without it 68 and 92)."""
 _AS_IT_IS = Rotation.identity()
 """A point has no orientation."""
