@@ -180,5 +180,4 @@ def require_kind(value: Any, kind: type, made_by: str) -> None:
         If it is something else.
     """
     if not isinstance(value, kind):
-        name = type(value).__name__
-        raise InvalidInputError(f"expected a {kind.__name__}, as {made_by} gives it, got {name}")
+        raise InvalidInputError(f"expected a {kind.__name__}, as {made_by} gives it, got {type(value)}")

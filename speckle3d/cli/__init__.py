@@ -89,7 +89,7 @@ def _run(heard: list[int]) -> None:
         from speckle3d import __version__
 
         emit(f"speckle3d {__version__}")
-        sys.exit(0)
+        return
     try:
         code = app(standalone_mode=False, prog_name="speckle3d")
     except Speckle3DError as error:

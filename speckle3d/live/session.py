@@ -143,8 +143,10 @@ class Session:
 
     def picture(self) -> tuple[Float32Array, ImageGrid] | None:
         """Grey levels of the latest frame, shape (vector, sample), and where they lie; None without one."""
-        levels = None if self._volume is None else self._volume.latest()
-        return None if self._volume is None or levels is None else (levels, self._volume.grid)
+        volume = self._volume
+        if volume is None or (levels := volume.latest()) is None:
+            return None
+        return levels, volume.grid
 
     def path(self) -> tuple[FloatArray, FloatArray, RigidTransform]:
         """Times of frames, elevation of the image's centre there, mm, and poses, as they are known now."""
