@@ -132,7 +132,7 @@ def orient(
     magnetometer: bool = True,
     time_offset_s: MaybeNumber = None,
     calibration: MaybePath = None,
-    replace_stream: Annotated[bool, typer.Option("--replace")] = False,
+    replace: bool = False,
     rate_hz: MaybeNumber = None,
     world: World = None,
 ) -> Result:
@@ -154,7 +154,7 @@ def orient(
 
     Other Parameters
     ----------------
-    replace_stream
+    replace
         With --into: replace a stream that the sweep has.
     rate_hz, world, as_json
 
@@ -168,7 +168,7 @@ def orient(
 
     if into is None and out is None:
         raise InvalidInputError("expected --into SWEEP.h5, -o CSV or both, got neither")
-    if into is not None and not replace_stream and s3.load_sweep(into).orientation is not None:
+    if into is not None and not replace and s3.load_sweep(into).orientation is not None:
         raise InvalidInputError(
             f"{into}: expected no orientation sensor's stream, got one: --replace replaces it"
         )
@@ -184,7 +184,7 @@ def orient(
             mounting = solution.rotation
             offset_s = offset_s if solution.time_offset_s is None else solution.time_offset_s
         offset_s = offset_s if time_offset_s is None else time_offset_s
-        coverage = attach_log(into, log, rotations, mounting, offset_s, replace_stream)
+        coverage = attach_log(into, log, rotations, mounting, offset_s, replace)
         note(f"orientation of {len(rotations)} samples in {into}{coverage}")
     if out is not None:
         xsens.write_csv(out, with_orientation(log, rotations))
@@ -210,7 +210,7 @@ def accuracy(
     optical: MaybePath = None,
     calibration: Paths = None,
     turns: str = "roll, yaw, tilt",
-    fit_mounting: Annotated[bool, typer.Option("--fit-mounting/--aligned")] = True,
+    fit_mounting: bool = True,
     time_offset_s: float = 0.0,
     method: Method = "smoother",
     magnetometer: bool = True,
