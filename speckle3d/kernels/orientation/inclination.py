@@ -216,7 +216,7 @@ def _complete(s: Any, r: Any, step: Any, f: FloatArray) -> None:
     for i in range(6):
         step.sd[i] = math.sqrt(s.p[i, i])
     if s.starting and s.still_s < s.start_s:
-        step.sd[:2] = step.sd[:2] * min(_START_S / s.start_s, _LARGEST_START)
+        step.sd[:2] = step.sd[:2] * min(max(_START_S / s.start_s, 1.0), _LARGEST_START)
 
 
 @compiled
