@@ -1,5 +1,6 @@
 """Errors raised on purpose, and doubts about a recording; a message is one line: expected, got, and where."""
 
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -52,6 +53,10 @@ def naming(where: str) -> Iterator[None]:
         if str(error).startswith(printable(where)):
             raise
         raise type(error)(f"{where}: {error}") from error
+
+
+DECISIVE = math.log(100.0)
+"""Logarithm of the ratio of likelihoods that is decisive evidence (H. Jeffreys, "Theory of Probability")."""
 
 
 @dataclass(frozen=True)

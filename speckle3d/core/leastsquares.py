@@ -13,7 +13,7 @@ def robust_sigma(residuals: FloatArray | Float32Array, smallest: float = 0.0) ->
     return max(MAD_TO_SIGMA * float(np.median(np.abs(residuals))), smallest)
 
 
-def huber_weights(residuals: FloatArray, limit: float = 1.345) -> FloatArray:
+def huber_weights(residuals: FloatArray, limit: float = 2.0) -> FloatArray:
     """Huber's weights: one up to `limit`, beyond it its inverse; with a small limit, least absolute values.
 
     Parameters

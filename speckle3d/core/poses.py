@@ -36,6 +36,9 @@ TURN_CHANGE_MM = 40.0
 grow to 0.3 degrees in 1 mm, 0.7 in 4, 1.0 in 8 and 2.0 in 24. Tracked hands over phantoms turn by 0.3, 0.7 to
 0.9, 1.0 to 1.7 and 1.7 to 4.5 about each axis."""
 
+ERROR_STEPS = 40
+"""Places along a sweep at which its errors are computed; between them they are interpolated."""
+
 HELD = np.array([1.0, 1.0, 1.0, 0.05, 0.05, 0.05])
 """How far a probe may go between two frames that no pair joins, deviations of (x, y, z, tilt, yaw, roll), mm
 and rad: 25 mm and 70 degrees in a second at 25 frames."""

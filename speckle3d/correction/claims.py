@@ -12,10 +12,10 @@ from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.geometry import skew
+from speckle3d.correction.curves import CUBIC
 from speckle3d.correction.settings import FusedSettings
 
-CUBIC = 3
-LEAST_LENGTH_MM = 1e-9
+LEAST_LENGTH_MM = float(np.finfo(float).eps)
 """Of a sweep that did not move, whose relative error is as good as infinite."""
 
 

@@ -29,8 +29,8 @@ AXES = ("x", "y", "z", "tilt", "yaw", "roll")
 ELEVATIONAL = ("z", "tilt", "yaw")
 """Parameters that speckle decorrelation biases, in proportion to the distance travelled."""
 
-COEFFICIENTS = 5
-"""Per parameter: the first frame's offset and the four coefficients of a cubic."""
+CUBIC = 3
+"""Degree of the curves; with the first frame's offset each has two coefficients more."""
 
 
 def cumulative_product(matrices: FloatArray) -> FloatArray:
@@ -59,8 +59,8 @@ def curve_basis(axes: tuple[str, ...], steps_mm: FloatArray, curves: Curves) -> 
         travelled), because those drifts accumulate with distance and change sign when the probe turns back.
     """
     n = steps_mm.size + 1
-    cubic = legendre.legvander(2.0 * np.arange(1, n) / (n - 1) - 1.0, COEFFICIENTS - 2)
-    basis = np.zeros((n, len(axes), COEFFICIENTS))
+    cubic = legendre.legvander(2.0 * np.arange(1, n) / (n - 1) - 1.0, CUBIC)
+    basis = np.zeros((n, len(axes), CUBIC + 2))
     basis[0, :, 0] = 1.0
     for a, axis in enumerate(axes):
         if curves == "distance" and axis in ELEVATIONAL:
@@ -104,7 +104,7 @@ class CorrectedChain:
     @property
     def names(self) -> tuple[str, ...]:
         """Name of every coefficient, in order."""
-        parts = ("offset", *(f"legendre{k}" for k in range(COEFFICIENTS - 1)))
+        parts = ("offset", *(f"legendre{k}" for k in range(CUBIC + 1)))
         return tuple(f"{axis}_{part}" for axis in self.axes for part in parts)
 
     @property

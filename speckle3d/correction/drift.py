@@ -21,7 +21,7 @@ from speckle3d.core.text import shown
 from speckle3d.correction.claims import curve_errors, length_sigma
 from speckle3d.correction.curves import (
     AXES,
-    COEFFICIENTS,
+    CUBIC,
     CorrectedChain,
     Curves,
     curve_basis,
@@ -43,7 +43,7 @@ class DriftSettings(BaseModel):
         gt=0,
         description="Distance below which the unsquared corner distance is rounded off to be differentiable.",
     )
-    minimum_frames: int = Field(10, ge=COEFFICIENTS, description="Shortest sweep that is corrected, frames.")
+    minimum_frames: int = Field(10, ge=CUBIC + 2, description="Shortest sweep that is corrected, frames.")
     minimum_coverage: float = Field(
         0.8, ge=0, le=1, description="Least share of the frames that need a sensor reading."
     )

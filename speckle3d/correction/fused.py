@@ -33,13 +33,9 @@ from speckle3d.correction.scale import ScaledPoses, ScaleEvidence
 from speckle3d.correction.sensor_readings import SensorReadings
 from speckle3d.correction.settings import FusedSettings
 
-HUBER = 2.0
-"""Deviations, by the root mean square of three residuals, at which a reading begins to lose weight."""
 MOST_ROUNDS, LEAST_STEP = 12, 1e-5
 ROUNDS = 2
 """The first finds how the sensors wander, which the second solves with."""
-NEGLIGIBLE = 1e-4
-"""Weight of a wander that has no say in the covariance."""
 FARTHEST = 2.0
 """Factor between the lengths of images and tracker beyond which no average of the two means anything."""
 
@@ -90,7 +86,7 @@ class FusionProblem:
         weight = np.exp(np.array(evidence) - max(evidence))
         weight /= weight.sum()
         mean, covariance = weight @ np.array(steps), np.zeros_like(matrix)
-        for k in np.flatnonzero(weight > NEGLIGIBLE):
+        for k in np.flatnonzero(weight > np.finfo(float).eps):
             away = steps[k] - mean
             covariance += weight[k] * (cho_solve(factors[k], np.eye(mean.size)) + np.outer(away, away))
         return variants[int(np.argmax(weight))], mean, covariance
@@ -110,7 +106,7 @@ class FusionProblem:
         matrix, gradient = np.zeros((unknowns.size, unknowns.size)), np.zeros(unknowns.size)
         for columns, residual, slope, robust in self._equations(unknowns):
             size = np.sqrt((residual**2).mean(axis=1))
-            root = np.sqrt(huber_weights(size, HUBER) if robust else np.ones_like(size))[:, None]
+            root = np.sqrt(huber_weights(size) if robust else np.ones_like(size))[:, None]
             rows, pull = (slope * root[:, :, None]).reshape(-1, slope.shape[-1]), (residual * root).ravel()
             matrix[np.ix_(columns, columns)] += rows.T @ rows
             gradient[columns] += rows.T @ pull

@@ -10,12 +10,20 @@ from scipy.sparse.linalg import splu
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import FloatArray, IntArray
-from speckle3d.core.poses import HELD, SCALE_CHANGE_MM, SHARED, STRUCTURE, TURN_CHANGE_MM, RelativePoses
+from speckle3d.core.poses import (
+    ERROR_STEPS,
+    HELD,
+    SCALE_CHANGE_MM,
+    SHARED,
+    STRUCTURE,
+    TURN_CHANGE_MM,
+    RelativePoses,
+)
 from speckle3d.core.reconstruction import SharedErrors
 from speckle3d.correction.curves import AXES, CorrectedChain
 from speckle3d.correction.scale import ScaleEvidence
 
-FRAMES_PER_KNOT, MOST_KNOTS = 4, 40
+FRAMES_PER_KNOT = 4
 """Corrections change from knot to knot: the images' own detail is finer than any sensor's between them."""
 SIDEWAYS, SIDEWAYS_BY_SHARE = 0.005, (0.5, 0.1)
 """Standard deviation of motion along x and y that images see for each mm along z where structure runs across:
@@ -32,7 +40,7 @@ Z = AXES.index("z")
 
 def knot_intervals(frames: int) -> int:
     """Number of intervals between knots of a sweep of so many frames."""
-    return int(np.clip((frames - 1) // FRAMES_PER_KNOT, 1, MOST_KNOTS))
+    return int(np.clip((frames - 1) // FRAMES_PER_KNOT, 1, ERROR_STEPS))
 
 
 @dataclass(frozen=True)

@@ -27,8 +27,9 @@ from speckle3d.correction.settings import FusedSettings
 FEWEST_READINGS = 10
 PER_PIECE = 512
 """Readings whose equations are held in memory at a time."""
-WANDER_KNOTS_PER_TIME, MOST_WANDER_KNOTS = 10, 30
-"""Knots of the wandering error in the time in which it changes."""
+WANDER_KNOTS = 20
+"""Knots of the wandering error: twice the fastest that is tried. Half and twice as many of a tracker move no
+length by 0.1 %, no claim by 3 %."""
 WANDER_MM = np.geomspace(0.03, 3.0, 7)
 """Sizes of a tracker's wandering error that are tried: from what optical ones have to what metal does to a
 field."""
@@ -39,12 +40,10 @@ STEADY = 0.5
 Half of it moves lengths of 56 parts of sweeps by at most 0.3 %, their claims by at most 6 %."""
 LEAST_JITTER = np.array([2e-5, 2e-3])
 """Of a turn, rad, and a place, mm: the last digits of sensors; simulated ones may have no noise."""
-TICK = 1e-6
-"""Of an unknown, by which derivatives are taken."""
 ANYWHERE = 1e4
 """Standard deviation of what is not known at all, mm and rad."""
-WORLD_TURN, WORLD_SHIFT, MOUNTING_TURN, MOUNTING_SHIFT = (slice(k, k + 3) for k in (0, 3, 6, 9))
-CLOCK, MILLIMETRES, RIGID = 12, 13, 14
+RIGID = 14
+"""Unknowns before the wander's: turn and shift of world and mounting, clock, logarithm of millimetres."""
 
 
 @dataclass(frozen=True)
@@ -150,9 +149,7 @@ class SensorReadings:
     @property
     def knots_s(self) -> FloatArray:
         """Times at which the wandering error is unknown."""
-        times = np.ptp(self.time_s) / self.settings.wander_s
-        count = int(np.clip(np.ceil(WANDER_KNOTS_PER_TIME * times), 2, MOST_WANDER_KNOTS))
-        return np.linspace(self.time_s[0], self.time_s[-1], MOST_WANDER_KNOTS if self.places else count)
+        return np.linspace(self.time_s[0], self.time_s[-1], WANDER_KNOTS)
 
     def wanders(self) -> list[SensorReadings]:
         """The readings with all that a tracker's wandering error may be; an orientation sensor's is known."""
@@ -189,13 +186,13 @@ class SensorReadings:
     def world_of(self, unknowns: FloatArray) -> RigidTransform:
         """Sensor's world from the path's; it turns about the middle of the readings."""
         pivot = RigidTransform.from_translation(self.world_from_sensor.translation.mean(axis=0))
-        turn = RigidTransform.from_rotation(Rotation.from_rotvec(unknowns[WORLD_TURN]))
-        shift = RigidTransform.from_translation(unknowns[WORLD_SHIFT])
-        return shift * pivot * turn * pivot.inv() * self.world
+        turn, shift = unknowns[:6].reshape(2, 3)
+        about_pivot = pivot * RigidTransform.from_rotation(Rotation.from_rotvec(turn)) * pivot.inv()
+        return RigidTransform.from_translation(shift) * about_pivot * self.world
 
     def _frames(self, unknowns: FloatArray) -> tuple[IntArray, FloatArray]:
         """The frame before each reading, and the reading's share of the time to the next."""
-        time_s, frames = self.time_s + unknowns[CLOCK], self.frame_time_s
+        time_s, frames = self.time_s + unknowns[12], self.frame_time_s
         before = np.clip(np.searchsorted(frames, time_s, "right") - 1, 0, frames.size - 2)
         return before, (time_s - frames[before]) / np.diff(frames)[before]
 
@@ -205,8 +202,8 @@ class SensorReadings:
         poses = RigidTransform.from_matrix(path)
         step = (poses[:-1].inv() * poses[1:]).as_exp_coords()[before]
         between = poses[before] * RigidTransform.from_exp_coords(step * share[:, None])
-        turn = Rotation.from_rotvec(unknowns[MOUNTING_TURN])
-        mounting = RigidTransform.from_components(unknowns[MOUNTING_SHIFT], turn)
+        turn, shift = unknowns[6:12].reshape(2, 3)
+        mounting = RigidTransform.from_components(shift, Rotation.from_rotvec(turn))
         return self.world_of(unknowns) * between * self.centre_from_sensor * mounting
 
     def _hats(self) -> FloatArray:
@@ -222,7 +219,7 @@ class SensorReadings:
         if not self.places:
             return turn + wander, np.zeros_like(turn)
         place = expected.translation
-        stretch = unknowns[MILLIMETRES] * (place - place.mean(axis=0))
+        stretch = unknowns[13] * (place - place.mean(axis=0))
         return turn, place + stretch + wander - self.world_from_sensor.translation
 
     def equations(
@@ -234,8 +231,9 @@ class SensorReadings:
         """
         poses = path.chain.poses(coefficients)
         errors = np.stack(self.errors(poses, unknowns))
-        nudged = (self.errors(poses, unknowns + tick) for tick in TICK * np.eye(RIGID, self.size))
-        rigid = (np.stack([np.stack(error) for error in nudged], axis=-1) - errors[..., None]) / TICK
+        tick = np.sqrt(np.finfo(float).eps)
+        nudged = (self.errors(poses, unknowns + step) for step in tick * np.eye(RIGID, self.size))
+        rigid = (np.stack([np.stack(error) for error in nudged], axis=-1) - errors[..., None]) / tick
         world, hats = self.world_of(unknowns), self._hats()
         to_world, on_path = world.rotation.as_matrix(), world.inv() * self._expected(poses, unknowns)
         twists, (before, share) = path.chain.twists(coefficients, poses), self._frames(unknowns)

@@ -17,12 +17,13 @@ from speckle3d.core.arrays import FloatArray
 from speckle3d.core.curves import DecorrelationCurves, SpeckleSize, curve_widths
 from speckle3d.core.errors import Doubt, MismatchError, Speckle3DError
 from speckle3d.core.sweep import RFSettings
+from speckle3d.examine.sensors import REFUTED
 from speckle3d.matching.patches import PatchGrid
 from speckle3d.matching.texture import Texture
 from speckle3d.motion.coherence import NOISY_GAIN, ROW_SIGMA, RowScales
 from speckle3d.motion.estimate import Motion
 
-BEND_DOUBT, BEND_LIMIT = 0.12, 0.25
+BEND_DOUBT = 0.12
 """Standard deviation over depth of the logarithm of distances. Simulated: right curves up to 0.06 in phantom,
 tissue and noise; of a lens whose focus is 10 % off 0.11; shipped ones 10 mm too high 0.20, reversed 0.53."""
 SIZE_LIMITS = {"lateral_mm": (0.13, 0.3), "axial_mm": (0.3, 0.6)}
@@ -127,7 +128,7 @@ def doubt_bend(rows: RowScales | None) -> Doubt | None:
         f"{rows.depth_mm[-1]:.0f} mm that differ by a factor of {ratio:.2f} ({100 * size:.0f} % rms, at most "
         f"{100 * BEND_DOUBT:.0f} expected)"
     )
-    return Doubt("curves", "curves of another probe, lens or depth", evidence, size > BEND_LIMIT)
+    return Doubt("curves", "curves of another probe, lens or depth", evidence, size > REFUTED * BEND_DOUBT)
 
 
 def doubt_size(

@@ -13,7 +13,7 @@ from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import Doubt
 from speckle3d.core.geometry import relative_poses
 from speckle3d.core.sweep import OrientationSensor, Sweep, Tracker
-from speckle3d.examine.sensors import jitter, rigid
+from speckle3d.examine.sensors import SMOOTH, jitter, rigid
 
 JOINT_CLAIMS = 3.0
 """Joint standard deviations beyond which two numbers disagree (DESIGN, Disagreement)."""
@@ -22,8 +22,6 @@ UNIT_FACTOR = 1.5
 """Factor within which a path must be such a multiple: units are farther apart, paths by images nearer."""
 BY_IMAGES = {"image", "consistent-subset", "orientation"}
 """Modes that take their length from the images alone."""
-SMOOTH_FRAMES = 9
-"""Frames of which the running median is taken, so that jitter is not taken for motion."""
 LEAST_SIGMA_MM, LEAST_SIGMA_RAD = 0.1, 0.013
 """Errors of place and roll that sensors have beside their jitter: of a mounting off by 1 mm or a third
 of a degree while the probe turns by 5 degrees, and of a heading."""
@@ -48,7 +46,7 @@ def disagreements(sweep: Sweep, image: RigidTransform, covariance: FloatArray) -
         if sensor is None or sensor.sensor_from_image is None:
             continue
         frames = np.flatnonzero(sensor.covers(sweep.frame_time_s))
-        if frames.size >= SMOOTH_FRAMES:
+        if frames.size >= SMOOTH:
             doubts += _doubt_sensor(sensor, sweep, image[frames], covariance[frames], frames)
     return tuple(doubts)
 
@@ -71,7 +69,7 @@ def _doubt_sensor(
             continue
         image_sigma = np.hypot(np.sqrt(covariance[:, axis, axis]), SIDEWAYS * travel if axis < 2 else 0.0)
         least = LEAST_SIGMA_MM if axis < 3 else LEAST_SIGMA_RAD
-        jitter_left = noise[int(axis > 2)] / np.sqrt(SMOOTH_FRAMES)
+        jitter_left = noise[int(axis > 2)] / np.sqrt(SMOOTH)
         sensor_sigma = np.full_like(image_sigma, np.hypot(jitter_left, least))
         size = np.abs(by_images[:, axis] - by_sensor[:, axis]) / np.hypot(image_sigma, sensor_sigma)
         worst = int(np.argmax(travel if axis == 2 else size))
@@ -94,7 +92,7 @@ def _motion(poses: RigidTransform, centre_mm: FloatArray) -> FloatArray:
     steps = relative_poses(poses)
     motion = np.hstack([steps.apply(centre_mm) - centre_mm, steps.rotation.as_rotvec()])
     path = np.concatenate([np.zeros((1, 6)), np.cumsum(motion, axis=0)])
-    path = median_filter(path, (SMOOTH_FRAMES, 1), mode="mirror")
+    path = median_filter(path, (SMOOTH, 1), mode="mirror")
     return np.asarray(path - path[0])
 
 

@@ -12,12 +12,13 @@ from scipy.optimize import isotonic_regression
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
-from speckle3d.core.curves import DecorrelationCurves
+from speckle3d.core.curves import PROBE_SIGMA, DecorrelationCurves
 from speckle3d.core.errors import Doubt, InsufficientDataError, MismatchError
 from speckle3d.core.poses import HELD
 from speckle3d.core.sweep import RFSettings
 from speckle3d.examine.curves import examine_curves, require_usable
-from speckle3d.examine.sensors import runs_of
+from speckle3d.examine.disagreements import JOINT_CLAIMS
+from speckle3d.examine.sensors import REFUTED, runs_of
 from speckle3d.matching.frames import MatchedSweep
 from speckle3d.matching.table import CorrelationTable
 from speckle3d.matching.texture import Texture
@@ -29,8 +30,8 @@ IMAGES = "images"
 
 SHADOW_SHARE = 0.02
 """Share of patches without an echo that is told."""
-OPEN_SHARE = 0.5
-"""Standard error over length from which a length is refused; from half of it, it is flagged. Good sweeps
+OPEN_SHARE = 0.25
+"""Standard error over length from which a length is flagged. Good sweeps
 claim up to 0.06, those with noise of half the signal's power 0.15."""
 
 SPECKLE_DB = 5.57
@@ -47,8 +48,6 @@ echoes, in half not."""
 INTENSITY_LIMITS = 0.1, 0.25
 """The same by the median patch for images without phase, where layers along the sweep stand still, too: bone
 and spine have 0.01 to 0.05. A quarter of the intensity's variation is half of the echo's power."""
-STANDING_SIGMA = 5.0
-"""Standard errors that a share must be above zero."""
 
 OUT_OF_TURN = 0.1
 """By how much a frame must be less like the last one than like an earlier one: ten times what the median
@@ -56,8 +55,6 @@ over fifty patches scatters by."""
 MOST_OUT_OF_TURN = 0.6
 """Share of such frames. A wobble of 3 Hz at 25 frames a second has a quarter of them, at its turns."""
 
-GREY_DOUBT = 0.08
-"""Relative standard deviation of lengths by grey levels, from which it is told: a curve's usual claim."""
 LARGEST_AVERAGING = 0.03
 """Of the length, from which averaging refuses it: the share is known to a factor of two."""
 
@@ -67,10 +64,8 @@ WINDOW = 8
 """Frames over which distances are compared with what pairs as alike have elsewhere: a fold of the path takes
 no more. A quarter of a window on comes the next."""
 LEAST_PAIRS = 6
-"""Pairs that a window needs."""
-FOLD_PATCHES = 8
-"""Patches from which a fold is told: a median over fewer scatters too much."""
-FOLD_DOUBT, FOLD_LIMIT = 0.25, 0.40
+"""Pairs that a window, and patches that an image needs: medians over fewer scatter too much."""
+FOLD_DOUBT = 0.2
 """Mean departure over mean distance in the worst window. Of 64 small sweeps of 6 to 21 patches, those right
 to three standard errors have up to 0.18, two at three of them 0.23 and 0.24, and three that are a quarter to
 a half too short 0.41 and more; whole images have up to 0.05, with noise of a tenth of the power 0.14."""
@@ -146,7 +141,7 @@ def examine_processing(grey: float, short: float) -> tuple[Doubt, ...]:
             f"several (persistence, frame averaging): lengths come out some {short:.0%} short"
         )
         doubts.append(Doubt(IMAGES, "averaged frames", evidence, short > LARGEST_AVERAGING))
-    if grey > GREY_DOUBT:
+    if grey > PROBE_SIGMA:
         evidence = (
             "expected grey levels that vary as speckle's decibels, got those of structure, edge enhancement, "
             f"smoothing or another map: lengths are open by {grey:.0%}; curves of a tracked sweep know it"
@@ -231,14 +226,14 @@ def doubt_length(position_mm: FloatArray, sigma_mm: FloatArray, reach_mm: float)
         Largest distance in the curves: a probe at rest is known to much less.
     """
     length, sigma = float(np.ptp(position_mm)), float(np.max(sigma_mm))
-    limit = max(OPEN_SHARE * length, reach_mm)
-    if sigma <= limit / 2:
+    limit = max(OPEN_SHARE * length, reach_mm / 2)
+    if sigma <= limit:
         return None
     evidence = (
-        f"expected a length known to {limit / 2:.3g} mm, got {length:.3g} mm with a standard error of "
+        f"expected a length known to {limit:.3g} mm, got {length:.3g} mm with a standard error of "
         f"{sigma:.3g} mm: the correlations do not determine it"
     )
-    return Doubt(IMAGES, "too little speckle in common", evidence, sigma > limit)
+    return Doubt(IMAGES, "too little speckle in common", evidence, sigma > REFUTED * limit)
 
 
 def doubt_order(table: CorrelationTable, frames: int, least_correlation: float) -> Doubt | None:
@@ -291,7 +286,7 @@ def doubt_clutter(share: FloatArray, pairs: int, cells: float, of_echo: bool = T
         return None
     # Each pair's coherence scatters by one over the root of twice its cells; pairs that share a frame are
     # nearly independent, and medians, of pairs and of patches, scatter by a quarter more than means.
-    chance = STANDING_SIGMA * 1.25**2 / np.sqrt(2.0 * cells * pairs * shares.size)
+    chance = JOINT_CLAIMS * 1.25**2 / np.sqrt(2.0 * cells * pairs * shares.size)
     least, most = ECHO_LIMITS if of_echo else INTENSITY_LIMITS
     median = float(np.median(shares))
     typical = float(np.mean(shares)) if of_echo else median
@@ -324,7 +319,7 @@ def doubt_path(
     low, high = ALIKE
     rows = np.flatnonzero((table.median > low) & (table.median < high) & table.joins(usable))
     rows = rows[np.argsort(-table.median[rows], kind="stable")]
-    if rows.size < LEAST_PAIRS or len(patch_centre_mm) < FOLD_PATCHES:
+    if rows.size < LEAST_PAIRS or len(patch_centre_mm) < LEAST_PAIRS:
         return None
     second = table.second[rows]
     # Median elevational distance of the patches between the frames of each pair.
@@ -347,7 +342,7 @@ def doubt_path(
         f"sweep's other pairs have, about frame {at + WINDOW // 2}"
     )
     where = (at, min(at + WINDOW, len(poses)) - 1)
-    return Doubt(IMAGES, "direction lost, noise or clutter", evidence, worst > FOLD_LIMIT, (where,))
+    return Doubt(IMAGES, "direction lost, noise or clutter", evidence, worst > REFUTED * FOLD_DOUBT, (where,))
 
 
 def doubt_connection(first: IntArray, second: IntArray, usable: BoolArray) -> Doubt | None:

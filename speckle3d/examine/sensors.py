@@ -16,38 +16,37 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.stats import median_abs_deviation
 
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
-from speckle3d.core.errors import Doubt, MismatchError
+from speckle3d.core.errors import DECISIVE, Doubt, MismatchError
 from speckle3d.core.geometry import nearest_rotation
 from speckle3d.core.leastsquares import robust_sigma
 from speckle3d.core.sweep import OrientationSensor, Sweep, Tracker
 
+REFUTED = 2.0
+"""Doubts refute from so many times the figure from which they are told."""
 LONGEST_STILL_S = 0.2
 """Beyond which unchanged readings are told: loggers repeat one until the next, of 5 Hz at least."""
 MOST_STILL, MOST_STILL_S = 0.2, 0.5
 """Share of the sweep, and time, over which readings that do not change at all refute a sensor."""
 LEAST_TRAVEL_MM = 0.5
 """By which images must have moved meanwhile: a probe may rest, and a simulated sensor have no noise."""
-DOUBTFUL_JITTER, ABSURD_JITTER = 1.5, 10.0
-"""Jitter of a step, mm and degrees, that is told, and that refutes; of sensors in use below 0.5 and 0.3."""
+DOUBTFUL_JITTER = 2.5
+"""Jitter of a step, mm and degrees, that is told; of sensors in use below 0.5 and 0.3."""
 MOST_SPIKES = 0.3
 """Share of readings; with more, there is no stream that spikes stand out of."""
-_WINDOW = 9
-"""Readings of which the median is taken: up to four spikes in a row do not move it."""
+SMOOTH = 9
+"""Readings of which the running median is taken: neither jitter nor four spikes in a row move it."""
 _SPIKE_SIGMA = 10.0
 _SPIKE = float(np.deg2rad(5.0)), 3.0
 """Turn, rad, and distance, mm, that no hand goes and comes back between readings: at 50 Hz it would take 220
 rad/s^2 and 7 m/s^2."""
 _SLIP = float(np.deg2rad(300.0)), 250.0
 """Rates, rad/s and mm/s, of no scan, from one reading to the next."""
-_STILL = 1e-9
+_STILL = np.sqrt(np.finfo(float).eps)
 """Readings closer than this are the same: noise moves the last digits of any sensor that is read."""
 TURN_S = 0.3
 """A hand's wobble turns round within this time; over longer ones a gyroscope's bias counts."""
 WALK_DEG, SCALE_ERROR = 0.03, 0.05
 """Random walk of a gyroscope over `TURN_S`, and the share of a turn by which readings honestly differ."""
-LEAST_GAIN = 4.0
-"""Logarithm of the likelihood by which a convention must explain the gyroscope better: good simulated sensors
-gain up to 0.1, faulty ones from 5."""
 MOST_BIAS_DEG_S = 3.0
 """Biases of gyroscopes in orientation sensors are below 1 degree/s once they have stood still."""
 TILTED_DEG = 10.0
@@ -120,7 +119,7 @@ def _doubt_jitter(label: str, place_mm: float, turn_rad: float) -> Iterator[Doub
     size = np.sqrt(2.0) * place_mm, np.sqrt(2.0) * np.rad2deg(turn_rad)
     if max(size) > DOUBTFUL_JITTER:
         evidence = f"expected a steady path, got a jitter of {size[0]:.2g} mm and {size[1]:.2g} degrees"
-        yield Doubt(label, "noise or scrambled values", evidence, max(size) > ABSURD_JITTER)
+        yield Doubt(label, "noise or scrambled values", evidence, max(size) > REFUTED * DOUBTFUL_JITTER)
 
 
 def _doubt_jumps(sensor: OrientationSensor | Tracker, frame_time_s: FloatArray) -> Iterator[Doubt]:
@@ -207,11 +206,11 @@ def doubts_of_gyroscope(sensor: OrientationSensor, jitter_rad: float) -> Iterato
     bias = float(np.linalg.norm(np.median(left, axis=0))) / (lag * float(np.median(pause)))
     contradicted = float(_spread(left).max()) > noise
     # The gyroscope's sign may be the mistaken one.
-    if contradicted and gain > max(LEAST_GAIN, misfit(left) - misfit(difference(readings, -1.0))):
+    if contradicted and gain > max(DECISIVE, misfit(left) - misfit(difference(readings, -1.0))):
         evidence = f"expected turns as its gyroscope's, so they fit better by {gain:.0f} in log likelihood"
         yield Doubt(sensor.label, name, evidence, True)
     # Readings that jitter beside a slow hand still turn as the gyroscope does, better than not at all.
-    elif contradicted and still > LEAST_GAIN:
+    elif contradicted and still > DECISIVE:
         evidence = f"expected turns as its gyroscope's, no turn fits better by {still:.0f} in log likelihood"
         yield Doubt(sensor.label, "gyroscope on other axes, or quaternions of another kind", evidence, False)
     elif bias > MOST_BIAS_DEG_S:
@@ -256,8 +255,8 @@ def _steps(poses: RigidTransform, targets: RigidTransform) -> FloatArray:
 def spikes(sensor: OrientationSensor | Tracker) -> BoolArray:
     """Mask of readings far off the median of those around them, shape (m,)."""
     poses = rigid(sensor.readings.world_from_sensor)
-    place = median_filter(poses.translation, (_WINDOW, 1), mode="mirror")
-    matrix = median_filter(poses.rotation.as_matrix(), (_WINDOW, 1, 1), mode="mirror")
+    place = median_filter(poses.translation, (SMOOTH, 1), mode="mirror")
+    matrix = median_filter(poses.rotation.as_matrix(), (SMOOTH, 1, 1), mode="mirror")
     turn = Rotation.from_matrix(nearest_rotation(matrix))
     off = _steps(RigidTransform.from_components(place, turn), poses)
     limits = [max(most, _SPIKE_SIGMA * robust_sigma(size)) for most, size in zip(_SPIKE, off, strict=True)]

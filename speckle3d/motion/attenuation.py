@@ -29,7 +29,7 @@ from scipy.optimize import least_squares
 from scipy.special import log_ndtr, logsumexp
 
 from speckle3d.core.arrays import FloatArray
-from speckle3d.core.curves import DecorrelationCurves, EchoSpectra
+from speckle3d.core.curves import ATTENUATION_SIGMA, DecorrelationCurves, EchoSpectra
 from speckle3d.core.errors import Doubt
 from speckle3d.core.sweep import RFSettings
 from speckle3d.motion.diffraction import NEPER_PER_DB
@@ -38,8 +38,6 @@ from speckle3d.motion.lens import stretched
 UNKNOWN_SIGMA = 0.1732
 """Standard deviation of the difference where no spectrum tells it: soft tissues and phantoms lie within 0.3
 dB/cm/MHz of each other, taken as evenly spread."""
-LENGTH_PER_UNIT = 0.18
-"""Change of the logarithm of length per dB/cm/MHz: 1.6 to 2 % for 0.1 on simulated sweeps."""
 ROW_SIGMA = 0.1
 """Error of a row's exponent beside its fit's: rows of simulated phantoms of 8 mm."""
 STRUCTURE_EXPONENT = 0.5
@@ -55,8 +53,6 @@ OTHER_BAND = 6.0
 """Gain in the log-likelihood by one exponent in all rows, from skin to bottom, from which another transmit
 band or filter is told. Twenty-one sweeps of two simulators gain 0.3 to 4.3; with the band 0.3 MHz off they
 gain 8.5 to 34."""
-LITTLE_NOISE, NOISE_SIGMA = -4.0, 50.0
-"""Prior of the logarithm of noise over a row's mean power, which keeps fits of rows without any finite."""
 _BINS_PER_SAMPLE = 1.5
 """Bins over which a Hann window correlates neighbouring ones."""
 
@@ -84,7 +80,7 @@ class Attenuation:
     @property
     def log_length_sigma(self) -> float:
         """Relative standard deviation of all distances due to the attenuation's."""
-        return float(LENGTH_PER_UNIT * self.sigma_db_cm_mhz)
+        return float(ATTENUATION_SIGMA * self.sigma_db_cm_mhz / UNKNOWN_SIGMA)
 
     def applied(self, curves: DecorrelationCurves) -> DecorrelationCurves:
         """Phantom curves stretched for the tissue's attenuation, with its spectrum."""
@@ -166,11 +162,11 @@ def _fit_rows(
         def misfit(values: FloatArray, *row: FloatArray) -> FloatArray:
             (gain, fall, log_noise), (weight, log_echo, reference) = values, row
             model = np.logaddexp(reference + gain - fall * f, log_noise)
-            return np.append(weight * (log_echo - model), (log_noise - LITTLE_NOISE) / NOISE_SIGMA)
+            return np.asarray(weight * (log_echo - model))
 
-        fit = least_squares(misfit, [0.0, 0.0, LITTLE_NOISE], method="lm", args=row)
+        fit = least_squares(misfit, [0.0, 0.0, row[1].min()], method="lm", args=row)
         jacobian = np.asarray(fit.jac)
-        variance = np.linalg.inv(jacobian.T @ jacobian)[1, 1]
+        variance = np.linalg.pinv(jacobian.T @ jacobian)[1, 1]
         rows.append((fit.x[1], variance, 2.0 * fit.cost / (f.size - 3)))
     fall, variance, misfits = np.array(rows).T
     misfits = _BINS_PER_SAMPLE * np.maximum(misfits, np.median(misfits))

@@ -27,7 +27,7 @@ from speckle3d.core.text import shown
 from speckle3d.kernels.plane_misfit import EchoModels
 from speckle3d.kernels.statistics import INTERPOLATION, correlation_variance
 from speckle3d.matching.table import CorrelationTable
-from speckle3d.motion.planes import MotionProblem, fully_developed
+from speckle3d.motion.planes import LEAST_CORRELATION, MotionProblem, fully_developed
 
 CURVES_SIGMA = 0.006
 """Relative error of all distances by curves of some twenty blocks of the same phantom: twelve lengths over
@@ -44,8 +44,6 @@ ROW_SIGMA = 0.06
 PHANTOM_SIGMA = 0.15
 """Relative error of distances by a phantom's curves where no patch tells its own scale, as in two frames:
 tissue reads 5 to 25 % short with them."""
-LOOSE = 1.0, 1.0
-"""Standard deviation of yaw and tilt per distance, rad/mm, where nothing tells them."""
 _BIN_EDGES_MM = np.concatenate([np.arange(0.0, 1.0, 0.03), np.arange(1.0, 4.01, 0.15)])
 """Fine where the curves fall, coarse where only structure is left."""
 PAIRS_PER_FACT = 4.0
@@ -53,14 +51,12 @@ PAIRS_PER_FACT = 4.0
 widths of the curve, where it is nearly whole within half of that; at 2.6 frames per width, 4.6 and 2.5. Over
 80 sweeps of two physics and three arrays 2, 4, 6, 8 and 12 leave 1.4, 1.3, 1.2, 1.3 and 1.5 % rms; with 8 the
 other physics reads 2 % short, with 2 phased arrays 2 % long."""
-STEP = 0.04
-LOG_SCALES, POWERS = STEP * np.arange(-20, 21), np.linspace(0.0, 0.8, 5)
+LOG_SCALES, POWERS = 0.04 * np.arange(-20, 21), np.linspace(0.0, 0.8, 5)
 """Values of ln s and a that are tried: twice as many move lengths by less than 0.1 %."""
 SHARES = np.array([0.0, 0.01, 0.02, 0.03, 0.05, 0.07, 0.1, 0.14, 0.19, 0.25, 0.32, 0.4, 0.5])
 LARGER_SHARES = [0.65, 0.8, 0.95]
 """Values of c. An echo that is structure for the most part is r^a alone, a curve of another width, and tells
 no scale; of intensity, structure's share is larger, because its phase does not count."""
-LEAST_GAIN, TINY = 0.05, 1e-12
 ROUNDS = 30
 """Of the mean share, by expectation and maximisation."""
 
@@ -152,7 +148,8 @@ class _Binning:
         product = (weighted @ self.mean[:, :, None])[:, :, 0] @ parts
         square = np.einsum("ic,qij,jc->qc", parts, weighted @ terms.transpose(0, 2, 1), parts)
         # Without an echo there is nothing that noise could have taken.
-        gain = (np.maximum(product, LEAST_GAIN * square) + TINY) / (square + TINY)
+        tiny = np.finfo(float).tiny
+        gain = (np.maximum(product, LEAST_CORRELATION * square) + tiny) / (square + tiny)
         return gain * product - 0.5 * gain**2 * square, gain
 
 
@@ -210,7 +207,7 @@ def estimate_coherence(problem: MotionProblem, table: CorrelationTable, path: Fl
     binning, centres = _bin_correlations(problem, table, path)
     patches = problem.patches
     speckle = fully_developed(len(patches))
-    as_measured = Coherence(np.zeros(1), *speckle, 1.0, PHANTOM_SIGMA, np.array(LOOSE))
+    as_measured = Coherence(np.zeros(1), *speckle, 1.0, PHANTOM_SIGMA, np.ones(2))
     # Scale, gain, share and power are four numbers.
     if (binning.weight > 0.0).sum(axis=1).max() < 4:
         return as_measured
@@ -257,16 +254,16 @@ def _share_prior(by_share: FloatArray, share: FloatArray) -> FloatArray:
     mean, width = float(share.mean()), np.gradient(share)
     for _ in range(ROUNDS):
         log_prior = np.asarray(log_softmax(np.log(width) - share / mean))
-        mean = max(float((softmax(by_share + log_prior, axis=1) @ share).mean()), TINY)
+        mean = max(float((softmax(by_share + log_prior, axis=1) @ share).mean()), np.finfo(float).tiny)
     return log_prior
 
 
 def _peak(log_posterior: FloatArray) -> float:
     """Most likely ln s by a parabola through the maximum, clipped to the scales tried."""
     at = int(np.clip(log_posterior.argmax(), 1, LOG_SCALES.size - 2))
-    low, middle, high = log_posterior[at - 1 : at + 2]
-    steps = (high - low) / (2.0 * max(2.0 * middle - low - high, 1e-9))
-    return float(LOG_SCALES[at] + STEP * np.clip(steps, -1.0, 1.0))
+    near = slice(at - 1, at + 2)
+    bend, slope, _ = np.polyfit(LOG_SCALES[near], log_posterior[near], 2)
+    return float(np.clip(-slope / (2.0 * min(bend, -1e-6)), LOG_SCALES[at - 1], LOG_SCALES[at + 1]))
 
 
 def _deviations(problem: MotionProblem, by_patch: FloatArray, log_scale: float) -> tuple[float, FloatArray]:
@@ -292,7 +289,8 @@ def _deviations(problem: MotionProblem, by_patch: FloatArray, log_scale: float) 
     error = LOG_SCALES @ posterior - log_scale
     variance = (LOG_SCALES - log_scale) ** 2 @ posterior - error**2
     arm = np.stack([np.ones(error.size), problem.levers.lateral_mm, problem.levers.lever_mm])
-    loose = np.diag([0.0, *LOOSE])
+    # Where nothing tells yaw and tilt, they are open by a radian per mm.
+    loose = np.diag([0.0, 1.0, 1.0])
     inverse = np.linalg.inv(arm / variance @ arm.T + loose)
     # What turning explains is no scatter.
     error -= inverse @ (arm @ (error / variance)) @ arm

@@ -22,21 +22,18 @@ from speckle3d.core.leastsquares import robust_sigma
 from speckle3d.core.sweep import RFSettings
 from speckle3d.kernels.statistics import correlation_variance
 from speckle3d.matching.intensity import two_way_wavenumber
+from speckle3d.motion.planes import LEVEL_END
 
 TILT_ROUNDS = 4
 """Fits of curves and of the response to tilt, each from the other."""
-LITTLE_TILT, LITTLE_TILT_MM = 0.1, 0.01
-"""Curves are fitted to frames whose turning changes distances by no more than this."""
-LEAST_RHO = 0.1
-"""Correlation at which curves end: below it a patch of some hundred cells cannot tell distances apart."""
+LITTLE_TILT = 0.1
+"""Curves are fitted to frames whose turning changes distances by at most this share of them and a bin."""
 BIN_MM = 0.05
 """Distances are averaged over: exact repeats of a phantom in such steps share one."""
 PAIRS_PER_FACT = 20.0
 """Frame pairs per independent piece of information: pairs share frames."""
 SURE_MM = 4.0
 """Standard deviation below which a pivot counts as learnt, a fraction of the probe's focal length."""
-TURNED_RAD = 1e-5
-"""From which frames count as turned: rounding is far below."""
 
 
 class CurveSettings(BaseModel):
@@ -107,7 +104,7 @@ def fit_curves(
             break
         pivot, spread = response.pivot_mm[row], response.spread_mm[row]
         distance = np.hypot(offset - pivot * tilt, spread * tilt)
-        fair = np.abs(distance - np.abs(offset)) <= LITTLE_TILT_MM + LITTLE_TILT * np.abs(offset)
+        fair = np.abs(distance - np.abs(offset)) <= LITTLE_TILT * (np.abs(offset) + BIN_MM)
     grid = grid[: max(2, int(np.searchsorted(grid, ends.min(), side="right")))]
     pairs = sum(sample.pairs for sample in every)
     return DecorrelationCurves(key, rows, grid, curves[:, : grid.size], cells, pairs, response)
@@ -124,12 +121,12 @@ def _fit_row(
     centre, mean = (np.bincount(group, values) / count for values in (distance, rho))
     # The fit of in-plane motion finds a little correlation in frames that share no speckle. Curves include
     # it, so that it is not taken for coherent scattering in a sweep.
-    low = centre[mean < LEAST_RHO]
+    low = centre[mean < LEVEL_END]
     far = mean[centre > 1.5 * low[0]] if low.size else mean[:0]
-    floor = float(np.clip(far.mean(), 0.0, LEAST_RHO / 2)) if far.size >= 3 else 0.0
+    floor = float(np.clip(far.mean(), 0.0, LEVEL_END / 2)) if far.size >= 3 else 0.0
     excess = (mean - floor) / (1 - floor)
     # Where a curve has levelled out it tells no distance: fit what lies before the first bin below the least.
-    below = np.flatnonzero(excess < LEAST_RHO)
+    below = np.flatnonzero(excess < LEVEL_END)
     stop = int(below[0]) if below.size else mean.size
     centre, excess = centre[:stop], excess[:stop]
     if centre.size < 3 or excess.min() > 0.6:
@@ -182,7 +179,7 @@ def _fit_tilt(
     depth, step, of_echo = curves.depth_mm, float(curves.distance_mm[1]), key.correlation_of == "echo"
     wavenumber = two_way_wavenumber(key.signal) if isinstance(key.signal, RFSettings) else 0.0
     spread = wavenumber * curve_widths(curves.distance_mm, curves.correlation) ** 2
-    turned = (np.abs(tilt_rad) > TURNED_RAD) & (np.abs(offset_mm) < curves.distance_mm[-1])
+    turned = (tilt_rad != 0.0) & (np.abs(offset_mm) < curves.distance_mm[-1])
     row, offset, tilt, rho = row[turned], offset_mm[turned], tilt_rad[turned], rho[turned]
     if np.bincount(row, minlength=depth.size).min() < 4 * PAIRS_PER_FACT:
         return None

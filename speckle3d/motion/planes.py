@@ -20,6 +20,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from speckle3d.core.curves import DecorrelationCurves
+from speckle3d.core.errors import DECISIVE
 from speckle3d.core.threads import in_parallel
 from speckle3d.kernels.plane_misfit import EchoModels, FitRules, Levers
 from speckle3d.kernels.planes import FittedPlanes, fit_planes
@@ -31,9 +32,8 @@ from speckle3d.matching.table import CorrelationTable
 LEAST_CORRELATION = 0.03
 """A patch that correlates less than this holds no distance at all."""
 LEVEL_END = 0.1
-"""Correlation above which a curve's end is where it was no longer measured, not where it has levelled out."""
-CROSSING_EVIDENCE = 6.0
-"""Gain in twice the log-likelihood (a BIC) for which frames are taken to cross inside the image."""
+"""Correlation at which curves end: below it a patch of some hundred cells cannot tell distances apart. An end
+above it is where a curve was no longer measured."""
 OUTLYING = 9.0
 """Squared deviations at which the misfit of a patch, or of a pair on a path, is capped: it may be wrong.
 Where frames cross, correlation is known to a few thousandths; one patch that lost it would outvote all."""
@@ -46,8 +46,6 @@ SENSED_SLOPE = 5e-4
 """Standard deviation of slopes between near frames from a smoothed orientation sensor: 0.03 degrees."""
 LEAST_SIGMA_MM = 1e-3
 """Of a patch's distance where the curve is flat: a hundredth of what it is known to elsewhere."""
-UNEVENNESS = 0.4
-"""Variation of the error of distances over the image against its mean; measured on simulated sweeps."""
 ROUNDS = 12
 
 
@@ -245,9 +243,7 @@ def pair_planes(
     side = np.zeros(rows.size, dtype=bool) | either_side
     settings = problem.planes
     slope_sd = SENSED_SLOPE if from_sensor else HAND_SLOPE
-    rules = FitRules(
-        from_sensor, slope_sd, CROSSING_SLOPE, settings.huber, OUTLYING, CROSSING_EVIDENCE, ROUNDS
-    )
+    rules = FitRules(from_sensor, slope_sd, CROSSING_SLOPE, settings.huber, OUTLYING, 2.0 * DECISIVE, ROUNDS)
     shift = _lever_shift(problem, table.inplane[rows, :2])
     fits = FittedPlanes(
         np.full((rows.size, 3), np.nan), np.tile(np.eye(3), (rows.size, 1, 1)), np.zeros(rows.size)
@@ -274,10 +270,9 @@ def pair_planes(
     scatter = np.maximum(1.0, cost / np.maximum(members.sum(axis=1) - 3, 1))
     covariance = np.linalg.inv(information) * scatter[:, None, None]
     covariance[:, 0, 0] += settings.bias_mm**2
-    # Uneven over the image, the bias feigns yaw. What is added to a square of distance fades as that grows.
-    uneven_mm = (
-        UNEVENNESS * settings.bias_mm**2 / (2.0 * np.maximum(np.abs(coefficients[:, 0]), settings.bias_mm))
-    )
+    # Uneven over the image by as much as it is, the bias feigns yaw. What is added to a square of distance
+    # fades as that grows.
+    uneven_mm = settings.bias_mm**2 / (2.0 * np.maximum(np.abs(coefficients[:, 0]), settings.bias_mm))
     # Where next to nothing of the echo is left, any distance fits as well: tens of metres have been seen.
     reach = float(problem.curves.distance_mm[-1])
     determined = (np.abs(coefficients[:, 0]) <= reach) & (covariance[:, 0, 0] <= reach**2)

@@ -32,9 +32,6 @@ APART_SLOPE = 0.01
 """Frames that turn more than this against each other may differ although their centres meet. Such as turn
 less and do not resemble each other are a pair that disagrees altogether."""
 
-ORIGIN = np.zeros((1, 2))
-"""Position and slope of the first frame."""
-
 
 class Strangers(NamedTuple):
     """Pairs of uncorrelated frames, which therefore are not close together.
@@ -56,7 +53,7 @@ def likeliest_path(
     planes: PairPlanes,
     frames: int,
     strangers: Strangers,
-    start: FloatArray = ORIGIN,
+    start: FloatArray | None = None,
 ) -> FloatArray:
     """Follow the most likely paths: elevational position and slope along x of one frame after the other.
 
@@ -71,7 +68,7 @@ def likeliest_path(
         Of the sweep.
     strangers : Strangers
     start : ndarray, shape (m, 2), optional
-        Position and slope of the first m frames, which stay.
+        Position and slope of the first m frames, which stay; of the first one zero.
 
     Returns
     -------
@@ -90,6 +87,7 @@ def likeliest_path(
         APART_SLOPE,
     )
     path, every = np.zeros((frames, 2)), np.arange(frames + 1)
+    start = path[:1] if start is None else start
     path[: len(start)] = start
     follow_paths(
         np.searchsorted(planes.second, every),

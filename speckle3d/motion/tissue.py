@@ -28,10 +28,8 @@ from speckle3d.motion.lens import stretched
 
 SMOOTHED = 21
 """Frames over which tissue goes by: what changes more slowly is no effect of speed."""
-USABLE_SHARE = 0.8
-"""Of the frames in which a patch must be usable to be compared from frame to frame."""
-LEAST_PAIRS, LEAST_PATCHES = 6, 4
-"""Pairs of neighbouring frames, and patches, from which averages are told."""
+LEAST_PAIRS = 6
+"""Pairs of neighbouring frames from which averages are told."""
 SINGLE_SLOPE, LEVEL = -0.1, 0.025
 """Logarithm of the grey levels' spread over correlation lost from frame to frame, in single frames at least,
 and chance at which fewer are taken for averages. Of 1,400 parts of simulated sweeps of two physics, 6 to 60
@@ -118,14 +116,13 @@ def averaging_loss(table: CorrelationTable, features: Sequence[FrameFeatures]) -
     """
     last = table.second - table.first == 1
     spread = np.array([frame.grey_spread for frame in features])[table.second[last]]
-    usable = np.mean([frame.usable for frame in features], axis=0) >= USABLE_SHARE
-    usable &= np.isfinite(spread).all(axis=0)
+    usable = np.median([frame.usable for frame in features], axis=0) * np.isfinite(spread).all(axis=0) > 0
     lost = 1.0 - table.median[last]
-    if lost.size < LEAST_PAIRS or usable.sum() < LEAST_PATCHES:
+    if lost.size < LEAST_PAIRS or not usable.any():
         return 0.0
     faster, flatter = (v - uniform_filter1d(v, SMOOTHED, axis=0) for v in (lost, spread[:, usable]))
     faster -= faster.mean()
     slopes = faster @ flatter / max(float(faster @ faster), 1e-12)
-    if ttest_1samp(slopes, SINGLE_SLOPE, alternative="less").pvalue > LEVEL:
+    if not ttest_1samp(slopes, SINGLE_SLOPE, alternative="less").pvalue <= LEVEL:
         return 0.0
     return float(-SHORT_BY_SPREAD * slopes.mean() * np.median(lost))

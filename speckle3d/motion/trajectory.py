@@ -14,18 +14,14 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.geometry import rotation_from_fixed_angles, skew
 from speckle3d.core.leastsquares import huber_weights
-from speckle3d.core.poses import HELD, RelativePoses
+from speckle3d.core.poses import ERROR_STEPS, HELD, RelativePoses
 from speckle3d.matching.table import CorrelationTable
 from speckle3d.motion.planes import PairPlanes
 
 ROUNDS = 4
 """Of Gauss-Newton; the next has steps below 1e-4 mm and rad."""
-COVARIANCE_FRAMES = 40
-"""Frames whose covariance is computed; those of the others are interpolated."""
 INPLANE_FLOOR = (1e-6, 1e-6, 1e-9)
 """Variances of in-plane motion (mm^2, mm^2, rad^2) that interpolation leaves, however many patches agree."""
-_TWIST = np.array([3, 4, 5, 0, 1, 2])
-"""(x, y, z, tilt, yaw, roll) among exponential coordinates, whose rotation comes first; and back."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +47,7 @@ class Trajectory:
         interpolated.
         """
         frames = len(self.poses)
-        frame_numbers = np.unique(np.linspace(1, frames - 1, min(frames - 1, COVARIANCE_FRAMES)).astype(int))
+        frame_numbers = np.unique(np.linspace(1, frames - 1, min(frames - 1, ERROR_STEPS)).astype(int))
         blocks = [np.zeros((6, 6))]
         for frame in frame_numbers:
             rows = slice(6 * frame - 6, 6 * frame)
@@ -84,7 +80,8 @@ def solve_trajectory(
         normal, gradient = _normal(pairs, root, poses, huber if number else np.finfo(float).max)
         step = np.zeros((frames, 6))
         step[1:] = -normal.solve(gradient).reshape(-1, 6)
-        poses = poses * RigidTransform.from_exp_coords(step[:, _TWIST])
+        # Exponential coordinates have the rotation first.
+        poses = poses * RigidTransform.from_exp_coords(np.roll(step, 3, axis=1))
     centre = RigidTransform.from_translation(centre_mm)
     return Trajectory(centre * poses * centre.inv(), normal)
 
@@ -105,7 +102,7 @@ def _normal(
     carried[:, :3, :3] = carried[:, 3:, 3:] = turn
     carried[:, :3, 3:] = -turn @ skew(relative.translation)
     whiten = root.transpose(0, 2, 1)
-    error = (pairs.poses.inv() * relative).as_exp_coords()[:, _TWIST, None]
+    error = np.roll((pairs.poses.inv() * relative).as_exp_coords(), 3, axis=1)[:, :, None]
     size = np.sqrt(((whiten @ error) ** 2).mean(axis=(1, 2)))
     whiten = np.sqrt(huber_weights(size, huber))[:, None, None] * whiten
     blocks = np.stack([-whiten @ carried, whiten], axis=1).reshape(-1, 6, 6)

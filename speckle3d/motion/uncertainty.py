@@ -8,13 +8,16 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import FloatArray
-from speckle3d.core.poses import SCALE_CHANGE_MM, SHARED, STRUCTURE, TURN_CHANGE_MM, PoseErrors
+from speckle3d.core.poses import (
+    ERROR_STEPS,
+    SCALE_CHANGE_MM,
+    SHARED,
+    STRUCTURE,
+    TURN_CHANGE_MM,
+    PoseErrors,
+)
 from speckle3d.core.reconstruction import SharedErrors
 from speckle3d.motion.planes import PairPlanes, PlaneSettings
-
-TREMBLING_MM = 0.1
-"""Frames nearer than this may turn as if they were this far apart: a hand trembles in place. At 0.15 B-mode
-of the accuracy set reads 0.4 % longer."""
 
 
 def claimed_covariance(
@@ -74,10 +77,6 @@ def _travel(poses: RigidTransform, centre_mm: FloatArray) -> FloatArray:
     return np.append(0.0, np.cumsum(steps))
 
 
-WAY_STEPS = 40
-"""Equal parts of the way at whose ends errors that grow along it change; between, neighbours share them."""
-
-
 def joint_errors(
     covariance: FloatArray,
     world_from_image: RigidTransform,
@@ -106,7 +105,7 @@ def joint_errors(
     value, axes = np.linalg.eigh(remainder / (size[:, :, None] * size[:, None, :]))
     root = size[:, :, None] * (axes * np.sqrt(np.maximum(value, 0.0))[:, None, :]) @ axes.transpose(0, 2, 1)
     way = np.maximum(_travel(poses, centre_mm), 1e-6)
-    begin, width = np.linspace(0.0, way[-1], WAY_STEPS, endpoint=False), way[-1] / WAY_STEPS
+    begin, width = np.linspace(0.0, way[-1], ERROR_STEPS, endpoint=False), way[-1] / ERROR_STEPS
     share = np.sqrt(np.clip(way - begin[:, None], 0.0, width) / way)
     grown = np.einsum("ki,iam->kmia", share, root).reshape(-1, len(poses), 6)
     factors = np.concatenate([common, grown])
@@ -148,8 +147,7 @@ class SlopeWeights:
         keep[:, :1, 1:] = -covariance[:, :1, 1:] @ np.linalg.inv(covariance[:, 1:, 1:]) * (1.0 - self.share)
         coefficients = (keep @ planes.coefficients[:, :, None])[:, :, 0]
         covariance = keep @ covariance @ keep.transpose(0, 2, 1)
-        turn_sigma = np.maximum(np.abs(coefficients[:, :1]), TREMBLING_MM) * self.deviation_per_mm
-        covariance[:, [1, 2], [1, 2]] += turn_sigma**2
+        covariance[:, [1, 2], [1, 2]] += (coefficients[:, :1] * self.deviation_per_mm) ** 2
         return replace(planes, coefficients=coefficients, covariance=covariance)
 
 

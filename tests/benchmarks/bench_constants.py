@@ -1,13 +1,14 @@
-"""How far halving and doubling each constant between the correlation table and the path moves lengths.
+"""How far halving and doubling each constant between the correlation table and the poses moves results.
 
-Run: ``python tests/benchmarks/bench_constants.py [SWEEP...] [--curves CURVES]``, with sweeps that have a
-truth.
+Run: ``python tests/benchmarks/bench_constants.py [SWEEP...] [--curves CURVES]``; some seconds for each of the
+sweeps and constants.
 
-Every module constant of `speckle3d.motion` that is a number is halved and doubled in turn; changes of
-lengths are printed in per cent, the largest first. Constants of kernels are compiled in and stay.
+Every module constant of `speckle3d.motion` and `speckle3d.correction` that is a number is halved and doubled
+in turn, those of crossing sweeps and of curves apart. Sweeps are matched once. Printed are the largest change
+of a length, per cent, and of its claim, a ratio, of any sweep in the modes `image` and `fused`, and what is
+found otherwise; the largest first. Constants of kernels are compiled in and stay.
 """
 
-import pkgutil
 from contextlib import ExitStack, contextmanager
 from importlib import import_module
 from itertools import islice
@@ -17,51 +18,60 @@ from unittest.mock import patch
 import bench
 import numpy as np
 
-import speckle3d.motion
+from speckle3d import pipeline
 from speckle3d.core.errors import Speckle3DError
+from speckle3d.correction.claims import length_sigma
+from speckle3d.corrections import correct
 from speckle3d.io.curves import read_curves
 from speckle3d.io.load import load_sweep
-from speckle3d.pipeline import track
+from speckle3d.matching.frames import match_sweep
 
-NOT_OF_THE_PATH = ("diffraction", "lens", "phantom")
-"""Modules of curves, which change no estimate."""
+STAGES = {
+    "motion": "attenuation coherence estimate planes sensors signs tissue trajectory uncertainty",
+    "correction": "claims fused image_path sensor_readings",
+}
 MODULES = [
-    import_module(f"speckle3d.motion.{info.name}")
-    for info in pkgutil.iter_modules(speckle3d.motion.__path__)
-    if info.name not in NOT_OF_THE_PATH
+    import_module(f"speckle3d.{room}.{stage}") for room, stages in STAGES.items() for stage in stages.split()
 ]
 
 
 @contextmanager
-def constant(name, value):
+def constant(name, value, other):
     """Another value of a constant in all modules that have it."""
     with ExitStack() as stack:
         for module in MODULES:
-            if hasattr(module, name):
-                stack.enter_context(patch.object(module, name, value))
+            if vars(module).get(name) == value:
+                stack.enter_context(patch.object(module, name, other))
         yield
 
 
 def changes():
     """Name and context of every change."""
-    constants = {name: value for module in MODULES for name, value in vars(module).items() if name.isupper()}
-    for name, value in constants.items():
-        if type(value) in (int, float) and value != 0:
+    constants = {item for module in MODULES for item in vars(module).items() if type(item[1]) in (int, float)}
+    for name, value in sorted(constants):
+        if name.isupper() and value:
             for factor in (0.5, 2.0):
-                yield f"{name} x {factor:g}", constant(name, type(value)(value * factor))
+                yield f"{name} = {value:g} x {factor:g}", constant(name, value, type(value)(value * factor))
 
 
-def travels(sweeps, curves):
-    """Travel along the normal of every sweep; NaN where it is refused."""
-    lengths = np.full(len(sweeps), np.nan)
+def results(sweeps, curves):
+    """Length and its relative claim by mode, shape (sweeps, 2, 2), NaN where refused; and what is found."""
+    values, doubts = np.full((len(sweeps), 2, 2), np.nan), set()
     for k, sweep in enumerate(sweeps):
         try:
-            poses = track(sweep, curves).image
-        except Speckle3DError:
+            tracked = pipeline.track(sweep, curves)
+            fused = correct(tracked, sweep, "fused")["fused"]
+        except Speckle3DError as error:
+            doubts.add(str(error))
             continue
-        centre = sweep.grid.centre_mm
-        lengths[k] = np.abs(np.cumsum((poses[:-1].inv() * poses[1:]).apply(centre)[:, 2] - centre[2])).max()
-    return lengths
+        doubts |= {f"{doubt.about}: {doubt.suspect}" for doubt in tracked.doubts}
+        for row, (poses, covariance) in enumerate(
+            ((tracked.image, tracked.covariance), (fused.poses, fused.covariance))
+        ):
+            centre = sweep.grid.centre_mm
+            z_mm = (poses[0].inv() * poses).apply(centre)[:, 2]
+            values[k, row] = np.abs(z_mm).max(), length_sigma(poses, covariance, centre)
+    return values, doubts
 
 
 def main():
@@ -73,13 +83,22 @@ def main():
     options = bench.parse_options(parser, frames=12, most=4)
     sweeps = [load_sweep(path) for path in options.sweeps]
     sweeps = [sweep.part(0, min(options.frames, len(sweep))) for sweep in sweeps]
-    curves, rows = read_curves(options.curves), {}
-    usual = travels(sweeps, curves)
-    for name, context in islice(changes(), options.most):
-        with context:
-            rows[name] = 100 * (travels(sweeps, curves) / usual - 1)
-    for name in sorted(rows, key=lambda name: -np.nan_to_num(np.abs(rows[name]), nan=np.inf).max()):
-        print(f"  {name:50s}" + "".join(f"{value:+8.2f}" for value in rows[name]))
+    curves, tables, rows = read_curves(options.curves), {}, []
+
+    def match_once(sweep, *rest):
+        if id(sweep) not in tables:
+            tables[id(sweep)] = match_sweep(sweep, *rest)
+        return tables[id(sweep)]
+
+    with patch.object(pipeline, "match_sweep", match_once):
+        usual, usual_doubts = results(sweeps, curves)
+        for label, context in islice(changes(), options.most):
+            with context:
+                values, doubts = results(sweeps, curves)
+            length, claim = np.nanmax(np.abs(np.log(values / usual)), axis=(0, 1), initial=0.0)
+            rows.append((length, np.exp(claim), label, " ".join(sorted(doubts ^ usual_doubts))))
+    for length, claim, label, others in sorted(rows, reverse=True):
+        print(f"  {label:50s}{100 * length:8.2f} %{claim:8.2f}  {others}")
 
 
 if __name__ == "__main__":

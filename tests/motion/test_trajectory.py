@@ -7,9 +7,8 @@ import pair_planes
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from speckle3d.core.poses import RelativePoses
+from speckle3d.core.poses import ERROR_STEPS, RelativePoses
 from speckle3d.matching.table import CorrelationTable
-from speckle3d.motion import trajectory
 from speckle3d.motion.trajectory import edges_of, solve_trajectory
 
 CENTRE_MM = np.array([19.0, 20.0, 0.0])
@@ -123,7 +122,7 @@ def test_one_false_pair_among_many_is_overruled():
 def test_a_chain_of_equal_steps_is_a_random_walk():
     """More frames than covariances are computed for; those between are interpolated."""
     frames, step = 250, np.diag([4e-4, 1e-4, 9e-4, 1e-8, 1e-8, 1e-8])
-    assert frames > 2 * trajectory.COVARIANCE_FRAMES
+    assert frames > 2 * ERROR_STEPS
     first = np.arange(frames - 1)
     still = RigidTransform.from_translation(np.zeros((frames - 1, 3)))
     pairs = RelativePoses(first, first + 1, still, np.tile(step, (frames - 1, 1, 1)))

@@ -21,7 +21,7 @@ from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 
 from speckle3d.core.arrays import FloatArray
-from speckle3d.correction.crossing.planes import BENDS, SPACING_MM
+from speckle3d.correction.crossing.planes import BENDS
 from speckle3d.correction.crossing.similarity import (
     PARAMETERS,
     RIGID,
@@ -30,12 +30,11 @@ from speckle3d.correction.crossing.similarity import (
     Placing,
     look_up_points,
 )
+from speckle3d.correction.crossing.stack import PIXEL_MM
 
 _MOST_STEPS = 30
 _LEAST_STEP = 0.02
 """Step, in the posterior's own standard deviations, at which a level has converged."""
-_LEAST_UNLIKE = 0.05
-"""Least 1 - correlation by which residuals are weighed."""
 PART_MM = 6.0
 """Side of the parts of tissue that are taken to move, or to err, as one."""
 _REACH_MM = 12.0
@@ -101,8 +100,8 @@ class CrossingFit:
 
     @cached_property
     def correlation(self) -> float:
-        """Mean of both ways."""
-        return float(np.mean([way.correlation(way.valid) for way in self.ways]))
+        """Mean of both ways; below one even of a sweep and itself."""
+        return min(float(np.mean([way.correlation(way.valid) for way in self.ways])), 0.999)
 
     @property
     def strain(self) -> float:
@@ -113,12 +112,12 @@ class CrossingFit:
     @property
     def weight(self) -> float:
         """Half the squared residuals of both ways, which compare the same tissue, count so much."""
-        return 0.25 * self.independent / max(1.0 - self.correlation, _LEAST_UNLIKE)
+        return 0.25 * self.independent / (1.0 - self.correlation)
 
     @property
     def log_likelihood(self) -> float:
         """Log-likelihood of the placing and its bends, up to a constant of the pair."""
-        return -0.5 * self.independent * float(np.log(max(1.0 - self.correlation, 1e-3))) - self.strain
+        return -0.5 * self.independent * float(np.log1p(-self.correlation)) - self.strain
 
     @cached_property
     def normal_equations(self) -> tuple[FloatArray, FloatArray]:
@@ -173,7 +172,7 @@ class CrossingFit:
                 for plane in (sweep.plane, sweep.plane[way.valid])
             )
             at = np.flatnonzero((every > 0) & (visible >= 0.25 * every))
-            lengths.append(SPACING_MM * float(np.ptp(at)) if at.size else 0.0)
+            lengths.append(PIXEL_MM * float(np.ptp(at)) if at.size else 0.0)
         return min(lengths)
 
 

@@ -30,8 +30,6 @@ from speckle3d.correction.settings import FusedSettings
 
 _STARTS = 4
 """Candidates refined."""
-_CELL = (2.0 * np.sqrt(np.pi)) ** 3
-"""Volume that counts as one comparison under a Gaussian blur of unit standard deviation."""
 _FEWEST, _PER_CELL = 3000, 12.0
 """Points looked up: at least so many, and so many for each such volume."""
 _LARGEST_SHARE = 0.45
@@ -316,7 +314,8 @@ def _comparison(
 ) -> tuple[list[BlurredSweep], Prior, float]:
     """Both sweeps under one blur, the prior of how they lie, and how many comparisons they are worth."""
     volume = min(float(np.isfinite(s.texture).sum() * s.spacing_mm.prod()) for s in sides)
-    cells = volume / (_CELL * blur_mm**3)
+    # Under a Gaussian blur so much volume counts as one comparison.
+    cells = volume / (2.0 * np.sqrt(np.pi) * blur_mm) ** 3
     points = int(min(settings.samples, max(_FEWEST, _PER_CELL * cells)))
     pair = [BlurredSweep.of(side, blur_mm, points) for side in sides]
     return pair, _prior(sweeps, sides, settings), min(settings.effective_samples, cells)

@@ -17,6 +17,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from speckle3d.core.arrays import Float32Array, FloatArray
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.geometry import elevational_steps
+from speckle3d.correction.crossing.stack import PIXEL_MM
 from speckle3d.correction.crossing.sweep import CrossingSweep
 from speckle3d.correction.crossing.texture import local_contrast
 from speckle3d.correction.curves import ELEVATIONAL, CorrectedChain
@@ -25,9 +26,6 @@ ORDERS = 3
 BENDS = len(ELEVATIONAL) * ORDERS
 """Coefficients of Legendre polynomials along the sweep: of the relative change of elevational steps, then of
 tilt and yaw per signed elevational mm of the images, rad/mm."""
-
-SPACING_MM = 0.35
-"""Between planes: as the pixels."""
 
 _SMOOTH_MM = 1.0
 """Travel over which the path is smoothed: a hand's slow wander stays."""
@@ -63,12 +61,12 @@ class StraightSweep:
     @property
     def spacing_mm(self) -> FloatArray:
         """Between voxels along the sweep, across and along the beam."""
-        return np.array([SPACING_MM, *self.pixels[:2]])
+        return np.array([PIXEL_MM, *self.pixels[:2]])
 
     @property
     def length_mm(self) -> float:
         """Travel from the first plane to the last."""
-        return SPACING_MM * (len(self.texture) - 1)
+        return PIXEL_MM * (len(self.texture) - 1)
 
     def bent_frames(self, bends: FloatArray) -> RigidTransform:
         """Every frame's pose on the bent path, whose middle stays in place."""
@@ -78,7 +76,7 @@ class StraightSweep:
 
     def mean_rates(self) -> FloatArray:
         """Mean relative change of steps, tilt and yaw per mm by bends, shape (3, 9)."""
-        return np.asarray(np.kron(np.eye(3), self.planes.basis[1:, 0].mean(axis=0) / SPACING_MM))
+        return np.asarray(np.kron(np.eye(3), self.planes.basis[1:, 0].mean(axis=0) / PIXEL_MM))
 
 
 def relative_turn(first: StraightSweep, second: StraightSweep) -> Rotation | None:
@@ -109,14 +107,14 @@ def straighten(sweep: CrossingSweep, nearest_mm: float = 0.0) -> StraightSweep:
         )
     travel = np.concatenate([[0.0], np.cumsum(elevational_steps(sweep.poses, sweep.centre_mm))])
     low, high = float(travel[good].min()), float(travel[good].max())
-    if high - low < 10 * SPACING_MM:
+    if high - low < 10 * PIXEL_MM:
         raise InsufficientDataError(
             f"{sweep.name}: expected a sweep along the elevational axis, got {high - low:.1f} mm of travel; "
             "sweep across the tissue, 24 mm or more"
         )
-    count = 1 + int((high - low) / SPACING_MM)
-    travel -= low + count // 2 * SPACING_MM
-    at = np.multiply(np.arange(count) - count // 2, SPACING_MM, dtype=np.float64)
+    count = 1 + int((high - low) / PIXEL_MM)
+    travel -= low + count // 2 * PIXEL_MM
+    at = np.multiply(np.arange(count) - count // 2, PIXEL_MM, dtype=np.float64)
     about_centre = sweep.poses * RigidTransform.from_translation(sweep.centre_mm)
     frames = _smooth_path(travel[good], about_centre[good], np.zeros(1))[0].inv() * about_centre
     planes, base = (_smooth_path(travel[good], frames[good], place) for place in (at, travel))
@@ -131,7 +129,7 @@ def straighten(sweep: CrossingSweep, nearest_mm: float = 0.0) -> StraightSweep:
     images[:, :, top_mm + np.arange(grid.samples) * grid.sample_spacing_mm < nearest_mm] = np.nan
     texture = local_contrast(
         _onto_planes(images, travel[good], at),
-        np.array([SPACING_MM, grid.vector_pitch_mm, grid.sample_spacing_mm]),
+        np.array([PIXEL_MM, grid.vector_pitch_mm, grid.sample_spacing_mm]),
     )
     return StraightSweep(
         texture,
@@ -171,9 +169,9 @@ def _smooth_path(travel: FloatArray, poses: RigidTransform, at: FloatArray) -> R
 def _onto_planes(images: Float32Array, travel: FloatArray, at: FloatArray) -> Float32Array:
     """Images on planes, between the mean images of the frames about either neighbour: shape (k, u, v)."""
     # A hand that dwells must not draw the images of the planes about it: frames of one place count as one.
-    place, many = np.unique(
-        np.round(travel / SPACING_MM).astype(int), return_inverse=True, return_counts=True
-    )[1:]
+    place, many = np.unique(np.round(travel / PIXEL_MM).astype(int), return_inverse=True, return_counts=True)[
+        1:
+    ]
     mean = (place == np.arange(many.size)[:, None]) / many[:, None]
     middle = mean @ travel
     after = np.clip(np.searchsorted(middle, at), 1, many.size - 1)

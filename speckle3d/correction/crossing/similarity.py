@@ -23,8 +23,6 @@ RIGID = 6
 PARAMETERS = RIGID + 2 * BENDS
 """A shift and turn of the second path against the first, then the bends of both."""
 
-_LEAST_POINTS = 200
-
 
 @dataclass(frozen=True)
 class Placing:
@@ -120,7 +118,7 @@ class OneWay:
 
     def correlation(self, points: BoolArray) -> float:
         """Correlation of both lists at some valid points; zero if there are too few."""
-        if int(points.sum()) < _LEAST_POINTS:
+        if int(points.sum()) <= PARAMETERS:
             return 0.0
         return float(_unit_vector(self.values[points])[0] @ _unit_vector(self.levels[points])[0])
 

@@ -9,10 +9,9 @@ from speckle3d.core.arrays import Float32Array, FloatArray
 
 _TRENDS_MM = ((0.0, 0.0, 5.0), (4.0, 4.0, 4.0), (4.0, 4.0, 0.7))
 """Standard deviations along the sweep, across and along the beam of what is subtracted: gain, attenuation and
-shadows, which follow the probe and move the best match away from the truth; the local mean; and layers, which
+shadows, which follow the probe and move the best match away from the truth; the local mean, in whose
+neighbourhood the contrast is made one, too; and layers, which
 parallel to the skin look alike at any turn and place and drown what tells places apart."""
-_LOCAL_MM = 4.0
-"""Standard deviation of the neighbourhood whose contrast is made one."""
 _LEAST_DB = 0.5
 """Contrast below which there is nothing but noise to divide by, dB."""
 _REACH = 2.5
@@ -23,7 +22,7 @@ def local_contrast(volume: Float32Array, spacing_mm: FloatArray) -> Float32Array
     """Images in dB without trends, over their local standard deviation, shape (k, u, v); NaN stays."""
     for sigma_mm in _TRENDS_MM:
         volume = volume - gaussian_mean(volume, sigma_mm, spacing_mm)
-    contrast = np.sqrt(gaussian_mean(volume**2, _LOCAL_MM, spacing_mm))
+    contrast = np.sqrt(gaussian_mean(volume**2, _TRENDS_MM[1], spacing_mm))
     return np.asarray(volume / np.maximum(contrast, _LEAST_DB), dtype=np.float32)
 
 
