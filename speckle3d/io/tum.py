@@ -9,7 +9,6 @@ from __future__ import annotations
 import re
 import warnings
 from contextlib import suppress
-from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -21,17 +20,13 @@ from speckle3d.io.hdf5 import PathLike, atomic_path
 from speckle3d.io.pose_paths import usable
 from speckle3d.io.text import parse_number, text_lines
 
-LengthUnit = Literal["m", "mm"]
-
-_MM_PER_UNIT: dict[LengthUnit, float] = {"m": 1000.0, "mm": 1.0}
+_MM_PER_M = 1000.0
 _COLUMNS = 8
 _UNIT_TOLERANCE = 1e-2
 """Of a quaternion's norm: files in the wild round to four digits."""
 
 
-def write_tum(
-    path: PathLike, time_s: npt.ArrayLike, poses: RigidTransform, length_unit: LengthUnit = "m"
-) -> None:
+def write_tum(path: PathLike, time_s: npt.ArrayLike, poses: RigidTransform) -> None:
     """Write poses, in mm, as TUM text with all their digits; the file appears whole or not at all.
 
     Raises
@@ -39,41 +34,34 @@ def write_tum(
     FileError
         If the file cannot be written.
     """
-    rows = np.column_stack(
-        [time_s, poses.translation / _MM_PER_UNIT[length_unit], poses.rotation.as_quat(canonical=True)]
-    )
-    lines = [f"# time_s x_{length_unit} y_{length_unit} z_{length_unit} qx qy qz qw"]
+    rows = np.column_stack([time_s, poses.translation / _MM_PER_M, poses.rotation.as_quat(canonical=True)])
+    lines = ["# time_s x_m y_m z_m qx qy qz qw"]
     lines += [" ".join(repr(value) for value in row) for row in rows.tolist()]
     with atomic_path(path) as part:
         part.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-def read_tum(path: PathLike, length_unit: LengthUnit | None = None) -> TimedPoses:
+def read_tum(path: PathLike) -> TimedPoses:
     """Read TUM text into poses in mm.
 
-    Parameters
-    ----------
-    length_unit : {"m", "mm"}, optional
-        By default what a comment of the file says, else metres, as the format has it. A heading that names
-        qw before qx says that quaternions are scalar first.
+    Places are in metres, as the format has it, unless a heading names x_mm. One that names qw before qx says
+    that quaternions are scalar first.
 
     Raises
     ------
     FileError
         If the file cannot be read.
     InvalidInputError
-        If the file says another unit, or most lines are not eight finite numbers. Lines of no use, and poses
+        If most lines are not eight finite numbers. Lines of no use, and poses
         whose time is not after the one before, are left out with a warning that counts them.
     """
     lines = [text for _, text in text_lines(path)]
     texts = [text.replace("q_", "q") for text in lines if "qw" in text or "q_w" in text or text[0] == "#"]
     heading = [word for text in texts for word in re.split(r"[\s,;#]+", text)]
-    unit = next((unit for unit in _MM_PER_UNIT if f"x_{unit}" in heading), length_unit or "m")
+    mm_per_unit = 1.0 if "x_mm" in heading else _MM_PER_M
     scalar_first = "qw" in heading and "qx" in heading[heading.index("qw") :]
     table = np.array([_eight(text) for text in lines if not text.startswith("#")]).reshape(-1, _COLUMNS)
     finite = np.isfinite(table).all(axis=1)
-    if unit != (length_unit or unit):
-        raise InvalidInputError(f"{path}: expected lengths in {length_unit}, got a file that says {unit}")
     sound = np.abs(np.linalg.norm(table[:, 4:], axis=1) - 1.0) <= _UNIT_TOLERANCE
     words = np.where(finite, np.where(sound, "", "without a unit quaternion"), "that are not eight numbers")
     rows, notes = usable(f"{path}: poses", table[:, 0], words.tolist())
@@ -86,7 +74,7 @@ def read_tum(path: PathLike, length_unit: LengthUnit | None = None) -> TimedPose
         warnings.warn(note, stacklevel=2)
     time_s, places, turns = np.split(table[rows], [1, 4], axis=1)
     poses = RigidTransform.from_components(
-        _MM_PER_UNIT[unit] * places, Rotation.from_quat(turns, scalar_first=scalar_first)
+        mm_per_unit * places, Rotation.from_quat(turns, scalar_first=scalar_first)
     )
     return TimedPoses(time_s[:, 0], poses)
 

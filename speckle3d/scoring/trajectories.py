@@ -23,7 +23,7 @@ from speckle3d.io import load
 from speckle3d.io.formats.challenge import Landmarks
 from speckle3d.io.load import load_landmarks, load_sweep, recording_sha256
 from speckle3d.io.reconstructions import FORMAT, read_reconstruction
-from speckle3d.io.tum import LengthUnit, read_tum
+from speckle3d.io.tum import read_tum
 from speckle3d.scoring.displacements import challenge_score, score_row
 from speckle3d.scoring.modes import default_mode
 from speckle3d.scoring.references import find_reference
@@ -83,7 +83,7 @@ def kind_of(path: Path) -> str:
         return "text"
 
 
-def load_estimate(path: Path, mode: str | None = None, length_unit: LengthUnit | None = None) -> Trajectory:
+def load_estimate(path: Path, mode: str | None = None) -> Trajectory:
     """Read TUM text, or one mode of a reconstruction.
 
     Parameters
@@ -91,21 +91,18 @@ def load_estimate(path: Path, mode: str | None = None, length_unit: LengthUnit |
     path : path
     mode : str, optional
         Which poses of a reconstruction; by default those that claim the smallest error of length.
-    length_unit : {"m", "mm"}, optional
-        Of text that does not say; else metres.
     """
     if kind_of(path) == "text":
-        text = read_tum(path, length_unit)
+        text = read_tum(path)
         return Trajectory(path.name, text.time_s, text.world_from_sensor)
     reconstruction = read_reconstruction(path, with_pairs=False)
     mode = default_mode(reconstruction)[0] if mode is None else mode
-    name, sha256 = f"{path.name}, mode {mode}", reconstruction.provenance.input_sha256
     return Trajectory(
-        name,
+        f"{path.name}, mode {mode}",
         reconstruction.frame_time_s,
         poses_of(reconstruction, mode),
         reconstruction.grid,
-        sweep_sha256=sha256,
+        sweep_sha256=reconstruction.provenance.input_sha256,
     )
 
 
@@ -116,9 +113,7 @@ def poses_of(reconstruction: Reconstruction, mode: str) -> RigidTransform:
     return reconstruction.poses[mode]
 
 
-def load_reference(
-    path: Path, name: str | None = None, mode: str | None = None, length_unit: LengthUnit | None = None
-) -> Trajectory:
+def load_reference(path: Path, name: str | None = None, mode: str | None = None) -> Trajectory:
     """Read TUM text, a reconstruction, or the truth or tracker of a sweep.
 
     Parameters
@@ -126,7 +121,7 @@ def load_reference(
     path : path
     name : {"tracker", "truth"}, optional
         Of a sweep; by default the truth if stored, else the tracker.
-    mode, length_unit
+    mode
         As for `load_estimate`.
 
     Raises
@@ -135,7 +130,7 @@ def load_reference(
         If the sweep has no reference.
     """
     if kind_of(path) != "sweep":
-        return load_estimate(path, mode, length_unit)
+        return load_estimate(path, mode)
     sweep = load_sweep(path)
     reference = find_reference(sweep, name)
     if reference is None:
