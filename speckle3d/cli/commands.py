@@ -62,8 +62,13 @@ _REPLACEMENTS = {
     ("images", "--clock"): "`calibrate clock --by images` finds the offset, --time-offset-s takes it",
     ("images", "--scales"): "calipers tell pixel sizes better; --pixel-mm takes them",
     ("reconstruct", "inertial"): "`fused` takes any sensor there is, `crossed` a second sweep",
+    ("reslice", "--difference-to"): "the first --mode is what others are compared with where no truth is known",
     ("export", "--frame"): "`convert` and `scene` write poses as 3D Slicer reads them",
+    ("accuracy", "--aligned"): "--no-fit-mounting says it",
+    ("export", "--length-unit"): "lengths are in metres, as TUM text has them",
+    ("score", "--length-unit"): "TUM text is in metres unless its heading says millimetres",
     ("live", "--compression"): "`convert --compression gzip` compresses its recording",
+    ("play", "--address"): "`ssh -L PORT:localhost:PORT MACHINE` brings it to another machine",
     ("play", "--loop"): "`while speckle3d play SWEEP; do :; done` begins again in a shell",
     ("simulate", "--reverse"): "--preset reversal comes back",
 }
