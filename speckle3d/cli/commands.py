@@ -62,7 +62,7 @@ _REPLACEMENTS = {
     ("images", "--clock"): "`calibrate clock --by images` finds the offset, --time-offset-s takes it",
     ("images", "--scales"): "calipers tell pixel sizes better; --pixel-mm takes them",
     ("reconstruct", "inertial"): "`fused` takes any sensor there is, `crossed` a second sweep",
-    ("reslice", "--difference-to"): "the first --mode is what others are compared with where no truth is known",
+    ("reslice", "--difference-to"): "the truth or the tracker if known, else the first --mode",
     ("export", "--frame"): "`convert` and `scene` write poses as 3D Slicer reads them",
     ("accuracy", "--aligned"): "--no-fit-mounting says it",
     ("export", "--length-unit"): "lengths are in metres, as TUM text has them",
