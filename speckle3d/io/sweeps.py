@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from speckle3d.core.arrays import AnyArray, FloatArray
 from speckle3d.core.errors import InvalidInputError, naming
-from speckle3d.core.geometry import rotations_from_quaternions, transforms_from_matrices
+from speckle3d.core.geometry import require_finite, rotations_from_quaternions, transforms_from_matrices
 from speckle3d.core.grid import FanLines, ImageGrid
 from speckle3d.core.streams import TimedPoses, TimedRotations
 from speckle3d.core.sweep import INERTIAL, BModeSettings, OrientationSensor, RFSettings, Sweep, Tracker
@@ -175,6 +175,8 @@ def _read_sensor(file: h5py.File, name: str) -> Any:
         if name == "tracker":
             return Tracker(TimedPoses(times_s[valid], world_from_sensor), place, offset_s, skew_rad)
         vectors = {key: _rows(group, key, count, 3)[valid] for key in INERTIAL if key in group}
+        for key, rows in vectors.items():
+            require_finite(rows, key)
         return OrientationSensor(
             TimedRotations(times_s[valid], world_from_sensor), place, offset_s, **vectors
         )

@@ -176,6 +176,12 @@ def _stamps(
         hour, minute, nano = (columns.get(f"utc_{part}", 0.0) for part in ("hour", "minute", "nano"))
         seconds = 3600.0 * hour + 60.0 * minute + columns["utc_s"] + 1e-9 * nano
         columns["time"] = unwrap_column(seconds)
+    if np.isnan(period_s) and not columns.keys() & {"time", "counter"}:
+        unknown = ", ".join(name[:40] for name in table.names if column_of(name) is None)
+        raise InvalidInputError(
+            f"expected a column of time with its unit, as time_s, got {unknown or 'none'}: name it so, or "
+            "give --rate-hz"
+        )
     clocks = [np.abs(columns[key]) < _LARGEST for key in ("time", "counter") if key in columns]
     timely = np.all(clocks, axis=0)
     if not timely.any():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
@@ -11,9 +11,6 @@ import speckle3d as s3
 from speckle3d.cli.common import MaybeNumber, MaybePath, MaybeText, Out, Result, note
 from speckle3d.cli.outputs import require_own_place
 from speckle3d.core.errors import naming
-
-if TYPE_CHECKING:
-    pass
 
 
 def measure(

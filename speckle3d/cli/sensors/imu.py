@@ -92,7 +92,9 @@ def info(log_file: Path, rate_hz: MaybeNumber = None, world: World = None) -> Re
         ("samples", str(len(log)), ""),
         ("duration", f"{log.duration_s:.3f}", "s"),
         ("rate", *rate),
-        ("gaps", log.losses or "none", ""),
+        ("lost", str(log.lost), "samples"),
+        ("gaps", str(len(log.gaps)), ""),
+        ("longest gap", f"{max((gap.duration_s for gap in log.gaps), default=0.0):.3f}", "s"),
         ("own orientation", str(int(log.oriented.sum())), "samples"),
     ]
     for name, unit in zip(INERTIAL, ("m/s^2", "rad/s", "a.u."), strict=True):
@@ -327,10 +329,11 @@ def record(
     $ speckle3d imu record /dev/ttyUSB0 log.mtb
     """
     state, settings = None, xsens.DeviceSettings(content, rate_hz, baud)
+    duration_s = math.inf if duration_s is None else duration_s
     try:
         with status_line() as show:
             show("connecting")
-            for state in xsens.record(port, out, settings, append, duration_s=duration_s or math.inf):
+            for state in xsens.record(port, out, settings, append, duration_s=duration_s):
                 show(state.line())
     except KeyboardInterrupt:
         note("stopped")
