@@ -49,6 +49,7 @@ _RULE = re.compile(r"\b(With|Not with) (--[\w-]+(?: or --[\w-]+)*)[:.]")
 _CHOICE = re.compile(r"\bOne of ((?:[A-Z]+|--[\w-]+) or --[\w-]+)")
 _OUTPUT = re.compile(r"(?:-o|--output=)(.+)|-o|--output", re.DOTALL)
 _ANY_VIEWER = "frames are cut here, and volumes by any viewer, as 3D Slicer"
+_AS_PLUS = "names are PLUS's: Image_Reference, ProbeToReference, ProbeToWorld"
 _REPLACEMENTS = {
     ("reconstruct", "--volume-mode"): "`speckle3d volume --mode` writes a volume at any mode's poses",
     ("reconstruct", "--consistent-subset"): "`--drift consistent-subset`, or the setting of that name",
@@ -66,9 +67,13 @@ _REPLACEMENTS = {
     ("export", "--frame"): "`convert` and `scene` write poses as 3D Slicer reads them",
     ("accuracy", "--aligned"): "--no-fit-mounting says it",
     ("export", "--length-unit"): "lengths are in metres, as TUM text has them",
-    ("score", "--length-unit"): "TUM text is in metres unless its heading says millimetres",
+    ("score", "--length-unit"): "TUM text is in metres unless its heading names x_mm",
+    ("record", "inf"): "without --duration-s it records until Ctrl-C",
     ("live", "--compression"): "`convert --compression gzip` compresses its recording",
     ("play", "--address"): "`ssh -L PORT:localhost:PORT MACHINE` brings it to another machine",
+    ("play", "--image"): _AS_PLUS,
+    ("play", "--transform"): _AS_PLUS,
+    ("play", "--orientation"): _AS_PLUS,
     ("play", "--loop"): "`while speckle3d play SWEEP; do :; done` begins again in a shell",
     ("simulate", "--reverse"): "--preset reversal comes back",
 }
