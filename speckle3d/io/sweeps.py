@@ -68,7 +68,7 @@ def open_sweep(source: h5py.File, _: ImportSettings) -> Recording:
         if not times_s.size:
             raise InvalidInputError(f"{path}: expected a frame, got none so far")
         frames, grid, signal = _read_image(file, times_s.size)
-        has_truth = "truth/world_from_image" in file
+        has_truth = "truth" in file
         sweep = Sweep(
             frames=frames,
             grid=grid,

@@ -92,12 +92,15 @@ def find_files(path: Path) -> tuple[str, dict[str, Member], dict[str, Member]]:
         If it holds several recordings or none.
     """
     members = _members(path)
-    recordings = sorted({member.recording for member in members})
+    # Others' files, as my_env.yml, have no raw samples.
+    with_raw = {member.recording for member in members if member.content == "raw"}
+    recordings = sorted(with_raw or {member.recording for member in members})
     if len(recordings) != 1:
         raise InvalidInputError(
             f"{path}: expected files of one recording, as 2024-05-01_rf.raw and _rf.yml, got those of "
             f"{', '.join(recordings) or 'none'}: give the raw file of one (of a tar file: unpack it first)"
         )
+    members = [member for member in members if member.recording == recordings[0]]
     raw = {member.kind: member for member in members if member.content == "raw"}
     yml = {member.kind: member for member in members if member.content.startswith("y")}
     return Path(recordings[0]).name, raw, yml

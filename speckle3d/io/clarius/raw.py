@@ -145,12 +145,13 @@ def open_raw(member: Member, kind: str) -> AnyArray:
         If its samples are of another size than those of the kind.
     """
     content, (dtype, parts, _) = _content(member), SAMPLES[kind]
-    _, count, *size, sample_bytes = HEADER.unpack(content[: HEADER.size])
+    with reading(member.where):
+        _, count, *size, sample_bytes = HEADER.unpack(content[: HEADER.size])
+        record = np.dtype([("time", "<u8"), ("samples", dtype, (*size, parts))])
     if sample_bytes != parts * np.dtype(dtype).itemsize:
         raise InvalidInputError(
             f"{member.where}: expected samples of {kind} as in the yml, got some of {sample_bytes} bytes"
         )
-    record = np.dtype([("time", "<u8"), ("samples", dtype, (*size, parts))])
     whole = (len(content) - HEADER.size) // record.itemsize
     if whole < count:
         raise FileError(f"{member.where}: ends early: {whole} of {count} frames")

@@ -91,6 +91,8 @@ def open_package(path: Path, settings: ImportSettings) -> Facts:
         remarks.append(f"the yml says {count:g} frames, the raw file holds {len(records)}")
 
     yml_rate_hz, transmit_hz = yml.require("sampling rate"), yml.number("transmit frequency")
+    if not yml_rate_hz > 0:
+        raise InvalidInputError(f"{yml.where}: sampling rate: expected it above zero, got {yml_rate_hz:g}")
     rate_hz = settings.sampling_rate_hz or yml_rate_hz
     speed_m_s = yml.number("vsound") or yml.number("speed of sound")
     spacing_mm = 1e3 * (settings.speed_of_sound_m_s or speed_m_s or SPEED_OF_SOUND_M_S) / (2.0 * rate_hz)
