@@ -11,7 +11,7 @@ from typing import Any, TypeAlias
 import h5py
 import numpy as np
 
-from speckle3d.core.arrays import AnyArray, ComplexArray, FloatArray
+from speckle3d.core.arrays import AnyArray, ComplexArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.text import printable
 from speckle3d.io.carrier import demodulation_of
@@ -32,11 +32,6 @@ TOLERANCE_MM = 1e-3
 """Of a pixel's place: single precision in metres keeps 1e-5 mm of a depth of 150 mm."""
 
 
-def flat(group: h5py.Group, name: str) -> FloatArray:
-    """Numbers of an array in one row, whatever axes of length 1 there are; empty where there is none."""
-    return read_array(group, name, None).ravel() if has_member(group, name) else np.zeros(0)
-
-
 def single(group: h5py.Group, name: str) -> float | None:
     """Read one number; None if there is none, or an empty array, of this name.
 
@@ -45,7 +40,7 @@ def single(group: h5py.Group, name: str) -> float | None:
     InvalidInputError
         If there are several that differ, as one per transmission may.
     """
-    values = flat(group, name)
+    values = read_array(group, name, None).ravel() if has_member(group, name) else np.zeros(0)
     if values.size and np.ptp(values):
         raise InvalidInputError(
             f"{locate(group, name)}: expected one number, got {values.min():g} to {values.max():g}"
@@ -106,6 +101,8 @@ def pixel_values(place: ComplexArray, where: str, source: str) -> dict[str, Valu
     def is_zero(off: ComplexArray) -> bool:
         return bool(np.abs(off).max() <= TOLERANCE_MM)
 
+    if not (place.size and np.isfinite(place).all()):
+        raise InvalidInputError(f"{where}: expected finite places of pixels, got others")
     numbers: dict[str, Any]
     x_mm, z_mm = place[:, 0].imag, place[0].real
     angle = np.angle(place[:, -1] - place[:, 0])
@@ -174,6 +171,8 @@ def grey_frames(
     """Frames of grey levels and their dynamic range; all frames are read once to find the strongest echo."""
     read, span = source(), dynamic_range_db or ENVELOPE_RANGE_DB
     top = max((float(read(i).max()) for i in range(shape[0])), default=0.0)
+    if not (np.isfinite(top) and (decibels or top > 0)):
+        raise InvalidInputError(f"expected echoes, got amplitudes up to {top:g}")
     turn = partial(grey_levels, turn=source.turn, decibels=decibels, top=top, dynamic_range_db=span)
     frames = replace(source, turn=turn).frames(shape, np.uint8)
     return frames, Value(span, f"of grey levels made here below {top:g}")

@@ -23,10 +23,10 @@ from pathlib import Path
 import h5py
 import numpy as np
 
+from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.io.formats.hdf5_values import (
     by_phase,
-    flat,
     frame_of,
     grey_frames,
     pixel_values,
@@ -38,6 +38,7 @@ from speckle3d.io.frames import HDF5Slices
 from speckle3d.io.hdf5 import (
     find_member,
     locate,
+    read_array,
     require_dataset,
     require_group,
 )
@@ -109,12 +110,17 @@ def _scan(group: h5py.Group, source: str) -> tuple[int, int, dict[str, Value]]:
     """Lines and samples of a scan, and where they lie."""
     scan, where = require_group(group, "scan"), locate(group, "scan")
     kind = text_of(scan.attrs.get("class", ""))
+
+    def axis(name: str) -> FloatArray:
+        return read_array(scan, name, None).ravel()
+
+    place = np.zeros((0, 0), dtype=complex)
     if kind == _SECTOR:
         # Depths are from where the lines meet, which is above the array's face if it is curved.
-        place = 1e3 * flat(scan, "depth_axis") * np.exp(1j * flat(scan, "azimuth_axis")[:, None])
-        place += 1e3 * flat(scan, "z")[0] - place[0, 0].real
-    else:
-        place = 1e3 * (flat(scan, "z_axis") + 1j * flat(scan, "x_axis")[:, None])
+        place = 1e3 * axis("depth_axis") * np.exp(1j * axis("azimuth_axis")[:, None])
+        place += 1e3 * axis("z")[0] - place[0, 0].real
+    elif kind == _LINEAR:
+        place = 1e3 * (axis("z_axis") + 1j * axis("x_axis")[:, None])
     values = pixel_values(place, where, source) if kind in (_LINEAR, _SECTOR) else None
     if values is None:
         raise InvalidInputError(

@@ -147,7 +147,7 @@ def open_zea(file: h5py.File, settings: ImportSettings) -> Facts:
 
 
 def _pixels(node: h5py.Dataset, shape: tuple[int, ...]) -> tuple[dict[str, Value], float | None, bool]:
-    """Where the pixels of a Cartesian or polar grid lie, by the first frame.
+    """Where the pixels of a Cartesian or polar grid lie, the same in all frames.
 
     Returns
     -------
@@ -160,16 +160,17 @@ def _pixels(node: h5py.Dataset, shape: tuple[int, ...]) -> tuple[dict[str, Value
     where = locate(node)
     if node.shape != (*shape, 3) or 0 in shape:
         raise InvalidInputError(f"{where}: expected shape {(*shape, 3)}, got {node.shape}")
-    places_mm = 1e3 * node[0].astype(np.float64)
+    places_mm, end_mm = (1e3 * node[i].astype(np.float64) for i in (0, shape[0] - 1))
+    is_fixed = (np.abs(end_mm - places_mm) <= TOLERANCE_MM).all()
 
     for x_first in (False, True):
         x, y, z = np.moveaxis(places_mm if x_first else places_mm.swapaxes(0, 1), 2, 0)
         values = pixel_values(z + 1j * x, where, "of the coordinates")
-        if values is not None and np.ptp(y) <= TOLERANCE_MM:
+        if values is not None and np.ptp(y) <= TOLERANCE_MM and is_fixed:
             return values, float(x[0, 0]) if "vector_pitch_mm" in values else None, x_first
     raise InvalidInputError(
-        f"{where}: expected pixels on a Cartesian or polar grid in one plane, got others: beamform onto "
-        "zea's cartesian_pixel_grid, or scan-convert them"
+        f"{where}: expected pixels on a Cartesian or polar grid in one plane, the same in all frames, got "
+        "others: beamform onto zea's cartesian_pixel_grid, or scan-convert them"
     )
 
 
