@@ -31,3 +31,4 @@ def test_a_scene_of_two_modes(run, refuse, reconstruction, tmp_path):
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "volume-pose.nrrd").write_text("precious")
     assert "another origin" in refuse("scene", reconstruction, "-o", tmp_path / "other")
+    assert "is an input" in refuse("scene", target / "scene.mrml", "-o", target)

@@ -198,6 +198,9 @@ def scene(
     from speckle3d.study.scenes.scene import FILES
 
     require_own(out, FILES)
+    for path in filter(None, (input_file, choice.sweep_file)):
+        if path.resolve() in {(out / name).resolve() for name in FILES.names}:
+            raise InvalidInputError(f"{path}: is an input and would be replaced: give -o another folder")
     compounding = compounding_settings(config_file, settings)
     modes = list(dict.fromkeys(mode)) if mode else [None]
     sweeps, part = open_sweep_at(modes, input_file, recording, choice)
