@@ -245,6 +245,9 @@ def open_sequence(path: Path, settings: ImportSettings) -> Facts:
     if not own and size.value and spacing.value and differs(size.value, spacing.value):
         pixels = f"pixels of {_length_text(size.value)} mm, {size.source}"
         remarks.append(f"{pixels}: the file says {_length_text(spacing.value)}")
+    if len(header.frames) not in (0, header.frame_count):
+        count = len(header.frames)
+        remarks.append(f"the header has fields of {count} frames for {header.frame_count} images")
     if device.is_curved:
         is_picture = not (layout.is_rf or layout.has_lines_in_rows)
         meaning = "images are taken for scan-converted" if is_picture else "its lines spread"
