@@ -48,9 +48,10 @@ _EXPECTED = {
         "MONOCHROME1", "MONOCHROME2", "RGB", "YBR_FULL", "YBR_FULL_422", "YBR_ICT", "YBR_RCT",
     ),
     "BitsAllocated": (8,),
+    "PixelRepresentation": (0,),
 }  # fmt: skip
 _TAGS = (
-    *_MACHINE, *_RATES, *_EXPECTED, "NumberOfFrames", "FrameTimeVector", "PixelSpacing",
+    *_MACHINE, *_RATES, *_EXPECTED, "NumberOfFrames", "FrameTimeVector", "Rows", "Columns", "PixelSpacing",
     "LossyImageCompression", "SequenceOfUltrasoundRegions",
 )  # fmt: skip
 """All that is loaded."""
@@ -150,6 +151,8 @@ def _place(header: Any) -> Generator[Row, None, tuple[tuple[slice, slice], dict[
     if len(tissue) != 1:
         raise InvalidInputError(f"expected one region of 2-D tissue, got {len(tissue)} of {len(regions)}")
     region, (left, top, right, bottom) = tissue[0]
+    width, height = _numbers(header, "Columns", "Rows")
+    right, bottom = min(right, int(width) - 1), min(bottom, int(height) - 1)
     units = _numbers(region, "PhysicalUnitsXDirection", "PhysicalUnitsYDirection")
     x_step, y_cm = _numbers(region, "PhysicalDeltaX", "PhysicalDeltaY")
     if units not in (_CM, _POLAR):

@@ -77,6 +77,8 @@ def open_matlab(path: Path, settings: ImportSettings) -> Facts:
         )
     with naming(where):
         nodes = [_array(variables, arrays[role]) for role in data]
+        if len({node.shape for node in nodes}) > 1:
+            raise InvalidInputError(f"expected arrays of one size, got {' and '.join(map(_size, nodes))}")
         if _kind(nodes[0]).startswith("complex") != (data == ("iq",)):
             raise InvalidInputError(f"{data[0]}: expected complex numbers as iq alone, got {_kind(nodes[0])}")
         names, shape = _axes(arrays.get("axes", ""), nodes[0])
@@ -231,7 +233,7 @@ def _numbers(
 def _product(variables: Any, name: str, text: str) -> FloatArray:
     """Numbers of an array, in one row, times the factor behind its name."""
     parts = _TERM.fullmatch(text.strip())
-    if parts is None:
+    if parts is None or not float(parts[3] or 1.0):
         raise InvalidInputError(f"{name}: expected as NAME, NAME * 1e6 or NAME / 2, got {text}")
     numbers = np.asarray(_array(variables, parts[1])[()], dtype=np.float64).ravel()
     factor = float(parts[3] or 1.0)

@@ -127,7 +127,7 @@ class DeviceSet:
         return sum(values, ()) if all(values) else None
 
     def clip_region(self, grid: ImageGrid) -> str | None:
-        """Clip and fan of a volume reconstruction as a region of images in mm; None where there is neither.
+        """Clip and fan of a volume reconstruction as a region of images in mm; None where it is all of them.
 
         Names without a unit are those of older versions [1]_.
         """
@@ -136,7 +136,8 @@ class DeviceSet:
         if corner and size and min(size) > 0:
             # PLUS counts the pixel behind the rectangle, too (vtkIGSIOPasteSliceIntoVolume).
             (left, top), (right, bottom) = np.subtract(corner, _HAIR), np.add(corner, size) + _HAIR
-            outlines.append(np.array([(left, top), (right, top), (right, bottom), (left, bottom)]))
+            if max(left, top, grid.vectors - 1 - right, grid.samples - 1 - bottom) > 0:
+                outlines.append(np.array([(left, top), (right, top), (right, bottom), (left, bottom)]))
         angles, apex = region(2, "FanAnglesDeg", "FanAngles"), region(2, "FanOriginPixel", "FanOrigin")
         outer = region(1, "FanRadiusStopPixel", "FanDepth")
         if angles and apex and outer and angles[0] != angles[1]:
