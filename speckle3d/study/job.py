@@ -243,8 +243,8 @@ def require_possible(
     require_modes(sweep, [mode for mode in modes if mode != SUBSET], crossing)
     if SUBSET in modes and sensed_orientation(sweep, config.sensors) is None:
         raise InsufficientDataError(
-            f"{sweep.name}: mode {SUBSET}: expected sensed orientation over every frame and the setting "
-            "sensors.consistent_subset, got none"
+            f"{sweep.name}: mode {SUBSET}: expected sensed orientation within sensors.smooth_s of every "
+            "frame and the setting sensors.consistent_subset, got none"
         )
     return find_reference(repair_readings(sweep)[0] if config.sensors.examine else sweep, reference)
 
