@@ -63,4 +63,5 @@ def label(file: h5py.File) -> None:
     for pattern, words in MEANINGS.items():
         for name in fnmatch.filter(names, pattern):
             attributes = file[name].attrs
+            # Of fixed length: HDF5 never returns from zeros among texts of variable length.
             attributes["units"], _, attributes["meaning"] = map(np.bytes_, words.encode().partition(b": "))

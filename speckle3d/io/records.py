@@ -91,10 +91,7 @@ def put(group: h5py.Group, name: str, value: Any) -> None:
         inner = group.require_group(name)
         for key, item in value.items():
             put(inner, key, item)
-    elif isinstance(value, str):
-        # Of fixed length: HDF5 never returns from zeros among texts of variable length.
-        group.attrs[name] = np.bytes_(value.encode("utf-8", "backslashreplace"))
-    elif isinstance(value, int | float | tuple):
+    elif isinstance(value, str | int | float | tuple):
         group.attrs[name] = value
     elif isinstance(value, list):
         group.create_dataset(name, data=value, dtype=h5py.string_dtype())
