@@ -51,11 +51,19 @@ def claimed_covariance(
 
 def shared_covariance(poses: RigidTransform, centre_mm: FloatArray, shared: SharedErrors) -> FloatArray:
     """Covariance of every frame's pose by errors common to all pairs, shape (n, 6, 6)."""
-    common, way = _common_factors(poses, centre_mm, shared), _travel(poses, centre_mm)[:, None]
-    changing = np.zeros((len(poses), 6))
-    changing[:, 2:3] = shared.scale_sigma**2 * SCALE_CHANGE_MM * way
-    changing[:, [4, 3]] = np.square(shared.turn_sigma_per_mm) * TURN_CHANGE_MM * way
-    return np.asarray(np.einsum("mia,mib->iab", common, common) + changing[:, :, None] * np.eye(6))
+    common, way = _common_factors(poses, centre_mm, shared), _travel(poses, centre_mm)
+    covariance = np.einsum("mia,mib->iab", common, common)
+    covariance[:, 2, 2] += shared.scale_sigma**2 * SCALE_CHANGE_MM * way
+    # Each turn on the way moves the centre by its product with what is travelled along z after it.
+    z = poses.apply(centre_mm)[:, 2]
+    turned, arm, square = (np.cumsum(np.diff(way, prepend=0.0) * z**power) for power in range(3))
+    sideways, apart = z * turned - arm, z**2 * turned - 2.0 * z * arm + square
+    for angle, place, sign, sigma in zip((4, 3), (0, 1), (1.0, -1.0), shared.turn_sigma_per_mm, strict=True):
+        variance = sigma**2 * TURN_CHANGE_MM
+        covariance[:, angle, angle] += variance * turned
+        covariance[:, place, place] += variance * apart
+        covariance[:, [angle, place], [place, angle]] += sign * variance * sideways[:, None]
+    return np.asarray(covariance)
 
 
 def _common_factors(poses: RigidTransform, centre_mm: FloatArray, shared: SharedErrors) -> FloatArray:

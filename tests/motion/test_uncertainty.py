@@ -7,6 +7,7 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.core.reconstruction import SharedErrors
 from speckle3d.motion.uncertainty import (
     SCALE_CHANGE_MM,
+    TURN_CHANGE_MM,
     claimed_covariance,
     joint_errors,
     shared_covariance,
@@ -32,11 +33,12 @@ def test_an_error_of_scale_grows_on_the_way_and_mostly_comes_back():
 
 def test_a_false_turn_bends_the_sweep():
     yaw = covariance(turn=(1e-3, 0.0))
-    # Turned by z / 1000 at z, the centre is off by the mean turn times z.
-    assert np.sqrt(yaw[50, X, X]) == pytest.approx(1e-3 * 100 / 2, rel=1e-2)
+    # Turned by z / 1000 at z, the centre is off by the mean turn times z; of a walk, by its integral.
+    bent = 1e-3 * np.sqrt(10**4 / 4 + TURN_CHANGE_MM * 10**3 / 3)
+    assert np.sqrt(yaw[50, X, X]) == pytest.approx(bent, rel=2e-2)
     assert yaw[50, X, YAW] > 0
     tilt = covariance(turn=(0.0, 1e-3))
-    assert np.sqrt(tilt[50, Y, Y]) == pytest.approx(1e-3 * 100 / 2, rel=1e-2)
+    assert np.sqrt(tilt[50, Y, Y]) == pytest.approx(bent, rel=2e-2)
     assert tilt[50, Y, TILT] < 0
 
 
