@@ -31,7 +31,6 @@ from .io.voxels.volume_writer import write_volume as write_volume
 from .io.voxels.volumes import load_volume as load_volume
 from .io.voxels.volumes import read_volume as read_volume
 from .phantom_curves import calibrate_curves as calibrate_curves
-from .pipeline import track as track
 from .scoring.lengths import ModeError as ModeError
 from .scoring.lengths import compare_modes as compare_modes
 from .simulation.presets import simulate as simulate
@@ -42,5 +41,6 @@ from .study.job import run_job as run_job
 from .study.pose_errors import measure as measure
 from .study.scenes.scene import write_scene as write_scene
 from .tracked import Tracked as Tracked
+from .tracking import track as track
 
 __version__: str

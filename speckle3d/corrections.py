@@ -13,8 +13,8 @@ from speckle3d.correction.fused import fuse
 from speckle3d.correction.modes import CUBIC_MODES, correct_mode, require_modes, sensor_of
 from speckle3d.correction.scale import ScaledPoses
 from speckle3d.examine.sensors import credible_sensors, repair_readings, require_credible
-from speckle3d.pipeline import require_kind
 from speckle3d.tracked import Tracked
+from speckle3d.tracking import require_kind
 
 Correction = DriftCorrection | ScaledPoses
 

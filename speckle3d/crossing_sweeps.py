@@ -15,9 +15,9 @@ from speckle3d.correction.crossing.sweep import CrossingSweep
 from speckle3d.examine.sensors import credible_sensors
 from speckle3d.matching.intensity import IntensityExtractor
 from speckle3d.motion.sensors import sensed_orientation
-from speckle3d.pipeline import track
 from speckle3d.tracked import Tracked
 from speckle3d.tracked_curves import Length, corrected_curves
+from speckle3d.tracking import track
 
 
 def cross_sweeps(

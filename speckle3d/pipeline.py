@@ -6,15 +6,13 @@ RF -> intensity -> in-plane motion -> patch correlation -> |distance| and sigma 
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 
 from speckle3d.config import Config
 from speckle3d.core.curves import DecorrelationCurves
-from speckle3d.core.errors import InsufficientDataError, InvalidInputError, naming
+from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.progress import Progress
 from speckle3d.core.reconstruction import FramePairs
 from speckle3d.core.sweep import Sweep
@@ -22,7 +20,6 @@ from speckle3d.examine.curves import examine_key
 from speckle3d.examine.disagreements import disagreements
 from speckle3d.examine.images import examine_echoes, examine_images, examine_processing
 from speckle3d.examine.sensors import examine_sensors
-from speckle3d.io.curves import curves_beside, read_curves, trust_words
 from speckle3d.matching.frames import ImageSink, match_sweep
 from speckle3d.matching.matcher import FrameMatcher
 from speckle3d.matching.quality import placed_flags
@@ -39,77 +36,14 @@ PairSink = Callable[[FramePairs], None]
 
 def track(
     sweep: Sweep,
-    curves: DecorrelationCurves | None = None,
+    curves: DecorrelationCurves,
     config: Config | None = None,
     progress: Progress | None = None,
     sink: PairSink | None = None,
     images: ImageSink | None = None,
 ) -> Tracked:
-    """Estimate the pose of every frame from the images, and from the orientation-consistent patches.
-
-    The second set of poses, `Tracked.subset`, needs an orientation sensor calibrated to the image that has
-    readings for all frames, or for frames nearby.
-
-    Parameters
-    ----------
-    sweep : Sweep
-        n frames, read one at a time.
-    curves : DecorrelationCurves, optional
-        Of the sweep's probe and settings; by default curves.h5 beside its recording, as the
-        commands have it, and a warning says how far to trust them.
-    config : Config, optional
-    progress : callable, optional
-        Called with frames done and frames in all; `speckle3d.progress_bar` makes one.
-    sink : callable, optional
-        Called with the frame pairs.
-    images : callable, optional
-        Called with every intensity image.
-
-    Returns
-    -------
-    Tracked
-
-    Raises
-    ------
-    MismatchError
-        If the curves belong to another probe, frequency, sampling, patch size or depth, by what the files say
-        or by what the images do; see `speckle3d.examine`.
-    InsufficientDataError
-        If too many frames have no speckle in common with others, if the images do not determine the length,
-        or if they cannot be those of one probe that moves (`speckle3d.examine.images`).
-
-    Examples
-    --------
-    >>> import speckle3d as s3
-    >>> sweep = s3.load_sweep("data/phantom.h5").part(0, 32)
-    >>> tracked = s3.track(sweep, s3.load_curves("data/curves.h5"))
-    >>> len(tracked.image), tracked.direction_from, bool(tracked.flags.any())
-    (32, 'tracker', False)
-    """
-    require_kind(sweep, Sweep, "load_sweep(path)")
+    """Estimate the pose of every frame; `speckle3d.tracking.track` says from what, and what is raised."""
     settings = config or Config()
-    if curves is None:
-        if sweep.path is None:
-            raise InvalidInputError(
-                f"{sweep.name}: expected curves of its probe (load_curves(path)), got none"
-            )
-        path = curves_beside(sweep.path)
-        curves = read_curves(path)
-        warnings.warn(trust_words(path, curves, settings.curves.same_probe), stacklevel=2)
-    require_kind(curves, DecorrelationCurves, "load_curves(path)")
-    with naming(sweep.name):
-        return _track(sweep, curves, settings, progress, sink, images)
-
-
-def _track(
-    sweep: Sweep,
-    curves: DecorrelationCurves,
-    settings: Config,
-    progress: Progress | None,
-    sink: PairSink | None,
-    images: ImageSink | None,
-) -> Tracked:
-    """The stages, one after the other."""
     if len(sweep) < 2:
         raise InsufficientDataError(f"expected at least 2 frames, got {len(sweep)}")
     matcher = FrameMatcher(sweep, settings, curves)
@@ -161,23 +95,3 @@ def _track(
         grid=sweep.grid,
         frame_time_s=sweep.frame_time_s,
     )
-
-
-def require_kind(value: Any, kind: type, made_by: str) -> None:
-    """Raise `InvalidInputError` unless an argument has a type.
-
-    Parameters
-    ----------
-    value : object
-        The argument.
-    kind : type
-    made_by : str
-        What makes such an object, as ``load_sweep(path)``.
-
-    Raises
-    ------
-    InvalidInputError
-        If it is something else.
-    """
-    if not isinstance(value, kind):
-        raise InvalidInputError(f"expected a {kind.__name__}, as {made_by} gives it, got {type(value)}")

@@ -22,8 +22,8 @@ from speckle3d.core.progress import Progress
 from speckle3d.core.sweep import Sweep
 from speckle3d.motion.lens import stretched
 from speckle3d.phantom_curves import calibrate_curves
-from speckle3d.pipeline import track
 from speckle3d.tracked import Tracked
+from speckle3d.tracking import track
 
 LENGTH_SIGMA = 0.005
 """Of a tracker's millimetres and of how well its mounting is known, beside its jitter."""

@@ -22,12 +22,12 @@ from speckle3d.io.curves import read_curves
 from speckle3d.io.load import load_sweep
 from speckle3d.io.sweep_writer import write_sweep
 from speckle3d.phantom_curves import calibrate_curves
-from speckle3d.pipeline import track
 from speckle3d.scoring.lengths import compare_modes
 from speckle3d.sheet_curves import ProbeSheet, data_sheet_curves
 from speckle3d.simulation.beam import tabulate_beam
 from speckle3d.simulation.presets import SimulationSettings, simulate
 from speckle3d.simulation.receiver import received
+from speckle3d.tracking import track
 
 TABLE = Path(__file__).parent / "accuracy" / "table.toml"
 SWEEPS_FOLDER = os.environ.get("SPECKLE3D_ACCURACY_SWEEPS")

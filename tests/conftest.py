@@ -128,6 +128,6 @@ def curves(data_folder):
 @pytest.fixture(scope="session")
 def tracking(sweep, curves):
     """The shipped sweep, tracked as it comes."""
-    from speckle3d.pipeline import track
+    from speckle3d.tracking import track
 
     return track(sweep, curves)

@@ -6,7 +6,7 @@ import pytest
 
 from speckle3d.core.curves import SpeckleSize, TiltResponse
 from speckle3d.core.errors import MismatchError
-from speckle3d.pipeline import track
+from speckle3d.tracking import track
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ from speckle3d.io.curves import read_curves
 from speckle3d.io.load import load_sweep
 from speckle3d.matching.quality import FrameFlag
 from speckle3d.motion.sensors import SensorSettings, settle_direction
-from speckle3d.pipeline import track
+from speckle3d.tracking import track
 
 
 def test_steps_follow_the_truth(sweep, tracking):

@@ -3,8 +3,8 @@
 import pytest
 
 from speckle3d.core.geometry import elevational_steps
-from speckle3d.pipeline import track
 from speckle3d.simulation.receiver import received
+from speckle3d.tracking import track
 
 pytestmark = pytest.mark.slow
 

@@ -10,9 +10,9 @@ from sweep_examples import frames_of
 
 from speckle3d.config import Config
 from speckle3d.core.errors import InsufficientDataError
-from speckle3d.pipeline import track
 from speckle3d.sheet_curves import data_sheet_curves
 from speckle3d.simulation.receiver import received
+from speckle3d.tracking import track
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ import pytest
 
 from speckle3d.core import threads
 from speckle3d.corrections import correct
-from speckle3d.pipeline import track
+from speckle3d.tracking import track
 
 
 def poses_of(tracking, sweep):

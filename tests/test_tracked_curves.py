@@ -9,8 +9,8 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.core.curves import curve_widths
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.streams import TimedPoses
-from speckle3d.pipeline import track
 from speckle3d.tracked_curves import tracked_curves, tracker_scale
+from speckle3d.tracking import track
 
 
 def shaken(sweep, jitter_mm, seed=3):

@@ -17,7 +17,7 @@ from speckle3d.crossing_sweeps import crossing_side, stack_for
 from speckle3d.live.checks import GOOD
 from speckle3d.live.tracking import LiveTracker
 from speckle3d.live.volume import GrowingVolume
-from speckle3d.pipeline import track
+from speckle3d.tracking import track
 
 NOT_YET = "not overlapping with the first sweep yet: go on"
 NO_PLACE = "not overlapping with the first sweep"

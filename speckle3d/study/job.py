@@ -41,7 +41,6 @@ from speckle3d.io.load import import_record, load_landmarks, load_sweep, recordi
 from speckle3d.io.reconstructions import write_reconstruction
 from speckle3d.matching.quality import describe
 from speckle3d.motion.sensors import sensed_orientation
-from speckle3d.pipeline import track
 from speckle3d.scoring.displacements import score_row
 from speckle3d.scoring.lengths import TRACKER
 from speckle3d.scoring.modes import length_claims
@@ -58,6 +57,7 @@ from speckle3d.study.reslices.cuts import length_words
 from speckle3d.study.reslices.reslice_figures import draw_along
 from speckle3d.study.results import SUMMARY_FILES, Summary, require_own, summary_text, write_summary
 from speckle3d.tracked import Tracked
+from speckle3d.tracking import track
 
 
 @shown

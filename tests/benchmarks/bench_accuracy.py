@@ -24,9 +24,9 @@ from speckle3d.io.curves import read_curves
 from speckle3d.io.load import load_sweep
 from speckle3d.motion.sensors import settle_direction
 from speckle3d.phantom_curves import calibrate_curves
-from speckle3d.pipeline import track
 from speckle3d.scoring.lengths import compare_modes, sum_motion
 from speckle3d.simulation.presets import SimulationSettings
+from speckle3d.tracking import track
 
 FIRST_SEED = 1001
 CURVES_FILE = bench.DATA / "curves.h5"

@@ -14,10 +14,10 @@ from sweep_examples import frames_of
 
 from speckle3d.core.errors import Speckle3DError
 from speckle3d.core.sweep import Sweep
-from speckle3d.pipeline import track
 from speckle3d.sheet_curves import data_sheet_curves
 from speckle3d.simulation.presets import SimulationSettings, simulate
 from speckle3d.simulation.receiver import received
+from speckle3d.tracking import track
 
 STRAIN, SLIDING, PULSE_MM, PULSE_HZ, VESSEL_MM = 0.01, 0.05, 0.1, 1.2, 4.0
 """Strain at the end of the sweep; share of the probe's way that tissue goes along; pulse; depth over which it

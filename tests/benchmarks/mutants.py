@@ -102,7 +102,7 @@ def on_return(change):
     return lambda function, *arguments, **keywords: change(function(*arguments, **keywords))
 
 
-TRACK, DIRECTION = "speckle3d.pipeline:track", "speckle3d.motion.sensors:settle_direction"
+TRACK, DIRECTION = "speckle3d.tracking:track", "speckle3d.motion.sensors:settle_direction"
 COHERENCE = "speckle3d.motion.coherence:estimate_coherence"
 MUTANTS = {
     "tissue correction off": Mutant(COHERENCE, without_tissue, "tilt and tissue and not independent"),

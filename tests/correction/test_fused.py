@@ -14,8 +14,8 @@ from speckle3d.core.streams import TimedPoses
 from speckle3d.correction.fused import fuse
 from speckle3d.correction.scale import ScaleEvidence
 from speckle3d.corrections import correct
-from speckle3d.pipeline import track
 from speckle3d.scoring.lengths import compare_modes
+from speckle3d.tracking import track
 
 
 def fuse_images(tracking, sweep, scale_sigma=0.03, **evidence):

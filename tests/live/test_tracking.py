@@ -9,9 +9,9 @@ import speckle3d as s3
 from speckle3d.core.geometry import mirrored
 from speckle3d.live.tracking import LiveTracker
 from speckle3d.matching.quality import FrameFlag
-from speckle3d.pipeline import track
 from speckle3d.sheet_curves import ProbeSheet, data_sheet_curves
 from speckle3d.simulation.receiver import received
+from speckle3d.tracking import track
 
 FRAMES = 24
 SHEET = ProbeSheet(elevation_aperture_mm=5.0, elevation_focus_mm=20.0, band_mhz=(5.0, 10.0))

@@ -19,9 +19,9 @@ from speckle3d.matching.frames import match_sweep
 from speckle3d.matching.matcher import FrameMatcher
 from speckle3d.matching.schedule import PairSchedule
 from speckle3d.motion.tissue import averaging_loss, structure_openness
-from speckle3d.pipeline import track
 from speckle3d.sheet_curves import data_sheet_curves
 from speckle3d.simulation.receiver import received
+from speckle3d.tracking import track
 
 
 def b_mode(sweep):

@@ -8,7 +8,7 @@ from scipy import fft
 from speckle3d.core.threads import cores, on_one_thread
 from speckle3d.io.load import load_sweep
 from speckle3d.matching.intensity import IntensityExtractor
-from speckle3d.pipeline import track
+from speckle3d.tracking import track
 from speed.rows import Row, time_runs
 
 TARGETS = {1: 80.0, 2: 150.0}
