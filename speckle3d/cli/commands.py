@@ -230,7 +230,8 @@ def _check(flag: str, option: inspect.Parameter, value: Any, flags: Mapping[str,
         if rule[1] == "Not with" and partners:
             raise InvalidInputError(f"{flag}: expected no {partners[0]} beside it, got both")
     for item in value if isinstance(value, list | tuple) else [value]:
-        if isinstance(item, float) and not math.isfinite(item):
+        is_allowed = item == math.inf and re.search(r"\binf\b", info.help or "")
+        if isinstance(item, float) and not math.isfinite(item) and not is_allowed:
             raise InvalidInputError(f"{flag}: expected a finite number, got {item}")
         if isinstance(item, Path) and not item.exists() and not info.writable:
             where = f"{flag}: " if isinstance(info, typer.models.OptionInfo) else ""
