@@ -181,7 +181,7 @@ def _against_gyroscope(name: str, turns: FloatArray, change: FloatArray) -> str 
         error = _ERRORS * float(np.sqrt((scatter**2).sum())) / square
         low, high = _HONEST_SHARES
         agrees |= not axis and low < share - error and share + error < high
-        clear = rate * max(share, 1.0) > _LEAST_TURN * _rms(rest)
+        clear = rate * max(share, 1.0) > max(_LEAST_TURN * _rms(rest), _MOVING_RAD_S)
         if clear and (share + error < low or share - error > high):
             doubt = "are rate, axes and signs as they are told"
             if 0.0 < share < 0.05 or share > 20.0:
