@@ -337,12 +337,12 @@ def compare_orientations(
         raise InsufficientDataError(
             f"expected streams that overlap, got {span(first.time_s)} and {span(second.time_s)}"
         )
-    apart = first.world_from_sensor[common] * second.at(first.time_s[common]).inv()
-    w, x, y, z = apart.as_quat(scalar_first=True).T
+    difference = first.world_from_sensor[common] * second.at(first.time_s[common]).inv()
+    w, x, y, z = difference.as_quat(scalar_first=True).T
     turn = np.exp(2j * np.arctan2(z, w))
     offset = turn.mean()
     return Comparison(
-        _rms(apart.magnitude()),
+        _rms(difference.magnitude()),
         _rms(np.angle(turn)),
         _rms(2.0 * np.arctan2(np.hypot(x, y), np.hypot(w, z))),
         float(np.angle(offset)),

@@ -8,10 +8,10 @@ from scipy.ndimage import gaussian_filter
 from speckle3d.core.arrays import Float32Array, FloatArray
 
 _TRENDS_MM = ((0.0, 0.0, 5.0), (4.0, 4.0, 4.0), (4.0, 4.0, 0.7))
-"""Standard deviations along the sweep, across and along the beam of what is subtracted: gain, attenuation and
-shadows, which follow the probe and move the best match away from the truth; the local mean, in whose
-neighbourhood the contrast is made one, too; and layers, which
-parallel to the skin look alike at any turn and place and drown what tells places apart."""
+"""Standard deviations along the sweep, across and along the beam of the means that are subtracted. First
+gain, attenuation and shadows, which follow the probe and move the best match away from the truth; then the
+local mean, over whose neighbourhood the contrast is made one; last layers, which parallel to the skin
+look alike at any turn and place."""
 _LEAST_DB = 0.5
 """Contrast below which there is nothing but noise to divide by, dB."""
 _REACH = 2.5
