@@ -16,9 +16,9 @@ from speckle3d.core.streams import TimedRotations
 from speckle3d.core.sweep import INERTIAL, OrientationSensor
 from speckle3d.io.clarius.imu import MEANING
 from speckle3d.io.clarius.reader import READER, sensor_of
+from speckle3d.io.family.sweep_writer import attach_orientation
 from speckle3d.io.load import load_sweep
 from speckle3d.io.readers import find_reader
-from speckle3d.io.sweep_writer import attach_orientation
 from xsens.logs.clocks import Stamps, timeline
 from xsens.logs.faults import without_faults
 from xsens.logs.samples import ImuLog

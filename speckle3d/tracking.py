@@ -10,7 +10,7 @@ from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.progress import Progress
 from speckle3d.core.sweep import Sweep
-from speckle3d.io.curves import curves_beside, read_curves, trust_words
+from speckle3d.io.family.curves import curves_beside, read_curves, trust_words
 from speckle3d.matching.frames import ImageSink
 from speckle3d.pipeline import PairSink
 from speckle3d.pipeline import track as track_sweep

@@ -18,9 +18,9 @@ from speckle3d.core.streams import TimedPoses, TimedRotations
 from speckle3d.core.sweep import OrientationSensor, Tracker
 from speckle3d.correction.crossing.pair import solve_crossing
 from speckle3d.corrections import correct
-from speckle3d.io.curves import read_curves
+from speckle3d.io.family.curves import read_curves
+from speckle3d.io.family.sweep_writer import write_sweep
 from speckle3d.io.load import load_sweep
-from speckle3d.io.sweep_writer import write_sweep
 from speckle3d.phantom_curves import calibrate_curves
 from speckle3d.scoring.lengths import compare_modes
 from speckle3d.sheet_curves import ProbeSheet, data_sheet_curves

@@ -43,7 +43,7 @@ def data_folder():
 @pytest.fixture(scope="session")
 def back(tmp_path_factory):
     """File of simulated tissue passed forward and back at 10 mm/s, 25 frames/s; nothing may change it."""
-    from speckle3d.io.sweep_writer import write_sweep
+    from speckle3d.io.family.sweep_writer import write_sweep
     from speckle3d.simulation.presets import SimulationSettings, simulate
 
     settings = SimulationSettings(
@@ -60,7 +60,7 @@ def back(tmp_path_factory):
 @pytest.fixture(scope="session")
 def small_sweeps(tmp_path_factory, data_folder):
     """Folder of s5.h5 and s6.h5, simulated tissue of 24 frames, and the curves for them."""
-    from speckle3d.io.sweep_writer import write_sweep
+    from speckle3d.io.family.sweep_writer import write_sweep
     from speckle3d.simulation.presets import SimulationSettings, simulate
 
     def make(folder):
@@ -120,7 +120,7 @@ def sweep(data_folder):
 @pytest.fixture(scope="session")
 def curves(data_folder):
     """The curves that come with the project."""
-    from speckle3d.io.curves import read_curves
+    from speckle3d.io.family.curves import read_curves
 
     return read_curves(data_folder / "curves.h5")
 

@@ -160,10 +160,10 @@ def fill(target, content):
 
 def write_all(folder):
     """Write the set."""
-    from speckle3d.io.calibrations import write_calibration
-    from speckle3d.io.curves import write_curves
-    from speckle3d.io.reconstructions import write_reconstruction
-    from speckle3d.io.sweep_writer import GrowingSweep, write_sweep
+    from speckle3d.io.family.calibrations import write_calibration
+    from speckle3d.io.family.curves import write_curves
+    from speckle3d.io.family.reconstructions import write_reconstruction
+    from speckle3d.io.family.sweep_writer import GrowingSweep, write_sweep
 
     for name, (content, compression) in sweeps().items():
         simulation = {"seed": 3, "medium": {"a": [1, 2]}} if name == "rf_plain" else None

@@ -8,7 +8,7 @@ from wire_scenes import picture, scene
 from speckle3d.core.grid import ImageGrid
 from speckle3d.core.streams import TimedPoses
 from speckle3d.core.sweep import BModeSettings, Sweep, Tracker
-from speckle3d.io.sweep_writer import write_sweep
+from speckle3d.io.family.sweep_writer import write_sweep
 
 MEMBRANE_MM = 6.0
 """How far above the floor a second echo lies, along the columns."""

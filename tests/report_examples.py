@@ -8,7 +8,7 @@ from dataclasses import replace
 
 from speckle3d.config import Config
 from speckle3d.core.errors import Doubt
-from speckle3d.io.curves import read_curves
+from speckle3d.io.family.curves import read_curves
 from speckle3d.io.hdf5 import sha256_of
 from speckle3d.io.load import load_sweep
 from speckle3d.study.job import run_job

@@ -13,8 +13,8 @@ from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.errors import NoSpaceError
 from speckle3d.core.volume import Volume
+from speckle3d.io.family.sweep_writer import attach_orientation, write_sweep
 from speckle3d.io.plus.write import write_sequence
-from speckle3d.io.sweep_writer import attach_orientation, write_sweep
 from speckle3d.io.voxels.volume_writer import write_volume
 from speckle3d.study.results import write_texts
 from xsens.live.recording import RawFile

@@ -8,7 +8,7 @@ from sweep_examples import frames_of
 
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.geometry import mirrored
-from speckle3d.io.curves import read_curves
+from speckle3d.io.family.curves import read_curves
 from speckle3d.io.load import load_sweep
 from speckle3d.matching.quality import FrameFlag
 from speckle3d.motion.sensors import SensorSettings, settle_direction

@@ -13,11 +13,11 @@ import speckle3d as s3
 import xsens
 from speckle3d.app.look import Page
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
+from speckle3d.io.family.reconstructions import FORMAT
 from speckle3d.io.hdf5 import SIGNATURE
 from speckle3d.io.import_settings import MissingSettingsError
 from speckle3d.io.load import kind_of
 from speckle3d.io.readers import find_reader, first_bytes
-from speckle3d.io.reconstructions import FORMAT
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation

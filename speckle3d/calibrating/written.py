@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from calibration.report import text_report
 from speckle3d.core.calibration import Calibration, Source
-from speckle3d.io.calibrations import write_calibration
+from speckle3d.io.family.calibrations import write_calibration
 from speckle3d.io.fileset import FileSet
 from speckle3d.io.hdf5 import atomic_path
 from speckle3d.io.load import recording_sha256

@@ -170,7 +170,7 @@ def mount(sweep: s3.Sweep, paths: Sequence[Path]) -> s3.Sweep:
     import numpy as np
 
     from speckle3d.examine.sensors import rigid
-    from speckle3d.io.calibrations import apply_calibrations
+    from speckle3d.io.family.calibrations import apply_calibrations
 
     for path in paths:
         calibration = s3.load_calibration(path)

@@ -39,7 +39,7 @@ def info(path: Path) -> Result:
     $ speckle3d info sweep.h5
     """
     from speckle3d.io.describe import describe
-    from speckle3d.io.reconstructions import FORMAT
+    from speckle3d.io.family.reconstructions import FORMAT
 
     rows = describe(path)
     if rows[0][1] == FORMAT:
@@ -104,12 +104,12 @@ def convert(
     $ speckle3d convert scan.mha sweep.h5 --calibration tracker.h5
     """
     from speckle3d.calibrating.recordings import require_unsaid
-    from speckle3d.io.calibrations import fitted_pixels, resized
+    from speckle3d.io.family.calibrations import fitted_pixels, resized
+    from speckle3d.io.family.reconstructions import FORMAT
+    from speckle3d.io.family.sweep_writer import COMPRESSIONS
     from speckle3d.io.hdf5 import require_suffix
     from speckle3d.io.load import kind_of, open_recording
     from speckle3d.io.plus.write import SUFFIXES, write_sequence
-    from speckle3d.io.reconstructions import FORMAT
-    from speckle3d.io.sweep_writer import COMPRESSIONS
     from speckle3d.study.posed import USUAL_RANGE_DB, open_posed
     from speckle3d.study.scenes.scene import slicer_sequence
 

@@ -89,7 +89,7 @@ def reconstruct(
     --------
     $ speckle3d reconstruct data/phantom.h5 -o out --drift orientation --drift pose
     """
-    from speckle3d.io.curves import curves_beside, trust_words
+    from speckle3d.io.family.curves import curves_beside, trust_words
     from speckle3d.io.load import open_recording
     from speckle3d.study.posed import open_posed
     from speckle3d.study.scenes.voxels import write_voxels

@@ -13,10 +13,10 @@ from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.files import PathLike
 from speckle3d.core.sweep import BModeSettings, RFSettings, Sweep
 from speckle3d.core.volume import LabelMap
-from speckle3d.io import calibrations, curves, reconstructions
-from speckle3d.io.calibrations import read_calibration
+from speckle3d.io.family import calibrations, curves, reconstructions
+from speckle3d.io.family.calibrations import read_calibration
+from speckle3d.io.family.reconstructions import read_reconstruction
 from speckle3d.io.load import kind_of, open_recording
-from speckle3d.io.reconstructions import read_reconstruction
 from speckle3d.io.recordings import Row, number_row, rate_of
 from speckle3d.io.voxels.volumes import is_volume, read_volume
 

@@ -14,7 +14,7 @@ from speckle3d.core.files import PathLike
 from speckle3d.core.reconstruction import ImportRecord
 from speckle3d.core.sweep import Sweep
 from speckle3d.core.text import written_path
-from speckle3d.io import sweeps
+from speckle3d.io.family import sweeps
 from speckle3d.io.formats import challenge
 from speckle3d.io.formats.challenge import Landmarks
 from speckle3d.io.hdf5 import file_format, reading, sha256_of

@@ -28,7 +28,7 @@ GROUP = "speckle3d.readers"
 START_BYTES = 4096
 
 _MODULES = (
-    "sweeps", "formats.challenge", "formats.uff", "formats.zea", "formats.dicom", "formats.matlab",
+    "family.sweeps", "formats.challenge", "formats.uff", "formats.zea", "formats.dicom", "formats.matlab",
     "images.metaimage", "plus.device_set", "formats.ultrasonix", "clarius.reader", "formats.pictures",
 )  # fmt: skip
 """Modules of this package that have a reader, in the order in which they are asked."""

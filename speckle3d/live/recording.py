@@ -9,8 +9,8 @@ import numpy.typing as npt
 
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.geometry import transforms_from_matrices
+from speckle3d.io.family.sweep_writer import GrowingSweep
 from speckle3d.io.igtl.messages import TransformReceived
-from speckle3d.io.sweep_writer import GrowingSweep
 from speckle3d.live.progress import Progress
 
 RESTARTED_S = 1.0

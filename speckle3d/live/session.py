@@ -28,10 +28,10 @@ from speckle3d.core.errors import InvalidInputError, Speckle3DError
 from speckle3d.core.grid import ImageGrid
 from speckle3d.core.threads import on_one_thread
 from speckle3d.imaging.voxels.volume import CompoundedVolume
+from speckle3d.io.family.sweep_writer import GrowingSweep
 from speckle3d.io.hdf5 import make_folder
 from speckle3d.io.igtl.messages import ImageReceived, Received, TransformReceived
 from speckle3d.io.import_settings import ImportSettings
-from speckle3d.io.sweep_writer import GrowingSweep
 from speckle3d.live.checks import GOOD, NO_OVERLAP, TOO_FAST, Words, words_for
 from speckle3d.live.crossing import CrossingCheck
 from speckle3d.live.frames import ImageLayout

@@ -20,9 +20,9 @@ from speckle3d.core.grid import ImageGrid
 from speckle3d.core.reconstruction import Reconstruction
 from speckle3d.core.streams import TimedPoses
 from speckle3d.io import load
+from speckle3d.io.family.reconstructions import FORMAT, read_reconstruction
 from speckle3d.io.formats.challenge import Landmarks
 from speckle3d.io.load import load_landmarks, load_sweep, recording_sha256
-from speckle3d.io.reconstructions import FORMAT, read_reconstruction
 from speckle3d.io.tum import read_tum
 from speckle3d.scoring.displacements import challenge_score, score_row
 from speckle3d.scoring.modes import default_mode

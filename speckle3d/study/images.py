@@ -15,9 +15,9 @@ from speckle3d.core.grid import ImageGrid, ScanConversion
 from speckle3d.core.reconstruction import Reconstruction
 from speckle3d.core.sweep import BModeSettings, Sweep
 from speckle3d.imaging.voxels.settings import Levels
-from speckle3d.io.calibrations import apply_calibrations
+from speckle3d.io.family.calibrations import apply_calibrations
+from speckle3d.io.family.reconstructions import read_reconstruction
 from speckle3d.io.load import load_sweep, recording_sha256
-from speckle3d.io.reconstructions import read_reconstruction
 from speckle3d.matching.intensity import IntensityExtractor, IntensitySettings
 
 _GLANCES = 24

@@ -29,10 +29,10 @@ from speckle3d.core.progress import Progress
 from speckle3d.core.streams import TimedRotations
 from speckle3d.core.sweep import OrientationSensor, Sweep
 from speckle3d.core.text import text_table
+from speckle3d.io.family.reconstructions import read_reconstruction
+from speckle3d.io.family.sweep_writer import write_sweep
 from speckle3d.io.hdf5 import make_folder
 from speckle3d.io.load import load_sweep
-from speckle3d.io.reconstructions import read_reconstruction
-from speckle3d.io.sweep_writer import write_sweep
 from speckle3d.scoring.lengths import TRACKER, ModeError
 from speckle3d.scoring.references import error_rows, find_reference, tracker_alone
 from speckle3d.scoring.statistics import mean_interval

@@ -5,7 +5,7 @@ from browsers import needs_browser, open_page, viewing
 from phantom_pages import by_command, place, run_and_save, text_match
 from phantom_recordings import MEMBRANE_MM, PIXEL_MM, floor_recording
 
-from speckle3d.io.calibrations import read_calibration
+from speckle3d.io.family.calibrations import read_calibration
 
 pytestmark = needs_browser
 

@@ -9,9 +9,9 @@ from speckle3d.app.reconstruction.page import ReconstructionPage, _Viewer
 from speckle3d.core.grid import ImageGrid
 from speckle3d.core.reconstruction import Provenance, Reconstruction, Trust
 from speckle3d.core.sweep import BModeSettings, Sweep
+from speckle3d.io.family.reconstructions import read_reconstruction, write_reconstruction
+from speckle3d.io.family.sweep_writer import write_sweep
 from speckle3d.io.load import load_sweep, recording_sha256
-from speckle3d.io.reconstructions import read_reconstruction, write_reconstruction
-from speckle3d.io.sweep_writer import write_sweep
 from speckle3d.io.voxels.volumes import read_volume
 
 GRID = ImageGrid(vectors=32, samples=40, vector_pitch_mm=0.5, sample_spacing_mm=0.5)

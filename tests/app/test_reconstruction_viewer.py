@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from browsers import needs_browser, open_page, viewing
 
-from speckle3d.io.curves import read_curves
+from speckle3d.io.family.curves import read_curves
 from speckle3d.io.load import load_sweep
 from speckle3d.study.job import run_job
 

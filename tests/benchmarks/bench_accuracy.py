@@ -20,7 +20,7 @@ from cache import DEFAULT, sweep_file
 
 from speckle3d.config import Config
 from speckle3d.corrections import correct
-from speckle3d.io.curves import read_curves
+from speckle3d.io.family.curves import read_curves
 from speckle3d.io.load import load_sweep
 from speckle3d.motion.sensors import settle_direction
 from speckle3d.phantom_curves import calibrate_curves

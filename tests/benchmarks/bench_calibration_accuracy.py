@@ -21,7 +21,7 @@ from calibration.points import Recording
 from speckle3d.calibrating.phantoms import detect_phantom, solve_phantom
 from speckle3d.calibrating.settings import OrientationSettings, PlaneSettings, WireSettings
 from speckle3d.core.errors import InsufficientDataError
-from speckle3d.io.calibrations import read_calibration
+from speckle3d.io.family.calibrations import read_calibration
 from speckle3d.simulation.presets import SimulationSettings, simulate
 from speckle3d.simulation.sensors import ORIENTATION_FROM_IMAGE, TRACKER_FROM_IMAGE
 from speckle3d.study.images import GreyImages

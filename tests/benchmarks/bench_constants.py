@@ -22,7 +22,7 @@ from speckle3d import pipeline
 from speckle3d.core.errors import Speckle3DError
 from speckle3d.correction.claims import length_sigma
 from speckle3d.corrections import correct
-from speckle3d.io.curves import read_curves
+from speckle3d.io.family.curves import read_curves
 from speckle3d.io.load import load_sweep
 from speckle3d.matching.frames import match_sweep
 

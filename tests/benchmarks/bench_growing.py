@@ -17,8 +17,8 @@ import numpy as np
 import sweep_examples
 
 from speckle3d.core.sweep import stored_dtype
+from speckle3d.io.family.sweep_writer import GrowingSweep
 from speckle3d.io.load import load_sweep, open_recording
-from speckle3d.io.sweep_writer import GrowingSweep
 
 LONGEST_S = 0.6
 KINDS = (

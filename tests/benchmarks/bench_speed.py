@@ -16,7 +16,7 @@ from speed import commands
 from speed.rows import print_table
 
 from speckle3d.core.threads import cores
-from speckle3d.io.curves import write_curves
+from speckle3d.io.family.curves import write_curves
 from speckle3d.simulation.settings import SimulationSettings
 
 SWEEP = SimulationSettings(preset="phantom", seed=2001, length_mm=7.5, frames=60)

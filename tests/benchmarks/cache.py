@@ -10,8 +10,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 import speckle3d
 from speckle3d.core.streams import TimedPoses, TimedRotations
 from speckle3d.core.sweep import OrientationSensor, Tracker
+from speckle3d.io.family.sweep_writer import write_sweep
 from speckle3d.io.load import load_sweep
-from speckle3d.io.sweep_writer import write_sweep
 from speckle3d.simulation.presets import simulate
 
 DEFAULT = Path(__file__).resolve().parents[2] / ".cache" / "sweeps"

@@ -151,9 +151,9 @@ MUTANTS = {
         "claim and fused and not independent",
     ),
     "mounting in metres": Mutant(
-        "speckle3d.io.calibrations:read_calibration",
+        "speckle3d.io.family.calibrations:read_calibration",
         on_return(in_metres),
-        "io/test_calibrations.py",
+        "io/family/test_calibrations.py",
     ),
     "wrong lines weigh as much": Mutant(
         "calibration.robust:absolute_weights", on_return(np.ones_like), "calibration/test_plane.py"

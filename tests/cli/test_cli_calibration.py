@@ -5,9 +5,9 @@ import pytest
 from calibration_files import example_calibration
 from scipy.spatial.transform import Rotation
 
-from speckle3d.io.calibrations import write_calibration
+from speckle3d.io.family.calibrations import write_calibration
+from speckle3d.io.family.reconstructions import read_reconstruction
 from speckle3d.io.load import load_sweep
-from speckle3d.io.reconstructions import read_reconstruction
 from speckle3d.study.images import GreyImages
 
 

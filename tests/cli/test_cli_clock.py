@@ -5,7 +5,7 @@ import pytest
 from calibration_files import example_calibration
 from scipy.spatial.transform import RigidTransform
 
-from speckle3d.io.calibrations import read_calibration, write_calibration
+from speckle3d.io.family.calibrations import read_calibration, write_calibration
 
 IMAGES = ("--by", "images", "--search-s", "0.2")
 

@@ -9,8 +9,8 @@ from crossing_scenes import centre_error_mm, crossing_sweeps, displace
 from speckle3d.core.geometry import roll_yaw_tilt
 from speckle3d.core.grid import ImageGrid
 from speckle3d.core.sweep import BModeSettings, Sweep, Tracker
-from speckle3d.io.calibrations import read_calibration
-from speckle3d.io.sweep_writer import write_sweep
+from speckle3d.io.family.calibrations import read_calibration
+from speckle3d.io.family.sweep_writer import write_sweep
 
 
 def test_two_sweeps_of_a_curved_array(run, tmp_path):

@@ -9,8 +9,8 @@ import pytest
 import sweep_examples
 from scipy.spatial.transform import Rotation
 
+from speckle3d.io.family.sweep_writer import write_sweep
 from speckle3d.io.load import load_sweep
-from speckle3d.io.sweep_writer import write_sweep
 from xsens.logs.samples import ImuLog
 from xsens.logs.textlogs import write_csv
 

@@ -7,7 +7,7 @@ from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.grid import ImageGrid
 from speckle3d.core.reconstruction import Provenance, Reconstruction
-from speckle3d.io.reconstructions import read_reconstruction, write_reconstruction
+from speckle3d.io.family.reconstructions import read_reconstruction, write_reconstruction
 
 
 def test_the_length_of_a_reconstruction_is_that_of_both_ways(run, tmp_path):

@@ -10,7 +10,7 @@ import pytest
 from commands import RF, command, free_port, read_until
 
 import speckle3d as s3
-from speckle3d.io.reconstructions import read_reconstruction
+from speckle3d.io.family.reconstructions import read_reconstruction
 
 
 def start(*arguments):

@@ -8,7 +8,7 @@ import pytest
 from commands import run_command
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from speckle3d.io.calibrations import read_calibration
+from speckle3d.io.family.calibrations import read_calibration
 
 SCAN = ("--preset", "plane", "--vectors", "40", "--frames", "60", "--duration-s", "12", "--seed", "77")
 

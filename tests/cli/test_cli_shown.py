@@ -10,7 +10,7 @@ import h5py
 import pytest
 from calibration_files import example_calibration
 
-from speckle3d.io.calibrations import write_calibration
+from speckle3d.io.family.calibrations import write_calibration
 
 HOSTILE = "a\x1b]0;gone\x07\x1b[31m\n\u202e[red]{0}$x^$<script>"
 SHOWN = "a\\x1b]0;gone\\x07\\x1b[31m\\n\\u202e[red]{0}$x^$<script>"

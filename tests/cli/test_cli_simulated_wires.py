@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from speckle3d.io.calibrations import read_calibration
+from speckle3d.io.family.calibrations import read_calibration
 from speckle3d.simulation.presets import SimulationSettings, simulate
 
 

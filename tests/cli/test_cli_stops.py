@@ -11,7 +11,7 @@ from commands import command
 
 from speckle3d import cli
 from speckle3d.cli.signals import ToldToStopError, stoppable
-from speckle3d.io.reconstructions import read_reconstruction
+from speckle3d.io.family.reconstructions import read_reconstruction
 
 pytestmark = pytest.mark.skipif(os.name == "nt", reason="signals as POSIX has them")
 

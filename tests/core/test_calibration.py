@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from speckle3d.cli.common import mount
 from speckle3d.core.calibration import calibrated
 from speckle3d.core.errors import InvalidInputError, MismatchError
-from speckle3d.io.calibrations import write_calibration
+from speckle3d.io.family.calibrations import write_calibration
 
 
 def test_a_pixel_is_where_the_readings_and_the_calibration_put_it():

@@ -5,9 +5,9 @@ import sweep_examples
 from image_examples import frame_fields, grey, write_mha
 
 from speckle3d.io.describe import describe
+from speckle3d.io.family.sweep_writer import write_sweep
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.load import import_record, load_sweep, open_recording
-from speckle3d.io.sweep_writer import write_sweep
 
 BMODE = ImportSettings(column_pitch_mm=0.1, row_spacing_mm=0.2, dynamic_range_db=60.0)
 

@@ -8,7 +8,7 @@ from sweep_examples import RF
 
 import speckle3d as s3
 from speckle3d.core.grid import ImageGrid
-from speckle3d.io.sweep_writer import GrowingSweep
+from speckle3d.io.family.sweep_writer import GrowingSweep
 from speckle3d.live import recording
 from speckle3d.live.progress import Progress
 from speckle3d.live.recording import Recording

@@ -8,8 +8,8 @@ from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.reconstruction import Provenance, Reconstruction
-from speckle3d.io.reconstructions import write_reconstruction
-from speckle3d.io.sweep_writer import write_sweep
+from speckle3d.io.family.reconstructions import write_reconstruction
+from speckle3d.io.family.sweep_writer import write_sweep
 from speckle3d.io.tum import write_tum
 from speckle3d.scoring.displacements import score_row
 from speckle3d.scoring.trajectories import (

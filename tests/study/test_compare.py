@@ -10,9 +10,9 @@ from dataclasses import replace
 import pytest
 
 from speckle3d.config import Config
+from speckle3d.io.family.reconstructions import read_reconstruction
+from speckle3d.io.family.sweep_writer import write_sweep
 from speckle3d.io.load import load_sweep
-from speckle3d.io.reconstructions import read_reconstruction
-from speckle3d.io.sweep_writer import write_sweep
 from speckle3d.study.compare import compare_sweeps
 
 MODES = ["image", "consistent-subset", "orientation", "pose", "fused", "tracker"]

@@ -9,9 +9,9 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.core.calibration import Calibration, FramesUsed
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.reconstruction import CalibrationFile, Provenance, Reconstruction
-from speckle3d.io.calibrations import write_calibration
+from speckle3d.io.family.calibrations import write_calibration
+from speckle3d.io.family.sweep_writer import write_sweep
 from speckle3d.io.load import recording_sha256
-from speckle3d.io.sweep_writer import write_sweep
 from speckle3d.study.images import sweep_of
 from speckle3d.study.posed import at_modes, open_posed
 

@@ -14,7 +14,7 @@ import numpy as np
 from speckle3d.core.arrays import AnyArray, ComplexArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.text import printable
-from speckle3d.io.carrier import demodulation_of
+from speckle3d.io.formats.carrier import demodulation_of
 from speckle3d.io.frames import FileFrames, HDF5Slices
 from speckle3d.io.hdf5 import has_member, locate, read_array
 from speckle3d.io.import_settings import ImportSettings

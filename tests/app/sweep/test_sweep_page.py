@@ -10,9 +10,9 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.app.sweep.page import SweepPage, _Player
 from speckle3d.core.grid import ImageGrid
 from speckle3d.core.sweep import BModeSettings, Sweep
+from speckle3d.io.family.reconstructions import read_reconstruction
+from speckle3d.io.family.sweep_writer import write_sweep
 from speckle3d.io.load import load_sweep
-from speckle3d.io.reconstructions import read_reconstruction
-from speckle3d.io.sweep_writer import write_sweep
 from speckle3d.study.job import run_job
 from speckle3d.study.results import recorded_doubts
 

@@ -15,7 +15,7 @@ import bench
 import numpy as np
 from cache import ensure_file, sweep_file
 
-from speckle3d.io.curves import write_curves
+from speckle3d.io.family.curves import write_curves
 from speckle3d.io.load import load_sweep
 from speckle3d.phantom_curves import calibrate_curves
 from speckle3d.sheet_curves import ProbeSheet, data_sheet_curves

@@ -7,11 +7,11 @@ import pytest
 import sweep_examples
 from image_examples import grey, write_mha
 
+from speckle3d.io.family.sweep_writer import write_sweep
 from speckle3d.io.images.headers import read_header
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.load import load_sweep, open_recording
 from speckle3d.io.plus.write import write_sequence
-from speckle3d.io.sweep_writer import write_sweep
 
 RF = ImportSettings(
     sampling_rate_hz=40e6,

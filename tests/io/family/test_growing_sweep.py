@@ -9,8 +9,8 @@ import sweep_examples
 
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.sweep import stored_dtype
+from speckle3d.io.family.sweep_writer import GrowingSweep
 from speckle3d.io.load import load_sweep, open_recording
-from speckle3d.io.sweep_writer import GrowingSweep
 
 SWEEPS = {
     "rf": sweep_examples.rf_sweep(),
@@ -41,7 +41,7 @@ WRITER = """
 import sys
 sys.path[:0] = sys.argv[2:]
 import sweep_examples
-from speckle3d.io.sweep_writer import GrowingSweep
+from speckle3d.io.family.sweep_writer import GrowingSweep
 sweep = sweep_examples.rf_sweep()
 with GrowingSweep(sys.argv[1], sweep.grid, sweep.signal, "int16") as target:
     for frame, time_s in zip(sweep.frames, sweep.frame_time_s):

@@ -7,9 +7,9 @@ import sweep_examples
 
 from speckle3d.core.errors import FileError
 from speckle3d.core.grid import ImageGrid
+from speckle3d.io.family.sweep_writer import attach_orientation, write_sweep
 from speckle3d.io.load import load_sweep
 from speckle3d.io.plus.write import write_sequence
-from speckle3d.io.sweep_writer import attach_orientation, write_sweep
 
 
 @pytest.fixture

@@ -23,6 +23,7 @@ from speckle3d.core.geometry import rotations_from_quaternions
 from speckle3d.core.reconstruction import CalibrationFile
 from speckle3d.core.sweep import BModeSettings, Sweep
 from speckle3d.core.text import written_path
+from speckle3d.io.family.records import put, put_fields, read_record, written
 from speckle3d.io.hdf5 import (
     PathLike,
     locate,
@@ -34,7 +35,6 @@ from speckle3d.io.hdf5 import (
     require_group,
     sha256_of,
 )
-from speckle3d.io.records import put, put_fields, read_record, written
 
 FORMAT = "speckle3d.calibration"
 

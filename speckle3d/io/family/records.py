@@ -16,6 +16,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.errors import naming
 from speckle3d.core.files import PathLike
+from speckle3d.io.family.meanings import label
 from speckle3d.io.hdf5 import (
     atomic_path,
     has_member,
@@ -26,7 +27,6 @@ from speckle3d.io.hdf5 import (
     read_vector_attribute,
     require_group,
 )
-from speckle3d.io.meanings import label
 
 _AHEAD_BYTES, _SPARE_BYTES = 16 * 2**20, 2**18
 """Room on the disk that is taken before it is needed, and what HDF5 may need for its own after a write."""

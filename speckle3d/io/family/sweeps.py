@@ -18,6 +18,7 @@ from speckle3d.core.grid import FanLines, ImageGrid
 from speckle3d.core.streams import TimedPoses, TimedRotations
 from speckle3d.core.sweep import INERTIAL, BModeSettings, OrientationSensor, RFSettings, Sweep, Tracker
 from speckle3d.core.text import printable
+from speckle3d.io.family.records import read_record
 from speckle3d.io.frames import FileFrames, HDF5Slices
 from speckle3d.io.hdf5 import (
     Node,
@@ -35,7 +36,6 @@ from speckle3d.io.hdf5 import (
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.readers import Reader
 from speckle3d.io.recordings import Recording
-from speckle3d.io.records import read_record
 
 FORMAT = "speckle3d.sweep"
 VERSIONS = (1, 2, 3)

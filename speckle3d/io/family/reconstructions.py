@@ -22,6 +22,7 @@ from speckle3d.core.reconstruction import (
     SourceFile,
     Trust,
 )
+from speckle3d.io.family.records import put, put_fields, read_record, written
 from speckle3d.io.hdf5 import (
     PathLike,
     locate,
@@ -34,7 +35,6 @@ from speckle3d.io.hdf5 import (
     read_vector_attribute,
     require_group,
 )
-from speckle3d.io.records import put, put_fields, read_record, written
 
 FORMAT = "speckle3d.reconstruction"
 

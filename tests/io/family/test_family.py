@@ -6,10 +6,10 @@ import old_files
 import pytest
 
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.io.calibrations import read_calibration
-from speckle3d.io.curves import read_curves
+from speckle3d.io.family.calibrations import read_calibration
+from speckle3d.io.family.curves import read_curves
+from speckle3d.io.family.reconstructions import read_reconstruction
 from speckle3d.io.load import load_sweep
-from speckle3d.io.reconstructions import read_reconstruction
 
 READ = {
     "rf": load_sweep,

@@ -26,6 +26,17 @@ from speckle3d.core.grid import ImageGrid
 from speckle3d.core.progress import Progress
 from speckle3d.core.sweep import BModeSettings, OrientationSensor, RFSettings, Sweep, Tracker, stored_dtype
 from speckle3d.core.threads import ahead
+from speckle3d.io.family.meanings import label
+from speckle3d.io.family.records import put, put_fields, reserve, trim, written
+from speckle3d.io.family.sweeps import (
+    FORMAT,
+    GROWING,
+    MEMBERS,
+    SAMPLE_TYPES,
+    SENSORS,
+    VERSIONS,
+    require_sample_type,
+)
 from speckle3d.io.frames import FileFrames
 from speckle3d.io.hdf5 import (
     PathLike,
@@ -36,17 +47,6 @@ from speckle3d.io.hdf5 import (
     open_hdf5,
     reading,
     require_target,
-)
-from speckle3d.io.meanings import label
-from speckle3d.io.records import put, put_fields, reserve, trim, written
-from speckle3d.io.sweeps import (
-    FORMAT,
-    GROWING,
-    MEMBERS,
-    SAMPLE_TYPES,
-    SENSORS,
-    VERSIONS,
-    require_sample_type,
 )
 
 Compression = Literal["gzip", "lzf"] | None

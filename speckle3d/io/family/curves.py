@@ -9,9 +9,9 @@ import numpy as np
 from speckle3d.core.curves import CurveKey, DecorrelationCurves
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import RFSettings
+from speckle3d.io.family.records import put, put_fields, read_record, written
+from speckle3d.io.family.sweeps import read_signal
 from speckle3d.io.hdf5 import PathLike, open_family, read_text
-from speckle3d.io.records import put, put_fields, read_record, written
-from speckle3d.io.sweeps import read_signal
 
 FORMAT = "speckle3d.curves"
 

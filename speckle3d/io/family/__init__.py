@@ -1,0 +1,1 @@
+"""Own HDF5 files: sweeps, reconstructions, calibrations and curves."""
