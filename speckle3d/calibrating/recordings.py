@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 
 from calibration.points import Recording
@@ -9,9 +10,9 @@ from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.streams import TimedPoses, TimedRotations
 from speckle3d.core.sweep import BModeSettings, Sweep
 from speckle3d.imaging.voxels.settings import Levels
-from speckle3d.io.images.metaimage import lacking_poses, read_poses
-from speckle3d.io.import_settings import ImportSettings, MissingSettingsError, settings_for
+from speckle3d.io.import_settings import ImportSettings, MissingSettingsError
 from speckle3d.io.load import IMAGE, SIZED, kind_of, load_sweep
+from speckle3d.io.load import open_recording as open_sweep
 from speckle3d.study.images import GreyImages
 
 DYNAMIC_RANGE_DB = 60.0
@@ -86,7 +87,7 @@ def require_unsaid(path: Path, options: ImportSettings) -> None:
 def _readings(sweep: Sweep, path: Path, sensor: str) -> tuple[TimedPoses | TimedRotations, float]:
     stream = sweep.orientation if sensor == "orientation" else sweep.tracker
     if stream is None:
-        content = lacking_poses(path) if kind_of(path) == IMAGE else "none"
+        content = "none (of a file of PLUS, --transform names others)"
         if sweep.tracker is not None:
             content = "a tracker (--sensor tracker uses its orientation)"
         raise InsufficientDataError(
@@ -98,7 +99,12 @@ def _readings(sweep: Sweep, path: Path, sensor: str) -> tuple[TimedPoses | Timed
 def _readings_of(path: Path, sensor: str, transform: str | None) -> tuple[TimedPoses | TimedRotations, float]:
     if kind_of(path) != IMAGE:
         return _readings(load_sweep(path), path, sensor)
-    tracker = read_poses(path, settings_for(path, ImportSettings(tracker_transform=transform)))
+    recording = open_sweep(path, ImportSettings(tracker_transform=transform))
+    if (tracker := recording.tracker) is None:
+        reason = "; ".join(recording.remarks) or recording.fault or "none"
+        raise InvalidInputError(f"{path}: expected poses, as ProbeToTrackerTransform: {reason}")
+    for remark in recording.remarks:
+        warnings.warn(f"{path}: {remark}", stacklevel=2)
     readings: TimedPoses | TimedRotations = tracker.readings
     if sensor == "orientation":
         readings = TimedRotations(readings.time_s, tracker.readings.world_from_sensor.rotation)

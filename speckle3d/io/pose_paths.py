@@ -86,10 +86,8 @@ def usable(noun: str, time_s: FloatArray, faults: Sequence[str] | None = None) -
     return rows, _loss(noun, time_s.size, Counter(filter(None, reasons)), time_s[rows])
 
 
-def timed_poses(
-    time_s: FloatArray, matrices: FloatArray, faults: Sequence[str] | None = None
-) -> tuple[TimedPoses | None, list[str]]:
-    """Usable poses among matrices, shape (n, 4, 4), in mm, or None, and a line of the others.
+def timed_poses(time_s: FloatArray, matrices: FloatArray) -> tuple[TimedPoses | None, list[str]]:
+    """Usable poses among matrices, shape (n, 4, 4), in mm, NaN where there is none; and a line of the others.
 
     Rotations that are rounded are made exact.
     """
@@ -98,10 +96,11 @@ def timed_poses(
     exact[is_near, :3, 3] = matrices[is_near, :3, 3]
     exact[is_near, :3, :3] = nearest_rotation(matrices[is_near, :3, :3])
     is_rigid = (np.abs(exact - matrices) < ROUNDING_TOLERANCE).all(axis=(1, 2))
-    deviations = np.where(is_near, "whose pose is not rigid", "whose pose is not within 100 m")
-    reasons = np.array(faults or [""] * len(matrices), dtype=object)
-    reasons = np.where((reasons == "") & ~is_rigid, deviations, reasons)
-    rows, notes = usable("poses", time_s, reasons.tolist())
+    faults = np.where(
+        is_near, np.where(is_rigid, "", "whose pose is not rigid"), "whose pose is not within 100 m"
+    )
+    faults[np.isnan(matrices).any(axis=(1, 2))] = "without a valid pose"
+    rows, notes = usable("poses", time_s, faults.tolist())
     if not rows.size:
         return None, notes
     return TimedPoses(time_s[rows], RigidTransform.from_matrix(exact[rows])), notes

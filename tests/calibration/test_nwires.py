@@ -4,7 +4,7 @@ from wire_scenes import PIXEL_MM, candidates, plus_results, scene
 
 from calibration.nwires import label_by_wires, nwire_errors_mm, trimmed_mean_mm
 from calibration.points import Detections
-from speckle3d.io.images.metaimage import read_poses
+from speckle3d.io.load import open_recording
 from speckle3d.io.plus.wires import read_wire_phantom
 
 PLUS_ERRORS_MM = {"Calibration": (0.479116, 0.22656), "Validation": (0.539932, 0.223536)}
@@ -26,7 +26,9 @@ def test_frames_that_lack_wires_are_labelled_by_what_the_others_say():
 def test_published_errors_are_reproduced_for_every_frame(realdata, kind):
     folder = realdata / "plus"
     phantom = read_wire_phantom(folder / "PlusDeviceSet_fCal_Sim_SpatialCalibration_2.0.xml").phantom
-    poses = read_poses(folder / f"fCal_Test_{kind}_3NWires_fCal2.0.igs.mha").readings.world_from_sensor
+    poses = open_recording(
+        folder / f"fCal_Test_{kind}_3NWires_fCal2.0.igs.mha"
+    ).tracker.readings.world_from_sensor
     frames, pixels, errors, matrix = plus_results(folder, kind)
     labels = Detections(np.repeat(frames, 9), pixels.reshape(-1, 2), np.tile(np.arange(9), len(frames)))
     points = labels.points(poses[labels.frame])

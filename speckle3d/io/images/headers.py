@@ -14,14 +14,13 @@ from __future__ import annotations
 import bz2
 import math
 import re
-import zlib
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import takewhile
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, TypeVar
 
 import nrrd
 import numpy as np
@@ -32,14 +31,12 @@ from speckle3d.core.files import PathLike, open_regular
 from speckle3d.io.hdf5 import reading
 from speckle3d.io.text import numbers
 
-DEFLATE: Any = zlib
 try:
     from isal import isal_zlib
-
-    DEFLATE = isal_zlib
 except ImportError:
-    pass
+    import zlib as isal_zlib  # type: ignore[no-redef]
 
+DEFLATE = isal_zlib
 ZLIB, GZIP, _EITHER = 15, 31, 47
 """Windows of deflate, and by them what is around it; either is told when unpacking."""
 
@@ -72,13 +69,15 @@ _SYNONYMS = {
 _START = re.compile(rb"(?:\xef\xbb\xbf)?(?:NRRD000|(?:ObjectType|NDims|Comment|ObjectSubType)\s*=)")
 _FRAME_FIELD = re.compile(r"Seq_Frame0*(\d{1,7})_(\w+)")
 _MM_PER = {
-    "": 1.0, "?": 1.0, "none": 1.0, "unknown": 1.0, "mm": 1.0, "millimeter": 1.0, "cm": 10.0,
-    "centimeter": 10.0, "m": 1e3, "meter": 1e3, "um": 1e-3, "µm": 1e-3, "micrometer": 1e-3, "micron": 1e-3,
-}  # fmt: skip
-_S_PER = {"s": 1.0, "sec": 1.0, "second": 1.0, "ms": 1e-3, "msec": 1e-3, "us": 1e-6}
-"""Units by their names, which may have an s at their end."""
-_ENCODINGS = {"ra": "raw", "gz": "deflate", "bz": "bzip2", "tx": "text", "te": "text", "as": "text"}
-"""By how NRRD's words for them begin, as bzip2 or bz2."""
+    1.0: "mm millimeter none unknown ?",
+    10.0: "cm centimeter",
+    1e3: "m meter",
+    1e-3: "um µm micrometer micron",
+}
+_S_PER = {1.0: "s sec second", 1e-3: "ms msec", 1e-6: "us"}
+"""Names of units, which may have an s at their end."""
+_ENCODINGS = {"raw": "raw", "deflate": "gz gzip", "bzip2": "bz2 bzip2", "text": "text txt ascii"}
+_Key = TypeVar("_Key")
 _SPACE, _TIME = ("domain", "space", "", "???", "none", "?"), ("list", "time")
 """Kinds of axes."""
 
@@ -95,14 +94,12 @@ class SequenceHeader:
         Texts of the whole file.
     frames : dict of int to dict
         Fields of frames by their number, without the ``Seq_FrameNNNN_`` before their names.
-    size : tuple of int
-        Lengths of the image's axes, fastest first, and the number of frames if there is an axis for them.
-    spacing_mm : tuple of float, or None
-        Of the first two axes; None where the header holds the pixel unit 1 that stands for "unknown".
     file_size : tuple of int
         Lengths of all axes in the file, fastest first.
-    frame_axis : int, optional
-        Of `file_size`.
+    order : tuple of int
+        Axes of the file that are the image's, fastest first, and that of the frames if there is one.
+    spacing_mm : tuple of float, or None
+        Of the first two axes; None where the header holds the pixel unit 1 that stands for "unknown".
     is_volume : bool
         Whether all three axes are of space, as they say and frames' fields do not contradict.
     channels : int
@@ -117,7 +114,7 @@ class SequenceHeader:
     dtype : dtype
         Of the numbers in the file.
     data : path
-        Of the file that holds the pixels: the header's own, or one in its folder.
+        Of the file that holds the pixels.
     start : int
         First byte of the pixels; -1 where they are last.
     encoding : str
@@ -128,10 +125,9 @@ class SequenceHeader:
     container: str
     fields: dict[str, str]
     frames: dict[int, dict[str, str]]
-    size: tuple[int, ...]
-    spacing_mm: tuple[float, ...] | None
     file_size: tuple[int, ...]
-    frame_axis: int | None
+    order: tuple[int, ...]
+    spacing_mm: tuple[float, ...] | None
     is_volume: bool
     channels: int
     axis_times_s: FloatArray | None
@@ -141,6 +137,11 @@ class SequenceHeader:
     data: Path
     start: int
     encoding: str
+
+    @property
+    def size(self) -> tuple[int, ...]:
+        """Lengths of the image's axes, fastest first, and the number of frames if they have an axis."""
+        return tuple(self.file_size[i] for i in self.order)
 
     @property
     def has_images(self) -> bool:
@@ -167,16 +168,15 @@ class SequenceHeader:
         return values
 
     def images(self) -> AnyArray:
-        """Map or unpack all images, shape (frame, y, x).
+        """Map or unpack all images of one channel, shape (frame, y, x).
 
         Raises
         ------
         FileError
             If pixels are damaged or missing.
         """
-        values = self.numbers().reshape(self.file_size[::-1])
-        if self.frame_axis is not None:
-            values = np.moveaxis(values, len(self.file_size) - 1 - self.frame_axis, 0)
+        others = {*range(len(self.file_size))} - {*self.order}
+        values = self.numbers().reshape(self.file_size, order="F").transpose(*others, *self.order[::-1])
         return values.reshape(self.frame_count, self.size[1], self.size[0])
 
     def numbers(self) -> AnyArray:
@@ -233,7 +233,7 @@ def read_header(path: PathLike) -> SequenceHeader:
     FileError
         If the file cannot be read.
     InvalidInputError
-        If it is neither, the header does not make sense, or its pixels lie outside its folder.
+        If it is neither, or the header does not make sense.
     """
     data = Path(path)
     with reading(path), open_regular(path) as stream, naming(str(path)):
@@ -247,9 +247,9 @@ def read_header(path: PathLike) -> SequenceHeader:
         if len(kinds) != len(sizes):
             kinds = [""] * len(sizes)
         sides = [i for i, kind in enumerate(kinds) if kind in _SPACE]
-        frame_axis = next((i for i, kind in enumerate(kinds) if kind in _TIME), None)
-        if frame_axis is None and len(sides) > 2:
-            frame_axis = sides.pop()
+        frame_axes = [i for i, kind in enumerate(kinds) if kind in _TIME][:1]
+        if not frame_axes and len(sides) > 2:
+            frame_axes = [sides.pop()]
         if len(sides) == 3:  # images of 3D Slicer are a pixel thick
             thin = [i for i in sides if sizes[i] == 1][-1:]
             sides = [i for i in sides if i not in thin]
@@ -258,8 +258,7 @@ def read_header(path: PathLike) -> SequenceHeader:
                 "sizes: expected images on two axes and at most one of frames, not volumes in a row or "
                 f"segments in layers, got lengths {' '.join(map(str, sizes))} of kinds {' '.join(kinds)}"
             )
-        size = tuple(sizes[i] for i in (*sides, frame_axis) if i is not None)
-        others = {*range(len(sizes))} - {*sides, frame_axis}
+        order = *sides, *frame_axes
         axes, origin = _placement(words, len(sizes))
         spacing = None if axes is None else (*np.linalg.norm(axes, axis=1)[sides].tolist(),)
         if spacing is not None and (not all(0 < step < math.inf for step in spacing) or spacing == (1, 1)):
@@ -271,38 +270,38 @@ def read_header(path: PathLike) -> SequenceHeader:
                 frames[int(match[1])][match[2]] = value
             elif isinstance(value, str):
                 fields[name] = value
-        if 0 not in frames and (*size, 1)[2] in frames:  # of a writer that counts from 1
+        if 0 not in frames and sizes[order[-1]] in frames:  # of a writer that counts from 1
             frames = {number - 1: frame for number, frame in frames.items()}
-        if (encoding := _ENCODINGS.get(words["encoding"].lower()[:2])) is None:
+        others = (sizes[i] for i in range(len(sizes)) if i not in order)
+        channels = math.prod(others) * words.get("channels", 1)
+        is_volume = len(sizes) == 3 and {*kinds} <= {"domain", "space"} and len(frames) < sizes[order[2]]
+        if (encoding := _key(_ENCODINGS, words["encoding"].lower())) is None:
             raise InvalidInputError(f"encoding: expected raw, gzip, bzip2 or text, got {words['encoding']!r}")
         start, skip = stream.tell(), words.get("byte skip", 0)
         if file := words.get("data file"):
-            data, start = _data_file(data, file), 0
+            data, start = data.parent / file, 0
         if lines := words.get("line skip", 0):
             with open_regular(data) as pixels:
                 pixels.seek(start)
                 start += sum(len(pixels.readline()) for _ in range(lines))
         return SequenceHeader(
-            path=str(path),
-            container="NrrdImage" if is_nrrd else "MetaImage",
-            fields=fields,
-            frames=frames,
-            size=size,
-            spacing_mm=spacing,
-            file_size=sizes,
-            frame_axis=frame_axis,
-            is_volume=len(sizes) == 3 and {*kinds} <= {"domain", "space"} and len(frames) < size[2],
-            channels=math.prod(sizes[i] for i in others if i is not None) * words.get("channels", 1),
-            axis_times_s=None if frame_axis is None else _axis_times(words, frame_axis, sizes[frame_axis]),
-            axes_mm=axes,
-            origin_mm=origin,
+            str(path),
+            "NrrdImage" if is_nrrd else "MetaImage",
+            fields,
+            frames,
+            sizes,
+            order,
+            spacing,
+            is_volume,
+            channels,
+            _axis_times(words, frame_axes[0], sizes) if frame_axes else None,
+            axes,
+            origin,
             # A tracker's recording may name no type.
-            dtype=_number_type(
-                "uchar" if 0 in sizes else words["type"], words.get("endian", "").lower() == "big"
-            ),
-            data=data,
-            start=-1 if skip < 0 else start + skip,
-            encoding=encoding,
+            _number_type("uchar" if 0 in sizes else words["type"], words.get("endian", "").lower() == "big"),
+            data,
+            -1 if skip < 0 else start + skip,
+            encoding,
         )
 
 
@@ -327,12 +326,12 @@ def _meta_words(stream: BinaryIO) -> dict[str, Any]:
         fields[_SYNONYMS.get(name, name)] = value
         if name == "ElementDataFile":
             break
-    texts = defaultdict(str, fields)
+    texts = defaultdict(str, {"BinaryData": "True"} | fields)
 
     def is_set(name: str) -> bool:
         return texts[name][:1] in ("T", "t", "1")
 
-    file, is_text = texts["ElementDataFile"], "BinaryData" in fields and not is_set("BinaryData")
+    file, is_text = texts["ElementDataFile"], not is_set("BinaryData")
     # Of a file that holds its pixels itself, a size is that of the header.
     is_local, skip = file.upper() == "LOCAL", int(texts["HeaderSize"] or 0)
     words: dict[str, Any] = {
@@ -359,11 +358,10 @@ def _meta_words(stream: BinaryIO) -> dict[str, Any]:
 def _number_type(word: str, is_big: bool) -> np.dtype[Any]:
     """Type of numbers by a word of either format, as ``MET_UCHAR`` or ``unsigned char``."""
     plain = word.lower().removeprefix("met_").removesuffix("_t").replace("unsigned ", "u")
-    plain = plain.replace("signed ", "").removesuffix(" int").replace(" ", "")
-    for kind, words in NUMBER_TYPES.items():
-        if plain in words.split():
-            return np.dtype((">" if is_big else "<") + kind)
-    raise InvalidInputError(f"type: expected a type of numbers as uint8 or MET_UCHAR, got {word!r}")
+    kind = _key(NUMBER_TYPES, plain.replace("signed ", "").removesuffix(" int").replace(" ", ""))
+    if kind is None:
+        raise InvalidInputError(f"type: expected a type of numbers as uint8 or MET_UCHAR, got {word!r}")
+    return np.dtype((">" if is_big else "<") + kind)
 
 
 def mm_per(unit: str) -> float:
@@ -374,14 +372,19 @@ def mm_per(unit: str) -> float:
     InvalidInputError
         If the unit is not known.
     """
-    if (factor := _factor(_MM_PER, unit)) is None:
+    if (factor := _factor(_MM_PER, unit or "?")) is None:
         raise InvalidInputError(f"expected a unit as mm, cm, m or um, got {unit}")
     return factor
 
 
-def _factor(units: Mapping[str, float], unit: str) -> float | None:
+def _factor(units: Mapping[float, str], unit: str) -> float | None:
     """Factor of a unit by its name, long ones with or without a plural's s; None if it is not among them."""
-    return units.get(unit.lower() if len(unit) < 4 else unit.lower().removesuffix("s"))
+    return _key(units, unit.lower() if len(unit) < 4 else unit.lower().removesuffix("s"))
+
+
+def _key(table: Mapping[_Key, str], word: str) -> _Key | None:
+    """Key whose text has the word; None if none has it."""
+    return next((key for key, words in table.items() if word in words.split()), None)
 
 
 def _placement(words: Mapping[str, Any], count: int) -> tuple[FloatArray | None, FloatArray | None]:
@@ -399,24 +402,16 @@ def _placement(words: Mapping[str, Any], count: int) -> tuple[FloatArray | None,
     return axes, None if origin is None else origin * scale[: len(origin)]
 
 
-def _axis_times(words: Mapping[str, Any], axis: int, count: int) -> FloatArray | None:
+def _axis_times(words: Mapping[str, Any], axis: int, sizes: Sequence[int]) -> FloatArray | None:
     """Times of frames by the index of their axis, as 3D Slicer writes it, or by the step between them."""
     unit_s = _factor(_S_PER, "".join(words.get("units", ())[axis : axis + 1]))
     index, steps = words.get(f"axis {axis} index values", "").split(), words.get("spacings")
     if index and words.get(f"axis {axis} index type", "numeric") == "numeric":
-        times = np.array(index, dtype=float) * (unit_s or 1.0)
-        return np.append(times, np.full(count, np.nan))[:count]
+        times = np.full(max(sizes[axis], len(index)), np.nan)
+        times[: len(index)] = index
+        return times[: sizes[axis]] * (unit_s or 1.0)
     step_s = 0.0 if steps is None else (unit_s or 0.0) * float(steps[axis])
-    return np.asarray(step_s * np.arange(count)) if step_s > 0 else None
-
-
-def _data_file(path: Path, name: str) -> Path:
-    """Path of a data file, which lies in the header's folder: a stranger's header names no other."""
-    folder = path.parent.resolve()
-    data = (folder / name).resolve()
-    if not data.is_relative_to(folder):
-        raise InvalidInputError(f"expected pixels in one file in the header's own folder, got {name!r}")
-    return data
+    return np.asarray(step_s * np.arange(sizes[axis])) if step_s > 0 else None
 
 
 def _lines(stream: BinaryIO) -> Iterator[str]:

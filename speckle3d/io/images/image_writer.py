@@ -5,7 +5,6 @@ pynrrd refuses letters beyond ASCII (names of segments), and has no fields of fr
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -40,7 +39,7 @@ def write_image(
         further, and takes several times as long.
     """
     is_nrrd, words = path.suffix == ".nrrd", NUMBER_TYPES[dtype.str[1:]].split()
-    pack = DEFLATE.compressobj(1, zlib.DEFLATED, GZIP if is_nrrd else ZLIB) if is_packed else None
+    pack = DEFLATE.compressobj(1, DEFLATE.DEFLATED, GZIP if is_nrrd else ZLIB) if is_packed else None
     sizes = " ".join(map(str, shape))
 
     def header(packed_bytes: int) -> bytes:

@@ -25,7 +25,7 @@ from speckle3d.core.files import PathLike, open_regular
 from speckle3d.core.grid import ImageGrid
 from speckle3d.io.hdf5 import reading
 from speckle3d.io.import_settings import ImportSettings
-from speckle3d.io.plus.transforms import Names, chain_between, pixel_axes
+from speckle3d.io.plus.transforms import IMAGE, PROBE, chain_between, pixel_axes
 from speckle3d.io.readers import Reader
 from speckle3d.io.recordings import Facts
 from speckle3d.io.text import numbers
@@ -89,15 +89,15 @@ class DeviceSet:
         values = {element.attrib[name] for element in self.root.iter() if name in element.attrib}
         return values.pop() if len(values) == 1 else default
 
-    @cached_property
-    def names(self) -> Names:
-        """Names of the coordinate frames."""
-        usual = Names()
-        return Names(
-            self.text("ImageCoordinateFrame", usual.image),
-            self.text("ProbeCoordinateFrame", usual.probe),
-            self.text("ToolReferenceFrame", usual.tracker),
-        )
+    @property
+    def image(self) -> str:
+        """Name of the image's frame."""
+        return self.text("ImageCoordinateFrame", IMAGE)
+
+    @property
+    def probe(self) -> str:
+        """Name of the probe's frame."""
+        return self.text("ProbeCoordinateFrame", PROBE)
 
     @cached_property
     def transforms(self) -> dict[tuple[str, str], FloatArray]:
@@ -160,9 +160,9 @@ class DeviceSet:
 
     def pixel_mm(self, size: tuple[float, ...] | None = None) -> tuple[float, ...] | None:
         """Distances of columns and rows of the image, by default the machine's, mm; None if unknown."""
-        for end in (self.names.probe, self.text("TransducerOriginCoordinateFrame", "TransducerOrigin")):
-            if (matrix := self.transform(self.names.image, end)) is not None:
-                return pixel_axes(matrix, f"{self.path}: {self.names.image} to {end}")
+        for end in (self.probe, self.text("TransducerOriginCoordinateFrame", "TransducerOrigin")):
+            if (matrix := self.transform(self.image, end)) is not None:
+                return pixel_axes(matrix, f"{self.path}: {self.image} to {end}")
         machine_size = self.numbers("ScanConversion", 2, "OutputImageSizePixel")
         is_of_size = machine_size is None or size is None or size[:2] == machine_size
         return self.numbers("ScanConversion", 2, "OutputImageSpacingMmPerPixel") if is_of_size else None

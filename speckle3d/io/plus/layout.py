@@ -15,7 +15,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from speckle3d.core.arrays import AnyArray
-from speckle3d.core.errors import InvalidInputError
 from speckle3d.io.images.headers import SequenceHeader
 
 RF_TYPES = ("RF_REAL", "RF_IQ_LINE", "RF_I_LINE_Q_LINE")
@@ -67,25 +66,16 @@ class Layout:
         """Whether depth grows, or shrinks, along the first axis."""
         return self.orientation.startswith(("F", "N"))
 
-    def require_lines(self, header: SequenceHeader) -> None:
-        """Refuse images that are no ultrasound lines.
-
-        Raises
-        ------
-        InvalidInputError
-        """
-        path, dtype = header.path, header.dtype.newbyteorder("=")
-        content = "colour" if header.channels > 1 else self.kind
+    def fault(self, header: SequenceHeader) -> str:
+        """Why images are no ultrasound lines; empty where they are."""
+        content, dtype = "colour" if header.channels > 1 else self.kind, header.dtype.newbyteorder("=")
         if content not in (*RF_TYPES, "BRIGHTNESS"):
-            raise InvalidInputError(
-                f"{path}: expected grey B-mode or RF images, got {content}: export them as grey"
-            )
+            return f"expected grey B-mode or RF images, got {content}: export them as grey"
         if self.kind == "BRIGHTNESS" and dtype != np.uint8:
-            raise InvalidInputError(f"{path}: expected B-mode of type uint8, got {dtype}")
+            return f"expected B-mode of type uint8, got {dtype}"
         if {*self.orientation[:2]} not in _SIDES or self.orientation[2:] not in ("", "A", "D"):
-            raise InvalidInputError(
-                f"{path}: UltrasoundImageOrientation: expected as MF, FM or MFA, got {self.orientation}"
-            )
+            return f"UltrasoundImageOrientation: expected as MF, FM or MFA, got {self.orientation}"
+        return ""
 
     def frame(self, pixels: AnyArray) -> AnyArray:
         """Turn pixels, shape (y, x), into samples, shape (vector, sample): marked and far sides last."""

@@ -13,7 +13,7 @@ from typing import TypeAlias
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from speckle3d.core.arrays import BoolArray, FloatArray
+from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.geometry import nearest_rotation
 from speckle3d.core.grid import ImageGrid
@@ -34,7 +34,8 @@ IMAGE = "Image"
 ORIENTATION = "OrientationSensor"
 """Name of the frame of an orientation sensor, which PLUS's devices do not use: its transform to World is a
 rotation alone."""
-_REFERENCE = "Reference"
+PROBE, _REFERENCE = "Probe", "Reference"
+_WORLDS = ("Tracker", _REFERENCE)
 
 
 @dataclass(frozen=True)
@@ -48,9 +49,7 @@ class Poses:
     chain : tuple of str
         Transforms from the tool to the world, in the order in which they are applied.
     matrices : ndarray, shape (n, 4, 4)
-        Rigid to rounding; the identity where there is no valid one.
-    faults : list of str
-        Why there is none; empty where there is.
+        Rigid to rounding; NaN where there is no valid one.
     pixels : ndarray, shape (4, 4), optional
         Where the tool is the image itself, whose transforms take pixels to mm: pixels to mm in the image.
     """
@@ -58,21 +57,15 @@ class Poses:
     tool: str
     chain: tuple[str, ...]
     matrices: FloatArray
-    faults: list[str]
     pixels: FloatArray | None = None
 
 
-@dataclass(frozen=True)
-class Names:
-    """Names of coordinate frames, by default PLUS's own."""
-
-    image: str = IMAGE
-    probe: str = "Probe"
-    tracker: str = "Tracker"
-
-
 def tracked_poses(
-    header: SequenceHeader, tool_pose: str | None, reference: str | None, names: Names
+    header: SequenceHeader,
+    tool_pose: str | None,
+    reference: str | None,
+    image: str = IMAGE,
+    fixed: Sequence[Pair] = (),
 ) -> Poses | None:
     """Read the poses of a tool, seen from the reference if there is one.
 
@@ -84,6 +77,10 @@ def tracked_poses(
         Names of transforms, or ``"none"``; by default the probe's, in the tracker or in the only frame that
         it is tracked in, else that of what the image is on, else the image's; and that of ``Reference`` where
         a chain leads there.
+    image : str
+        Name of the image's frame.
+    fixed : sequence of pair
+        Transforms of a device set, which may say what the image is on.
 
     Returns
     -------
@@ -96,12 +93,13 @@ def tracked_poses(
         If a transform that was asked for is not there.
     """
     transforms = names_of(header)
-    name = _usual_pose(transforms, names) if tool_pose is None else tool_pose.removesuffix("Transform")
+    pairs = [ends(name) for name in transforms]
+    name = _usual_pose(pairs, fixed, image) if tool_pose is None else tool_pose.removesuffix("Transform")
     if name is None or name == "none":
         return None
     tool, world = ends(name)
     # A tool's poses do not lead by way of the image, whose transforms take pixels to mm.
-    pairs = [pair for pair in map(ends, transforms) if tool == names.image or names.image not in pair]
+    pairs = [pair for pair in pairs if tool == image or image not in pair]
     chain, target = chain_between(pairs, tool, world), _REFERENCE if reference is None else ends(reference)[0]
     if chain and target not in (tool, "none"):
         chain = chain_between(pairs, tool, target) or (chain if reference is None else None)
@@ -109,23 +107,20 @@ def tracked_poses(
         wanted = " and ".join(filter(None, (name, reference)))
         listing = ", ".join(transforms) or "none"
         raise InvalidInputError(f"{header.path}: expected a chain of transforms for {wanted}, got {listing}")
-    matrices, is_valid = np.eye(4), np.ones(header.frame_count, dtype=bool)
+    matrices, pixels = np.eye(4), None
     for pair in chain:
-        step, is_step_valid = _column(header, *pair)
-        matrices, is_valid = step @ matrices, is_valid & is_step_valid
-    pixels = None
-    if tool == names.image and is_valid.any():
-        where = f"{header.path}: {name}Transform"
-        widths = np.linalg.norm(matrices[:, :3, 0], axis=1)[is_valid]
-        usual = matrices[is_valid][np.argsort(widths)[widths.size // 2]]
+        matrices = _column(header, *pair) @ matrices
+    widths = np.linalg.norm(matrices[:, :3, 0], axis=1)
+    count = np.count_nonzero(np.isfinite(widths))
+    if tool == image and count:
+        where, usual = f"{header.path}: {name}Transform", matrices[np.argsort(widths)[count // 2]]
         _, skew_rad = sensor_from_image(usual, 0.0, where)  # refuses what is no calibration
         pixels = pixel_matrix(ImageGrid(1, 1, *pixel_axes(usual, where), skew_rad=skew_rad))
         for pose in (matrices, pixels):  # a third column may be anything
             pose[..., :3, 2] = np.cross(pose[..., :3, 0], pose[..., :3, 1])
         # Where a frame's pixels are others, its pose is not rigid.
         matrices = matrices @ np.linalg.inv(pixels)
-    faults = np.where(is_valid, "", "without a valid pose").tolist()
-    return Poses(tool, tuple(map(_joined, chain)), matrices, faults, pixels)
+    return Poses(tool, tuple(map(_joined, chain)), matrices, pixels)
 
 
 def chain_between(pairs: Iterable[Pair], start: str, end: str) -> list[Pair] | None:
@@ -151,8 +146,8 @@ def fixed_transform(header: SequenceHeader, name: str) -> FloatArray | None:
     key = f"{name}Transform"
     if key in header.fields:
         return np.reshape(numbers(header.fields[key], 16, f"{header.path}: {key}"), (4, 4))
-    matrices, is_valid = _column(header, *ends(name))
-    matrices = matrices[is_valid]
+    matrices = _column(header, *ends(name))
+    matrices = matrices[np.isfinite(matrices[:, 0, 0])]
     if not np.allclose(matrices, matrices[:1], _FIXED_TOLERANCE, _FIXED_TOLERANCE):
         raise InvalidInputError(f"{header.path}: {key}: expected one for all frames, got others")
     return next(iter(matrices), None)
@@ -229,29 +224,30 @@ def _joined(pair: tuple[str, str]) -> str:
     return "To".join(filter(None, pair))
 
 
-def _usual_pose(transforms: Sequence[str], names: Names) -> str | None:
+def _usual_pose(pairs: Sequence[Pair], fixed: Sequence[Pair], image: str) -> str | None:
     """Choose the pose of the probe, of what the image is on, or of the image, in the usual or only world."""
 
-    def partners(tool: str) -> set[str]:
-        frames = {b if a == tool else a for a, b in map(ends, transforms) if tool in (a, b)}
-        return frames - {names.probe, names.image, "TransducerOrigin", "TransducerOriginPixel", ""}
+    def partners(tool: str, pairs: Sequence[Pair]) -> set[str]:
+        frames = {b if a == tool else a for a, b in pairs if tool in (a, b)}
+        return frames - {PROBE, image, "TransducerOrigin", "TransducerOriginPixel", ""}
 
-    usual_worlds = names.tracker, _REFERENCE
-    carriers = sorted(partners(names.image) - {*usual_worlds})
-    for tool in (names.probe, *carriers, names.image):
-        worlds = partners(tool)
-        for world in (*usual_worlds, *(worlds if len(worlds) == 1 else ())):
+    carriers = sorted(partners(image, [*pairs, *fixed]) - {*_WORLDS})
+    for tool in (PROBE, *carriers, image):
+        worlds = partners(tool, pairs)
+        for world in (*_WORLDS, *(worlds if len(worlds) == 1 else ())):
             if world in worlds:
                 return f"{tool}To{world}"
     return None
 
 
-def _column(header: SequenceHeader, start: str, end: str) -> tuple[FloatArray, BoolArray]:
-    """Read one transform of every frame, either way round; the identity where it is not valid, and where."""
+def _column(header: SequenceHeader, start: str, end: str) -> FloatArray:
+    """Read one transform of every frame, either way round, shape (n, 4, 4); NaN where it is not valid."""
     keys = [f"{_joined(pair)}Transform" for pair in ((start, end), (end, start))]
     is_back = not header.column(keys[0])
     matrices = header.values(keys[is_back], 16).reshape(-1, 4, 4)
-    statuses = header.column(f"{keys[is_back]}Status")
-    is_valid = np.isfinite(matrices[:, 0, 0]) & [statuses.get(i, "OK") == "OK" for i in range(len(matrices))]
-    matrices[~is_valid] = np.eye(4)
-    return np.asarray(np.linalg.pinv(matrices)) if is_back else matrices, is_valid
+    for i, status in header.column(f"{keys[is_back]}Status").items():
+        matrices[i] *= 1.0 if status == "OK" else np.nan
+    if is_back:
+        is_valid = np.isfinite(matrices[:, 0, 0])
+        matrices[is_valid] = np.linalg.pinv(matrices[is_valid])
+    return matrices

@@ -1,4 +1,4 @@
-"""Volumes written plane by plane as NRRD, MetaImage or NIfTI files.
+"""Volumes written as NRRD, MetaImage or NIfTI files.
 
 World axes are written as left, posterior, superior (LPS), mm.
 
@@ -14,15 +14,11 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import nibabel
 import numpy as np
-import numpy.typing as npt
-from scipy.spatial.transform import RigidTransform
 
-from speckle3d.core.arrays import AnyArray
-from speckle3d.core.errors import MismatchError
 from speckle3d.core.files import PathLike
 from speckle3d.core.text import printable
 from speckle3d.core.volume import LabelMap, Segment, Volume
@@ -88,89 +84,6 @@ def write_volume(path: PathLike, volume: Volume, compress: bool = True) -> None:
         fields = {name: _escape(value) for name, value in named.items()}
         axes = (_meta_axes if suffix == ".mha" else _nrrd_axes)(volume)
         write_image(part, volume.voxels.T, volume.shape, volume.voxels.dtype, axes, fields, compress)
-
-
-class VolumeWriter:
-    """Takes the planes of a volume in a block and writes it as `write_volume` does when the block ends.
-
-    Parameters
-    ----------
-    path : path
-        With a suffix of `SUFFIXES`.
-    shape : tuple of int
-        Number of voxels along i, j and k.
-    spacing_mm : tuple of float
-        Distance between neighbouring voxel centres along i, j and k.
-    world_from_grid : RigidTransform
-        Pose of the grid; its origin is the centre of voxel ``[0, 0, 0]``; mm.
-    dtype : dtype
-        uint8, int16, uint16 or float32.
-    fields : mapping of str to str, optional
-        What the file says of the voxels; `read_volume` gives it back.
-    compress : bool
-        Whether voxels are packed with deflate; of .nii.gz, they always are, of .nii never.
-    segments : sequence of Segment, optional
-        What labels mean; voxels are labels if this is given, even if it is empty.
-
-    Raises
-    ------
-    InvalidInputError
-        If an argument is not what it must be.
-    FileError
-        If the file cannot be written; `NoSpaceError` if the disk is full.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> from speckle3d.io.voxels.volumes import read_volume
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     file = f"{folder}/v.nrrd"
-    ...     with VolumeWriter(file, (4, 3, 2), (1, 1, 1), RigidTransform.identity(), "uint8") as writer:
-    ...         for k in range(2):
-    ...             writer.append(np.full((1, 3, 4), k, np.uint8))
-    ...     read_volume(file).voxels[0, 0].tolist()
-    [0, 1]
-    """
-
-    def __init__(
-        self,
-        path: PathLike,
-        shape: tuple[int, int, int],
-        spacing_mm: tuple[float, float, float],
-        world_from_grid: RigidTransform,
-        dtype: npt.DTypeLike,
-        fields: Mapping[str, str] | None = None,
-        compress: bool = True,
-        segments: Sequence[Segment] | None = None,
-    ) -> None:
-        self._path, self._compress = path, compress
-        place = np.zeros(shape, dtype, order="F"), spacing_mm, world_from_grid, dict(fields or {})
-        self._volume = Volume(*place) if segments is None else LabelMap(*place, tuple(segments))
-        self._rest = self._volume.voxels.T
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        if kind is None:
-            if len(self._rest):
-                raise MismatchError(f"{self._path}: expected {len(self._rest)} more planes")
-            write_volume(self._path, self._volume, self._compress)
-
-    def append(self, planes: AnyArray) -> None:
-        """Take the next planes along k, shape (k, j, i), of the volume's type.
-
-        Raises
-        ------
-        MismatchError
-            If they are of another shape or type, or more than are left.
-        """
-        target = self._rest[: len(planes)]
-        if (planes.shape, planes.dtype) != (target.shape, target.dtype):
-            expected = f"planes of shape {target.shape}, {target.dtype}"
-            raise MismatchError(f"{self._path}: expected {expected}, got {planes.shape}, {planes.dtype}")
-        target[:] = planes
-        self._rest = self._rest[len(planes) :]
 
 
 def _segment_fields(segments: Iterable[Segment], shape: Sequence[int]) -> dict[str, str]:

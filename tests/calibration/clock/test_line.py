@@ -8,9 +8,8 @@ from calibration.clock.line import delay_from_lines, line_signal
 from calibration.detection.lines import detect_lines
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.streams import TimedPoses, TimedRotations
-from speckle3d.io.images.metaimage import read_poses
 from speckle3d.io.import_settings import ImportSettings
-from speckle3d.io.load import load_sweep
+from speckle3d.io.load import load_sweep, open_recording
 
 DELAY_S = 0.08
 
@@ -65,7 +64,7 @@ def test_the_real_water_tank_has_the_published_delay(realdata):
     plus = realdata / "plus"
     settings = ImportSettings(column_pitch_mm=0.078, row_spacing_mm=0.078, dynamic_range_db=60.0)
     sweep = load_sweep(plus / "WaterTankBottomTranslationVideoBuffer.igs.mha", settings)
-    readings = read_poses(plus / "WaterTankBottomTranslationTrackerBuffer.igs.mha").readings
+    readings = open_recording(plus / "WaterTankBottomTranslationTrackerBuffer.igs.mha").tracker.readings
     lines = detect_lines(sweep.frames, (0.078, 0.078))
     signal = line_signal(lines.pixels, np.array([0.078, 0.078]), 409.5)
     delay = delay_from_lines(signal, sweep.frame_time_s[lines.frame], readings)

@@ -8,7 +8,6 @@ from sweep_examples import frames_of
 
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.sweep import BModeSettings
-from speckle3d.io.images.metaimage import read_poses
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.load import load_sweep, open_recording
 
@@ -92,6 +91,10 @@ def matrix_at(place_mm):
     return matrix
 
 
+def poses_of(path, settings=None):
+    return open_recording(path, settings).tracker.readings.world_from_sensor
+
+
 def pose_matrices(sweep):
     return sweep.tracker.readings.world_from_sensor.as_matrix()
 
@@ -152,31 +155,31 @@ def test_frames_that_a_header_claims_beyond_its_bytes_are_refused_in_one_line(tm
     path = write_mha(tmp_path / "a.mha", grey(), frames=frame_fields(3)[2])
     content = path.read_bytes().replace(b"DimSize = 5 4 3", b"DimSize = " + size + b" 100000000000000")
     path.write_bytes(content.replace(b"CompressedData = False", b"CompressedData = " + is_packed))
-    for read in (read_poses, lambda path: load_sweep(path, BMODE)):
-        with pytest.raises((FileError, InvalidInputError)) as error:
-            read(path)
-        assert "\n" not in str(error.value)
+    with pytest.raises((FileError, InvalidInputError)) as error:
+        load_sweep(path, BMODE)
+    assert "\n" not in str(error.value)
 
 
 def test_a_frame_beyond_the_images_is_left_out(tmp_path):
     path = write_mha(tmp_path / "a.mha", grey(), frames=frame_fields(3)[2])
     path.write_bytes(path.read_bytes().replace(b"Seq_Frame0002", b"Seq_Frame9999999"))
-    with pytest.warns(UserWarning, match="1 of 3 left out"):
-        assert len(read_poses(path).readings) == 2
+    recording = open_recording(path)
+    assert len(recording.tracker.readings) == 2
+    assert "1 of 3 left out" in recording.remarks[0]
 
 
 def test_transforms_are_chosen_by_name(tmp_path):
     probe, reference, frames = frame_fields(3)
     path = write_mha(tmp_path / "a.mha", grey(), frames=frames)
     for name in (None, "ProbeToReference"):
-        relative = read_poses(path, ImportSettings(tracker_transform=name)).readings.world_from_sensor
+        relative = poses_of(path, ImportSettings(tracker_transform=name))
         # Six digits were written: 1e-6 of a rotation, 1e-3 of hundreds of mm.
         np.testing.assert_allclose(relative.as_matrix(), (reference.inv() * probe).as_matrix(), atol=3e-3)
-    alone = read_poses(path, ImportSettings(reference_transform="none")).readings.world_from_sensor
+    alone = poses_of(path, ImportSettings(reference_transform="none"))
     np.testing.assert_allclose(alone.as_matrix(), probe.as_matrix(), atol=1e-3)
     assert load_sweep(path, given_over(BMODE, tracker_transform="none")).tracker is None
     with pytest.raises(InvalidInputError, match=r"StylusToTracker.*ProbeToTracker"):
-        read_poses(path, ImportSettings(tracker_transform="StylusToTracker"))
+        load_sweep(path, ImportSettings(tracker_transform="StylusToTracker"))
 
 
 CASES = [
@@ -231,10 +234,10 @@ def test_recordings_of_others(realdata):
 @pytest.mark.realdata
 def test_tracker_recordings_without_images(realdata, tmp_path):
     buffer = realdata / "plus" / "WaterTankBottomTranslationTrackerBuffer.igs.mha"
-    assert len(read_poses(buffer).readings) == 5000
+    assert len(poses_of(buffer)) == 5000
     with pytest.raises(InvalidInputError, match="expected pixels"):
         load_sweep(buffer, BMODE)
     # Newer versions of PLUS write no type of pixels, and sizes of fewer frames than there are fields of.
     fields = {"ElementType": "MET_OTHER", "DimSize": "0 0 1"}
     empty = write_mha(tmp_path / "a.mha", np.zeros((3, 0, 0), np.uint8), fields, path_of(3)[1])
-    assert len(read_poses(empty).readings) == 3
+    assert len(poses_of(empty)) == 3
