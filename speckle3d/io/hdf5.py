@@ -6,7 +6,7 @@ import ctypes
 import hashlib
 import os
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -34,12 +34,14 @@ _READ_ATTEMPTS = 20
 _CHUNK_CACHE_BYTES = 32 * 2**20
 """Room for files whose chunks span several frames."""
 
+_DAMAGE = (OSError, EOFError, KeyError, MemoryError, RuntimeError, ValueError)
+"""What h5py, NumPy and decoders of text raise at damaged data; another error is a bug of ours."""
+
 LABELS_ALONE = ".seg.nrrd"
 """Suffix of labels with their segments, which nothing else may have."""
 
 
-@contextmanager
-def atomic_path(path: PathLike) -> Iterator[Path]:
+def atomic_path(path: PathLike) -> AbstractContextManager[Path]:
     """Yield a temporary sibling that becomes `path` when the block succeeds and vanishes when it does not.
 
     The sibling keeps the suffix, by which some writers choose their format. Siblings that killed processes
@@ -50,8 +52,7 @@ def atomic_path(path: PathLike) -> Iterator[Path]:
     FileError
         If the folder does not exist, `path` is not an ordinary file, or the system refuses to write.
     """
-    with whole_file(require_target(path)) as part:
-        yield part
+    return whole_file(require_target(path))
 
 
 def require_target(path: PathLike) -> Path:
@@ -134,16 +135,19 @@ def _open_beside_writer(path: PathLike) -> h5py.File:
 
 
 @contextmanager
-def reading(where: PathLike) -> Iterator[None]:
+def reading(where: PathLike, *more: type[BaseException]) -> Iterator[None]:
     """Turn what a damaged or unreadable file raises in the block into a `FileError` of one line.
 
-    Libraries stumble over damage with errors of any kind; meshio even leaves the program.
+    Parameters
+    ----------
+    more : exceptions
+        That a library raises at damage beside those of h5py and NumPy.
     """
     try:
         yield
     except Speckle3DError:
         raise
-    except (Exception, SystemExit) as error:
+    except (*_DAMAGE, *more) as error:
         raise FileError(f"{where}: cannot be read: {one_line(error)}") from error
 
 
@@ -255,7 +259,7 @@ def read_transforms(group: h5py.Group, name: str, count: int | None = None) -> R
 def read_texts(group: h5py.Group, name: str, shape: tuple[int, ...]) -> Any:
     """Read a data set of texts of a known shape, as nested lists."""
     node = require_dataset(group, name, shape)
-    with reading(locate(group, name)):  # h5py refuses what are no texts
+    with reading(locate(group, name), TypeError):  # h5py refuses what are no texts
         return np.asarray(node.asstr(errors="replace")[()], dtype=object).tolist()
 
 

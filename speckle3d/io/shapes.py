@@ -103,7 +103,7 @@ def read_surface(path: PathLike) -> Surface:
     suffix = require_suffix(path, SUFFIXES)
     meshio = extra_module("meshio", "surface", "a surface's file")
     # A damaged file shows in whatever meshio happens to stumble over.
-    with reading(f"{path}: as {suffix[1:].upper()}"):
+    with reading(f"{path}: as {suffix[1:].upper()}", Exception, SystemExit):
         if suffix == ".ply" and b"end_header" not in Path(path).read_bytes():
             raise ValueError("its header has no end")  # which meshio would search for ever
         mesh = meshio.read(path)

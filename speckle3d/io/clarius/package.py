@@ -108,7 +108,7 @@ def find_files(path: Path) -> tuple[str, dict[str, Member], dict[str, Member]]:
 
 def _members(path: Path) -> list[Member]:
     """Files of a folder or a tar file with the names of a package's; of a file, those of its recording."""
-    with reading(path):
+    with reading(path, tarfile.TarError):
         if path.is_dir():
             places = [(file, file.name, 0, file.stat().st_size) for file in sorted(path.iterdir())]
         elif part := _NAME.fullmatch(path.name):

@@ -66,7 +66,7 @@ class Description:
         """
         yaml, where = extra_module("yaml", "clarius", "a package of a Clarius scanner"), member.where
         text, loader = _GAIN_LINE.sub("", member.text()), getattr(yaml, "CBaseLoader", yaml.BaseLoader)
-        with reading(where):
+        with reading(where, Exception):
             fields = yaml.load(text, Loader=loader)
         if not isinstance(fields, dict):
             raise InvalidInputError(f"{where}: expected fields, got a {type(fields).__name__}")
@@ -145,7 +145,7 @@ def open_raw(member: Member, kind: str) -> AnyArray:
         If its samples are of another size than those of the kind.
     """
     content, (dtype, parts, _) = _content(member), SAMPLES[kind]
-    with reading(member.where):
+    with reading(member.where, struct.error):
         _, count, *size, sample_bytes = HEADER.unpack(content[: HEADER.size])
         record = np.dtype([("time", "<u8"), ("samples", dtype, (*size, parts))])
     if sample_bytes != parts * np.dtype(dtype).itemsize:
@@ -172,7 +172,7 @@ def open_frames(member: Member, kind: str, turns: ComplexArray | None = None) ->
 
 def _content(member: Member) -> Any:
     """Bytes of a file, unpacked where it is packed by lzop."""
-    with reading(member.where):
+    with reading(member.where, struct.error, IndexError):
         if member.name.endswith(".lzo"):
             return _unpack(member, member.path.stat().st_mtime_ns)
         return np.memmap(member.path, np.uint8, "r", member.start, (member.size,))
@@ -192,7 +192,7 @@ def _unpack(member: Member, _: int) -> bytes:
     while any((lengths := content[at : at + 8].ljust(8, b"\0"))[:4]):
         unpacked_size, size = struct.unpack(">II", lengths)
         at += 8 + 4 * (plain + (packs if size < unpacked_size else 0))  # behind the check sums
-        with reading(f"{member.where}: block {len(parts)}"):
+        with reading(f"{member.where}: block {len(parts)}", Exception):
             part = content[at : at + size]
             parts.append(part if size == unpacked_size else bytes(lzo.decompress(part, unpacked_size)))
         at += size

@@ -128,7 +128,7 @@ def _reading(where: str) -> Iterator[None]:
     """Turn what pydicom raises on damaged files into one line, and keep its warnings to itself."""
     import pydicom.config
 
-    with reading(where), warnings.catch_warnings(), pydicom.config.disable_value_validation():
+    with reading(where, Exception), warnings.catch_warnings(), pydicom.config.disable_value_validation():
         warnings.simplefilter("ignore")
         yield
 

@@ -90,7 +90,7 @@ def _variables(path: Path) -> dict[str, Any]:
     """Variables of versions 5 to 7, read whole by SciPy."""
     from scipy.io import loadmat
 
-    with warnings.catch_warnings(), reading(path):
+    with warnings.catch_warnings(), reading(path, Exception):
         warnings.simplefilter("ignore")
         return {name: value for name, value in loadmat(path).items() if not name.startswith("__")}
 

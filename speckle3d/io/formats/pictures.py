@@ -37,7 +37,7 @@ def _open_pictures(paths: list[Path]) -> ReadFrame:
     from PIL import Image
 
     def picture(i: int) -> AnyArray:
-        with reading(paths[i]), Image.open(paths[i]) as image:
+        with reading(paths[i], Exception), Image.open(paths[i]) as image:
             return np.asarray(image if image.mode in ("L", "I;16", "I") else image.convert("RGB"))
 
     return picture
@@ -48,7 +48,7 @@ def _open_video(path: Path, plugin: str | None) -> ReadFrame:
     file = extra_module("imageio.v3", "video", "a video").imopen(path, "r", plugin=plugin)
 
     def picture(i: int) -> AnyArray:
-        with reading(f"{path}: frame {i}"):
+        with reading(f"{path}: frame {i}", Exception):
             return np.asarray(file.read(index=i))
 
     return picture
@@ -69,7 +69,7 @@ def open_pictures(path: Path, settings: ImportSettings) -> Recording:
     """Read an array, a folder of pictures or a video."""
     images: Any = None
     rate_hz = None
-    with reading(path):  # of whichever plugin imageio takes
+    with reading(path, Exception):  # of whichever plugin imageio takes
         if path.is_dir():
             source: Callable[[], ReadFrame] = partial(_open_pictures, _pictures(path))
             count = len(_pictures(path))

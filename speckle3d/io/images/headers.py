@@ -189,7 +189,7 @@ class SequenceHeader:
         """
         count = math.prod(self.size) * self.channels
         size, values = count * self.dtype.itemsize, np.zeros(0, self.dtype)
-        with reading(self.path), open_regular(self.data) as stream:
+        with reading(self.path, Exception), open_regular(self.data) as stream:
             length = stream.seek(0, 2)
             start = max(length - size, 0) if self.start < 0 else self.start
             stream.seek(start)
@@ -315,7 +315,8 @@ def _nrrd_words(stream: BinaryIO) -> dict[str, Any]:
             name = re.sub("^(data|byte|line)(?=file|skip)", r"\1 ", name.strip().lower())
         # Without a sign: names of files below "data file: LIST".
         lines += [f"{NRRD_NAMES.get(name, name)}{sign}{value}"] if sign else []
-    return {"sizes": (), "type": "", "encoding": "", **nrrd.read_header(lines)}
+    with reading(stream.name, Exception):  # whatever pynrrd stumbles over
+        return {"sizes": (), "type": "", "encoding": "", **nrrd.read_header(lines)}
 
 
 def _meta_words(stream: BinaryIO) -> dict[str, Any]:

@@ -53,7 +53,7 @@ def read_xml(path: PathLike) -> Element:
     FileError
         If the file cannot be read, or is no XML.
     """
-    with reading(f"{path}: as XML"), open_regular(path) as stream:
+    with reading(f"{path}: as XML", ElementTree.ParseError, LookupError), open_regular(path) as stream:
         return ElementTree.parse(stream).getroot()
 
 

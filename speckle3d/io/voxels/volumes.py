@@ -224,7 +224,7 @@ def _read_nifti(path: Path) -> tuple[AnyArray, FloatArray, dict[str, str], bool]
 
     The header's unit counts; a header without one means mm.
     """
-    with naming(str(path)), reading(path):
+    with naming(str(path)), reading(path, Exception):
         image: Any = nibabel.load(path)
         voxels = np.asanyarray(image.dataobj)
         factor = mm_per(image.header.get_xyzt_units()[0])
