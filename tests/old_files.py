@@ -149,11 +149,11 @@ def fill(target, content):
     """Append the readings and frames of a sweep to one that grows."""
     orientation, tracker = content.orientation, content.tracker
     for i in range(N):
-        target.append_orientation(
-            orientation.readings.time_s[i],
-            orientation.readings.world_from_sensor[i].as_quat(scalar_first=True),
-        )
-        target.append_pose(tracker.readings.time_s[i], POSES[i].as_matrix(), valid=i != 2)
+        readings = orientation.readings
+        turn = readings.world_from_sensor[i].as_quat(scalar_first=True)
+        target.append_reading("orientation", readings.time_s[i], turn)
+        if i != 2:
+            target.append_reading("tracker", tracker.readings.time_s[i], POSES[i].as_matrix())
     for frame, time_s in zip(content.frames, content.frame_time_s, strict=True):
         target.append(frame, time_s)
 

@@ -106,7 +106,6 @@ def convert(
     from speckle3d.calibrating.recordings import require_unsaid
     from speckle3d.io.family.calibrations import fitted_pixels, resized
     from speckle3d.io.family.reconstructions import FORMAT
-    from speckle3d.io.family.sweep_writer import COMPRESSIONS
     from speckle3d.io.hdf5 import require_suffix
     from speckle3d.io.load import kind_of, open_recording
     from speckle3d.io.plus.write import SUFFIXES, write_sequence
@@ -138,7 +137,7 @@ def convert(
         note(f"{out}: does not hold the clip of {config}: give `speckle3d volume` --region '{region}'")
     with s3.progress_bar(f"writing {out.name}") as progress:
         if suffix not in SUFFIXES:
-            s3.write_sweep(out, sweep, progress, COMPRESSIONS[compression or "none"])
+            s3.write_sweep(out, sweep, progress, None if compression == "none" else compression)
             return
         left_out = write_sequence(out, sweep, progress, packs)
     for part in left_out:

@@ -124,10 +124,6 @@ class HDF5Slices:
         with open_hdf5(self.path) as file:
             return self._reader(file)(i)
 
-    def frames(self, shape: tuple[int, int, int], dtype: npt.DTypeLike, **options: Any) -> FileFrames:
-        """Frames of a shape (frame, vector, sample)."""
-        return FileFrames(self.path, self, shape, dtype, **options)
-
 
 def _slice(data: h5py.Dataset, axis: int | None, i: int) -> AnyArray:
     """Slice along an axis; a plain chunk as it lies in the file, twice as fast as by h5py."""

@@ -34,7 +34,14 @@ _READ_ATTEMPTS = 20
 _CHUNK_CACHE_BYTES = 32 * 2**20
 """Room for files whose chunks span several frames."""
 
-_DAMAGE = (OSError, EOFError, KeyError, MemoryError, RuntimeError, ValueError)
+_DAMAGE: tuple[type[BaseException], ...] = (
+    OSError,
+    EOFError,
+    KeyError,
+    MemoryError,
+    RuntimeError,
+    ValueError,
+)
 """What h5py, NumPy and decoders of text raise at damaged data; another error is a bug of ours."""
 
 LABELS_ALONE = ".seg.nrrd"

@@ -126,7 +126,11 @@ class MissingSettingsError(InvalidInputError):
 
     def __init__(self, path: PathLike | str, settings: tuple[str, ...] = ()) -> None:
         self.settings = settings
-        super().__init__(_request(path, settings) if settings else str(path))
+        fields, place = ImportSettings.model_fields, Path(path)
+        options = "; ".join(f"{option_of(name)} ({fields[name].description})" for name in settings)
+        file = f"{_FOLDER_FILE} in it" if place.is_dir() else f"{place.name}.toml beside it"
+        request = f"{path}: the file does not say, so give `speckle3d convert` or {file}: {options}"
+        super().__init__(request if settings else str(path))
 
 
 def option_of(name: str) -> str:
@@ -158,12 +162,3 @@ def settings_file(path: PathLike) -> Path | None:
     inside = [place / _FOLDER_FILE] if place.is_dir() else []
     files = [place.with_name(f"{place.name}.toml"), *inside, place.with_name(_FOLDER_FILE)]
     return next((file for file in files if file.is_file()), None)
-
-
-def _request(path: PathLike | str, settings: tuple[str, ...]) -> str:
-    fields = ImportSettings.model_fields
-    options = "; ".join(f"{option_of(name)} ({fields[name].description})" for name in settings)
-    return (
-        f"{path}: the file does not say, so give `speckle3d convert` or {Path(path).name}.toml beside it: "
-        f"{options}"
-    )

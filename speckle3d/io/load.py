@@ -26,6 +26,9 @@ from speckle3d.io.recordings import Recording, Row
 IMAGE = _IMAGES.format
 """Kind of MetaImage and NRRD files."""
 
+_PACKED = (b"\x1f\x8b", b"PK\3\4", b"BZh", b"\xfd7zXZ", b"7z\xbc\xaf", b"Rar!")
+"""First bytes of gzip, zip, bzip2, xz, 7-Zip and RAR."""
+
 SIZED = (sweeps.FORMAT, challenge.FORMAT)
 """Kinds that always say how large their pixels are."""
 
@@ -162,16 +165,15 @@ def family_format(path: PathLike, source: Path | h5py.File) -> str:
     InvalidInputError
         If it is of no known kind.
     """
-    place, formats = Path(path), ", ".join(reader.format for reader in readers())
+    formats = ", ".join(reader.format for reader in readers())
     if isinstance(source, h5py.File):
         if (kind := file_format(source)).startswith("speckle3d."):
             return kind
         content = f"HDF5 of another kind, with {', '.join(map(str, source)) or 'nothing'}"[:200]
-    elif place.is_dir():
-        content = "a folder that none of them is in"
     else:
-        is_packed = first_bytes(path).startswith((b"\x1f\x8b", b"PK\3\4"))
-        content = "a packed file: unpack it first" if is_packed else "another file"
+        if first_bytes(path).startswith(_PACKED):
+            raise InvalidInputError(f"{path}: expected a recording, got a packed file: unpack it first")
+        content = "a folder that none of them is in" if Path(path).is_dir() else "another file"
     raise InvalidInputError(
         f"{path}: expected a recording ({formats}), got {content}. Logs of sensors are for "
         "`speckle3d imu info`, paths of poses for `speckle3d trajectory score`"

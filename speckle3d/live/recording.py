@@ -69,9 +69,11 @@ class Recording:
             # Rigid to single precision as it comes.
             rigid = transforms_from_matrices(transform.matrix[None], where)
             if with_position:
-                self._sweep.append_pose(time_s, rigid.as_matrix()[0], transform.valid)
-            elif transform.valid:
-                self._sweep.append_orientation(time_s, rigid.rotation.as_quat(scalar_first=True)[0])
+                name, reading = "tracker", rigid.as_matrix()[0]
+            else:
+                name, reading = "orientation", rigid.rotation.as_quat(scalar_first=True)[0]
+            if transform.valid:
+                self._sweep.append_reading(name, time_s, reading)
         except InvalidInputError as error:
             self.refuse(error)
 

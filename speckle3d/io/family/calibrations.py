@@ -58,13 +58,11 @@ def write_calibration(path: PathLike, calibration: Calibration) -> None:
         put_fields(file, calibration, skip=("rotation", "translation_mm", "parameters", "frames"))
         is_rotation = calibration.translation_mm is None
         put(file, "sensor_from_image", calibration.rotation if is_rotation else calibration.sensor_from_image)
-        columns = {name: [getattr(row, name) for row in rows] for name in ("name", "unit")}
-        put(file, "parameters", columns)
-        for name in ("value", "standard_error"):
-            put(file, f"parameters/{name}", np.array([getattr(row, name) for row in rows], float))
-        put(file, "frames", {"given": frames.given, "reason": list(frames.dropped.values())})
-        put(file, "frames/used", np.array(frames.used, np.int64))
-        put(file, "frames/dropped", np.array([*frames.dropped], np.int64))
+        for name, make in (("name", list), ("unit", list), ("value", np.array), ("standard_error", np.array)):
+            put(file, f"parameters/{name}", make([getattr(row, name) for row in rows]))
+        members = {"given": frames.given, "used": np.array(frames.used, int)}
+        dropped = {"dropped": np.array([*frames.dropped], int), "reason": [*frames.dropped.values()]}
+        put(file, "frames", members | dropped)
 
 
 def read_calibration(path: PathLike) -> Calibration:

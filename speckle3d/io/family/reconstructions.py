@@ -19,7 +19,6 @@ from speckle3d.core.reconstruction import (
     Provenance,
     Reconstruction,
     SharedErrors,
-    SourceFile,
     Trust,
 )
 from speckle3d.io.family.records import put, put_fields, read_record, written
@@ -69,8 +68,7 @@ def write_reconstruction(path: PathLike, result: Reconstruction, pairs: Sequence
             put(file, "frame_flags", trust.flags)
         put_fields(file, origin, skip=["calibrations", "imported"])
         for calibration in origin.calibrations:
-            source = SourceFile(calibration.path, calibration.sha256)
-            put(file, f"calibrations/{calibration.sensor}", source)
+            put(file, f"calibrations/{calibration.sensor}", calibration)
         if origin.imported is not None:
             put(file, "import", {"name": origin.imported.name})
             file["import/settings_json"] = origin.imported.settings_json

@@ -50,9 +50,6 @@ from speckle3d.io.hdf5 import (
 )
 
 Compression = Literal["gzip", "lzf"] | None
-COMPRESSIONS: dict[str, Compression] = {"gzip": "gzip", "lzf": "lzf", "none": None}
-"""By their names on the command line."""
-
 _GZIP_LEVEL = 1
 """Higher ones take several times as long for echoes and save no more than 2 %."""
 
@@ -161,24 +158,27 @@ def write_sweep(
         put(file, "frame_time_s", sweep.frame_time_s)
         for name in SENSORS:
             _put_sensor(file, name, getattr(sweep, name))
-        put(file, "truth", {"world_from_image": sweep.truth} if sweep.truth is not None else None)
+        put(file, "truth/world_from_image", sweep.truth)
         put(file, "probe", sweep.probe or None)
         for name, value in (simulation or {}).items():
             plain = value if isinstance(value, str | int | float) else json.dumps(value, sort_keys=True)
             put(file, "simulation", {name: plain})
         if isinstance(frames, FileFrames):
-            _copy_other_groups(frames.path, file)
+            _copy_others(frames.path, file)
 
 
-def _copy_other_groups(source: PathLike, file: h5py.File) -> None:
-    """Copy what another sweep file holds beyond the format."""
+def _copy_others(source: PathLike, file: h5py.File) -> None:
+    """Copy what another sweep file holds beyond the format: groups, data sets and attributes of the root."""
     with reading(source), naming(str(source)):
         if not h5py.is_hdf5(source):
             return
         with open_hdf5(source) as origin:
-            names = {*origin} - MEMBERS - {*file} if file_format(origin) == FORMAT else ()
-            for name in names:
+            if file_format(origin) != FORMAT:
+                return
+            for name in {*origin} - MEMBERS - {*file}:
                 origin.copy(find_member(origin, name), file, name)
+            for name in {*origin.attrs} - {*file.attrs}:
+                file.attrs[name] = origin.attrs[name]
 
 
 def attach_orientation(path: PathLike, sensor: OrientationSensor) -> None:
@@ -342,31 +342,24 @@ class GrowingSweep:
             _append_frame(self._frames, frame)
             self._frames.flush()
 
-    def append_pose(self, time_s: float, matrix: FloatArray, valid: bool = True) -> None:
-        """Write a tracker's reading, unless it is not valid: world_from_sensor, shape (4, 4), mm.
+    def append_reading(self, sensor: str, time_s: float, reading: FloatArray) -> None:
+        """Write world_from_sensor of a sensor.
+
+        Parameters
+        ----------
+        sensor : {"tracker", "orientation"}
+        time_s : float
+        reading : ndarray, shape (4, 4) in mm, or (4,), a unit quaternion, scalar first
 
         Raises
         ------
         InvalidInputError
-            If it is not rigid, or its time is not after the one before: it is then not in the file.
+            If it is not rigid or of unit length, or its time is not after the one before: it is then not in
+            the file.
         """
-        if valid:
-            self._append_reading("tracker", time_s, matrix)
-
-    def append_orientation(self, time_s: float, quaternion_wxyz: FloatArray) -> None:
-        """Write an orientation sensor's reading: world_from_sensor, scalar first.
-
-        Raises
-        ------
-        InvalidInputError
-            If it is no unit quaternion, or its time is not after the one before: it is then not in the file.
-        """
-        self._append_reading("orientation", time_s, quaternion_wxyz)
-
-    def _append_reading(self, name: str, time_s: float, reading: FloatArray) -> None:
-        *_, check = SENSORS[name]
-        check(np.asarray(reading)[None], f"{self.path}: /{name} at {time_s} s")
-        with self._row(name, time_s, reading):
+        *_, check = SENSORS[sensor]
+        check(np.asarray(reading)[None], f"{self.path}: /{sensor} at {time_s} s")
+        with self._row(sensor, time_s, reading):
             pass
 
     @contextmanager

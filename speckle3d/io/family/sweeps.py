@@ -138,7 +138,7 @@ def _read_image(file: h5py.File, count: int) -> tuple[FileFrames, ImageGrid, RFS
             fan=read_record(require_group(file, "fan"), FanLines) if "fan" in file else None,
         )
     kind = np.complex64 if in_pairs else dtype
-    return slices.frames((count, vectors, samples), kind, stored_dtype=dtype), grid, signal
+    return FileFrames(slices.path, slices, (count, vectors, samples), kind, dtype), grid, signal
 
 
 def require_sample_type(name: str, dtype: np.dtype[Any], where: str) -> None:

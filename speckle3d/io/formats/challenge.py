@@ -29,7 +29,7 @@ from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.geometry import transforms_from_matrices
 from speckle3d.core.sweep import Tracker
-from speckle3d.io.frames import HDF5Slices
+from speckle3d.io.frames import FileFrames, HDF5Slices
 from speckle3d.io.hdf5 import (
     PathLike,
     find_member,
@@ -109,7 +109,7 @@ def open_scan(file: h5py.File, _: ImportSettings) -> Recording:
     }
     return Recording(
         scan,
-        frames=slices.frames((n, width, height), node.dtype),
+        frames=FileFrames(scan, slices, (n, width, height), node.dtype),
         values=values,
         tracker=tracker,
         chain="tforms",

@@ -174,5 +174,5 @@ def grey_frames(
     if not (np.isfinite(top) and (decibels or top > 0)):
         raise InvalidInputError(f"expected echoes, got amplitudes up to {top:g}")
     turn = partial(grey_levels, turn=source.turn, decibels=decibels, top=top, dynamic_range_db=span)
-    frames = replace(source, turn=turn).frames(shape, np.uint8)
+    frames = FileFrames(source.path, replace(source, turn=turn), shape, np.uint8)
     return frames, Value(span, f"of grey levels made here below {top:g}")

@@ -34,7 +34,7 @@ from speckle3d.io.formats.hdf5_values import (
     text_of,
     values_of,
 )
-from speckle3d.io.frames import HDF5Slices
+from speckle3d.io.frames import FileFrames, HDF5Slices
 from speckle3d.io.hdf5 import (
     find_member,
     locate,
@@ -92,7 +92,7 @@ def open_uff(file: h5py.File, settings: ImportSettings) -> Facts:
         values |= values_of(file, {"speed_of_sound_m_s": f"{channels}/sound_speed"})
     shape = count, lines, samples
     source = HDF5Slices(path, parts, partial(frame_of, shape=shape[1:]), axis)
-    frames = source.frames(shape, np.complex64 if is_complex else np.float32)
+    frames = FileFrames(path, source, shape, np.complex64 if is_complex else np.float32)
     if not is_complex:
         # Echoes have both signs, amplitudes and decibels one.
         frame = frames[count // 2]

@@ -38,7 +38,7 @@ from speckle3d.io.formats.hdf5_values import (
     text_of,
     values_of,
 )
-from speckle3d.io.frames import HDF5Slices
+from speckle3d.io.frames import FileFrames, HDF5Slices
 from speckle3d.io.hdf5 import (
     find_member,
     has_member,
@@ -121,7 +121,7 @@ def open_zea(file: h5py.File, settings: ImportSettings) -> Facts:
     source = HDF5Slices(path, (str(node.name),), turn)
     if has_channels or node.dtype == np.uint8:
         dtype = np.complex64 if is_complex else np.float32 if has_channels else np.uint8
-        frames = source.frames(shape, dtype)
+        frames = FileFrames(path, source, shape, dtype)
     else:
         is_db, range_db = kind != "envelope_data", settings.dynamic_range_db
         frames, values["dynamic_range_db"] = grey_frames(source, shape, is_db, range_db)

@@ -75,9 +75,9 @@ def test_an_error_leaves_nothing_in_the_file_and_the_recording_goes_on(tmp_path)
     sweep, path = SWEEPS["rf"], tmp_path / "s.h5"
     with growing(path, sweep, probe="L14") as target:
         target.append(sweep.frames[0], 10.0)
-        target.append_pose(9.0, np.eye(4))
+        target.append_reading("tracker", 9.0, np.eye(4))
         for append in (
-            lambda: target.append_pose(9.0, np.eye(4)),
+            lambda: target.append_reading("tracker", 9.0, np.eye(4)),
             lambda: target.append(sweep.frames[1], 10.0),
         ):
             with pytest.raises(InvalidInputError):
