@@ -22,6 +22,7 @@ from __future__ import annotations
 import math
 import re
 import struct
+import zlib
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -188,12 +189,16 @@ def _unpack(member: Member, _: int) -> bytes:
     (flags,) = struct.unpack_from(">I", content, 17)
     at = 37 if flags & 0x800 else 33
     at += 1 + content[at] + 4
-    plain, packs = (sum(bool(flags & bit) for bit in bits) for bits in ((0x1, 0x100), (0x2, 0x200)))
+    checks = [check for flag, check in ((0x1, zlib.adler32), (0x100, zlib.crc32)) if flags & flag]
+    packed_checks = bool(flags & 0x2) + bool(flags & 0x200)
     while any((lengths := content[at : at + 8].ljust(8, b"\0"))[:4]):
-        unpacked_size, size = struct.unpack(">II", lengths)
-        at += 8 + 4 * (plain + (packs if size < unpacked_size else 0))  # behind the check sums
-        with reading(f"{member.where}: block {len(parts)}", Exception):
+        (unpacked_size, size), where = struct.unpack(">II", lengths), f"{member.where}: block {len(parts)}"
+        with reading(where, Exception):
+            sums = struct.unpack_from(f">{len(checks)}I", content, at + 8)
+            at += 8 + 4 * (len(checks) + packed_checks * (size < unpacked_size))
             part = content[at : at + size]
             parts.append(part if size == unpacked_size else bytes(lzo.decompress(part, unpacked_size)))
+        if [check(parts[-1]) for check in checks] != [*sums]:
+            raise FileError(f"{where}: is damaged: its check sum is another")
         at += size
     return b"".join(parts)

@@ -96,11 +96,18 @@ def open_package(path: Path, settings: ImportSettings) -> Facts:
     rate_hz = settings.sampling_rate_hz or yml_rate_hz
     speed_m_s = yml.number("vsound") or yml.number("speed of sound")
     spacing_mm = 1e3 * (settings.speed_of_sound_m_s or speed_m_s or SPEED_OF_SOUND_M_S) / (2.0 * rate_hz)
-    first_mm, model = None, _model(settings.probe or yml.model)
+    first, model = Value(), _model(settings.probe or yml.model)
     if (delay := yml.number("delay samples")) is not None:
-        first_mm = max(delay - BEFORE_DEPTH_S * rate_hz, 0.0) * spacing_mm
+        first = Value(
+            (delay - BEFORE_DEPTH_S * rate_hz) * spacing_mm,
+            "delay samples, less 1 us before depth 0 (assumed)",
+        )
+        if first.value < 0:
+            first = Value(
+                0.0, f"assumed: the delay of {1e6 * delay / rate_hz:.2f} us is below the 1 us before depth 0"
+            )
     values = {
-        "first_sample_depth_mm": Value(first_mm, "delay samples, less 1 us before depth 0 (assumed)"),
+        "first_sample_depth_mm": first,
         "row_spacing_mm": Value(spacing_mm, f"of {rate_hz / 1e6:g} MHz"),
         "sampling_rate_hz": Value(yml_rate_hz, _YML),
         "centre_frequency_hz": Value(transmit_hz, "transmit frequency"),
@@ -111,7 +118,7 @@ def open_package(path: Path, settings: ImportSettings) -> Facts:
     if signal == "IQ":
         shift_hz, receive = settings.demodulation_frequency_hz, yml.receive
         if receive is not None:
-            start_mm = first_mm or settings.first_sample_depth_mm or 0.0
+            start_mm = first.value or settings.first_sample_depth_mm or 0.0
             depths_mm = start_mm + spacing_mm * np.arange(shape[2], dtype=np.float64)
             middle_hz, slide = _oscillator(receive, depths_mm, rate_hz)
             values["demodulation_frequency_hz"] = Value(middle_hz, "of the lines' middle")

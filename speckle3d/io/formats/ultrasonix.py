@@ -34,7 +34,7 @@ _NAMES = (
 _HEADER = struct.Struct("<19i")
 _READ = {2: ("B-mode before scan conversion (.bpr)", 8), 4: ("B-mode (.b8)", 8), 16: ("RF (.rf)", 16)}
 """Name and bits of the types that are read; all are powers of two."""
-_BMODE, _TYPES = 4, [2**k for k in range(20)]
+_BMODE = 4
 _SUFFIXES = (".rf", ".bpr", ".b8", ".crf", ".col")
 
 
@@ -56,7 +56,7 @@ def _tag_bytes(header: dict[str, int], size: int) -> int | None:
 
 
 def _claims(path: Path, start: bytes) -> bool:
-    if len(start) < _HEADER.size or (header := _header(start))["kind"] not in _TYPES:
+    if len(start) < _HEADER.size or (header := _header(start))["kind"].bit_count() != 1:
         return False
     return _tag_bytes(header, path.stat().st_size) is not None or path.suffix.lower() in _SUFFIXES
 

@@ -24,7 +24,6 @@ from speckle3d.core.sweep import RFSettings, Sweep, stored_dtype
 from speckle3d.io.hdf5 import atomic_path, require_suffix
 from speckle3d.io.images.headers import NRRD_NAMES
 from speckle3d.io.images.image_writer import write_image
-from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.plus.transforms import IMAGE, ORIENTATION, pixel_matrix
 from speckle3d.io.text import number_text, numbers
 
@@ -64,11 +63,11 @@ def own_values(path: str, fields: Mapping[str, str]) -> dict[str, Any]:
     InvalidInputError
         Naming the field that does not make sense.
     """
-    values: dict[str, Any] = {}
-    for name in (*ImportSettings.model_fields, "full_scale"):
-        if (text := fields.get(_PREFIX + name)) is not None:
-            parts = () if name == "probe" else numbers(text, None, f"{path}: {_PREFIX}{name}")
-            values[name] = text if name == "probe" else parts if len(parts) > 1 else parts[0]
+    texts = {name.removeprefix(_PREFIX): text for name, text in fields.items() if name.startswith(_PREFIX)}
+    values: dict[str, Any] = {"probe": texts.pop("probe", "")}
+    for name, text in texts.items():
+        first, *others = numbers(text, None, f"{path}: {_PREFIX}{name}")
+        values[name] = (first, *others) if others else first
     return values
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -27,7 +27,7 @@ from speckle3d.io.voxels.volume_writer import COMMENT, LABELS, PREFIX, RAS_FROM_
 
 _SIZES = {size.to_bytes(4, order) for size in (348, 540) for order in ("little", "big")}
 """First bytes of NIfTI-1 and NIfTI-2: the length of the header."""
-_FIELD = re.compile(r"Segment(\d{1,5})_(\w+)")
+_SEGMENT = re.compile(r"Segment(?:ation|(\d{1,5}))_(\w+)")
 _UNNAMED_COLOUR = "0.5 0.5 0.5"
 """Fields of Slicer's labels, and a colour where they have none."""
 _SAME_PLACE_MM = 1e-3
@@ -85,12 +85,9 @@ def read_volume(path: PathLike) -> Volume:
     start = first_bytes(path)
     if _is_nifti(Path(path), start):
         voxels, matrix, fields, is_labels = _read_nifti(Path(path))
-        remarks = {name: text for name, text in fields.items() if not _is_segmentation([name])}
     elif is_image(start):
         voxels, matrix, fields = _read_image(path)
-        is_labels = _is_segmentation(fields)
-        own = {name: text for name, text in fields.items() if name.startswith(PREFIX)}
-        remarks = {name.removeprefix(PREFIX): unescape(text) for name, text in own.items()}
+        is_labels = any(map(_SEGMENT.fullmatch, fields))
     else:
         raise InvalidInputError(
             f"{path}: expected NRRD, MetaImage or NIfTI (.nii.gz, .nii, .hdr), got something else"
@@ -99,6 +96,7 @@ def read_volume(path: PathLike) -> Volume:
         raise InvalidInputError(
             f"{path}: expected a grey image of three axes, got shape {voxels.shape} of {voxels.dtype}"
         )
+    remarks = {name: text for name, text in fields.items() if not _SEGMENT.fullmatch(name)}
     with naming(str(path)):
         voxels, spacing, pose = _right_handed(
             voxels.astype(voxels.dtype.newbyteorder("="), copy=False), matrix
@@ -158,11 +156,6 @@ def _right_handed(
     return voxels, tuple(spacing.tolist()), pose
 
 
-def _is_segmentation(fields: Iterable[str]) -> bool:
-    """Whether names of a header's fields tell of segments."""
-    return any(name.startswith("Segmentation_") or _FIELD.fullmatch(name) for name in fields)
-
-
 def _read_segments(fields: Mapping[str, str], where: str) -> Iterator[Segment]:
     """Read what labels mean; those without a name or colour get one.
 
@@ -173,8 +166,8 @@ def _read_segments(fields: Mapping[str, str], where: str) -> Iterator[Segment]:
     """
     rows = defaultdict[int, dict[str, str]](dict)
     for name, value in fields.items():
-        if match := _FIELD.fullmatch(name):
-            rows[int(match[1])][match[2]] = unescape(value)
+        if (match := _SEGMENT.fullmatch(name)) and match[1]:
+            rows[int(match[1])][match[2]] = value
     for i, row in sorted(rows.items()):
         place = f"{where}: Segment{i}"
         (label,) = numbers(row.get("LabelValue", "1"), 1, f"{place}_LabelValue")
@@ -189,10 +182,8 @@ def _read_segments(fields: Mapping[str, str], where: str) -> Iterator[Segment]:
 
 def _labels(voxels: AnyArray) -> AnyArray:
     """Labels as whole numbers of two bytes at most."""
-    if voxels.dtype.name in ("uint8", "uint16"):
-        return voxels
     with np.errstate(invalid="ignore"):
-        labels = voxels.astype(np.uint16)
+        labels = voxels if voxels.dtype == np.uint8 else voxels.astype(np.uint16)
     if not np.array_equal(labels, voxels):
         raise InvalidInputError("labels: expected whole numbers from 0 to 65535, got others")
     return labels
@@ -204,7 +195,7 @@ def _is_nifti(path: Path, start: bytes) -> bool:
 
 
 def _read_image(path: PathLike) -> tuple[AnyArray, FloatArray, dict[str, str]]:
-    """Voxels of a MetaImage or NRRD image, their LPS world from index in mm, and the header's fields."""
+    """Voxels of a MetaImage or NRRD image, their LPS world from index in mm, and fields."""
     header, matrix = read_header(path), np.eye(4)
     axes = np.eye(3) if header.axes_mm is None else header.axes_mm
     origin = np.zeros(3) if header.origin_mm is None else header.origin_mm
@@ -216,7 +207,9 @@ def _read_image(path: PathLike) -> tuple[AnyArray, FloatArray, dict[str, str]]:
     matrix[:3, :3], matrix[:3, 3] = axes.T, origin
     # The first axis runs fastest in a file; a mapped file may be replaced while voxels are used.
     shape = (*header.size[::-1], *[header.channels] * (header.channels > 1))
-    return np.array(header.numbers()).reshape(shape).T, matrix, header.fields
+    names = [name for name in header.fields if name.startswith(PREFIX) or _SEGMENT.fullmatch(name)]
+    fields = {name.removeprefix(PREFIX): unescape(header.fields[name]) for name in names}
+    return np.array(header.numbers()).reshape(shape).T, matrix, fields
 
 
 def _read_nifti(path: Path) -> tuple[AnyArray, FloatArray, dict[str, str], bool]:
