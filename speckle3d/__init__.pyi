@@ -26,9 +26,9 @@ from .io.readers import Reader as Reader
 from .io.shapes import read_surface as read_surface
 from .io.shapes import write_surface as write_surface
 from .io.shapes import write_transform as write_transform
-from .io.voxels.volume_writer import write_volume as write_volume
 from .io.voxels.volumes import load_volume as load_volume
 from .io.voxels.volumes import read_volume as read_volume
+from .io.voxels.volumes import write_volume as write_volume
 from .phantom_curves import calibrate_curves as calibrate_curves
 from .scoring.lengths import ModeError as ModeError
 from .scoring.lengths import compare_modes as compare_modes

@@ -15,7 +15,7 @@ from speckle3d.core.errors import NoSpaceError
 from speckle3d.core.volume import Volume
 from speckle3d.io.family.sweep_writer import attach_orientation, write_sweep
 from speckle3d.io.plus.write import write_sequence
-from speckle3d.io.voxels.volume_writer import write_volume
+from speckle3d.io.voxels.volumes import write_volume
 from speckle3d.study.results import write_texts
 from xsens.live.recording import RawFile
 from xsens.logs.read import parse_stream

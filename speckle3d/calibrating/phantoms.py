@@ -47,7 +47,7 @@ from speckle3d.core.progress import Progress
 from speckle3d.core.streams import TimedPoses
 from speckle3d.core.wires import WirePhantom
 from speckle3d.io.load import SIZED, kind_of
-from speckle3d.io.plus.wires import read_wire_phantom
+from speckle3d.io.plus.device_set import read_wire_phantom
 from speckle3d.io.points import PickedPoints, read_points, write_points
 
 BY_HAND = "left out by hand"

@@ -54,7 +54,7 @@ def require_own_place(out: Path, kind: str, *inputs: Path) -> None:
     """
     from speckle3d.io.hdf5 import LABELS_ALONE, require_suffix, require_target
     from speckle3d.io.shapes import SUFFIXES as SURFACES
-    from speckle3d.io.voxels.volume_writer import SUFFIXES as VOLUMES
+    from speckle3d.io.voxels.volumes import SUFFIXES as VOLUMES
 
     target, kinds = require_target(out), kind.split()
     suffixes = {"picture": (".png",), "surface": SURFACES, "volume": VOLUMES, "labels": (LABELS_ALONE,)}

@@ -5,7 +5,7 @@ from wire_scenes import PIXEL_MM, candidates, plus_results, scene
 from calibration.nwires import label_by_wires, nwire_errors_mm, trimmed_mean_mm
 from calibration.points import Detections
 from speckle3d.io.load import open_recording
-from speckle3d.io.plus.wires import read_wire_phantom
+from speckle3d.io.plus.device_set import read_wire_phantom
 
 PLUS_ERRORS_MM = {"Calibration": (0.479116, 0.22656), "Validation": (0.539932, 0.223536)}
 """PLUS's own means and standard deviations, mm."""

@@ -8,7 +8,7 @@ from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.volume import Volume
 from speckle3d.io.shapes import read_surface
-from speckle3d.io.voxels.volume_writer import write_volume
+from speckle3d.io.voxels.volumes import write_volume
 
 RADIUS_MM, STEP_MM = 3.0, 0.25
 VOLUME_MM3 = 4 / 3 * np.pi * RADIUS_MM**3

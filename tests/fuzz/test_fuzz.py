@@ -58,7 +58,7 @@ def write_shapes(folder):
     from speckle3d.io import shapes
     from speckle3d.io.points import PickedPoints, write_points
     from speckle3d.io.tum import write_tum
-    from speckle3d.io.voxels.volume_writer import SUFFIXES, write_volume
+    from speckle3d.io.voxels.volumes import SUFFIXES, write_volume
 
     place = np.arange(120, dtype=np.uint8).reshape(4, 5, 6) % 3, (0.5, 0.25, 1.0), POSES[1], {"a": "b"}
     for suffix in (".seg.nrrd", *SUFFIXES):

@@ -11,8 +11,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.volume import STATE_SEGMENTS, VOXEL_TYPES, LabelMap, Segment, Volume
-from speckle3d.io.voxels.volume_writer import SUFFIXES, write_volume
-from speckle3d.io.voxels.volumes import read_volume
+from speckle3d.io.voxels.volumes import SUFFIXES, read_volume, write_volume
 
 RAS_FROM_LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
 # NIfTI keeps its matrix in single precision: 6e-8 of places up to 300 mm, and of 5 voxels of a few mm.

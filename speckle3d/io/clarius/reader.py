@@ -34,8 +34,7 @@ from scipy.integrate import cumulative_trapezoid
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.io.clarius.imu import SensorSamples, read_samples
-from speckle3d.io.clarius.package import find_files, is_package
-from speckle3d.io.clarius.raw import SAMPLES, Description, open_frames, open_raw
+from speckle3d.io.clarius.package import SAMPLES, Description, find_files, is_package, open_frames, open_raw
 from speckle3d.io.clarius.spectrum import band_hz
 from speckle3d.io.frames import FileFrames
 from speckle3d.io.import_settings import SPEED_OF_SOUND_M_S, ImportSettings

@@ -1,7 +1,8 @@
-"""Headers of MetaImage and NRRD files: axes, units, fields of frames, pixels.
+"""MetaImage and NRRD files: axes, units, fields of frames, pixels.
 
-pynrrd parses NRRD's headers; a MetaImage's fields are put into NRRD's words. Pixels are read here: pynrrd
-reads all of a raw sequence into memory and stops at the first member of packed pixels.
+pynrrd parses NRRD's headers; a MetaImage's fields are put into NRRD's words. The rest is done here: pynrrd
+reads all of a raw sequence into memory, stops at the first member of packed pixels, refuses letters beyond
+ASCII (names of segments) when it writes, and has no fields of frames.
 
 References
 ----------
@@ -15,7 +16,7 @@ import bz2
 import math
 import re
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import takewhile
@@ -35,12 +36,10 @@ try:
     from isal import isal_zlib
 except ImportError:
     import zlib as isal_zlib  # type: ignore[no-redef]
-
-DEFLATE = isal_zlib
-ZLIB, GZIP, _EITHER = 15, 31, 47
+_ZLIB, _GZIP, _EITHER = 15, 31, 47
 """Windows of deflate, and by them what is around it; either is told when unpacking."""
 
-NUMBER_TYPES = {
+_NUMBER_TYPES = {
     "i1": "char int8",
     "u1": "uchar uint8",
     "i2": "short int16",
@@ -212,7 +211,7 @@ def _unpack(content: bytes, encoding: str) -> bytes:
         return bz2.decompress(content)
     plain = bytearray()
     while content:
-        stream = DEFLATE.decompressobj(_EITHER)
+        stream = isal_zlib.decompressobj(_EITHER)
         plain += stream.decompress(content)
         content = stream.unused_data if stream.unused_data[:2] == b"\x1f\x8b" else b""
     return bytes(plain)
@@ -359,7 +358,7 @@ def _meta_words(stream: BinaryIO) -> dict[str, Any]:
 def _number_type(word: str, is_big: bool) -> np.dtype[Any]:
     """Type of numbers by a word of either format, as ``MET_UCHAR`` or ``unsigned char``."""
     plain = word.lower().removeprefix("met_").removesuffix("_t").replace("unsigned ", "u")
-    kind = _key(NUMBER_TYPES, plain.replace("signed ", "").removesuffix(" int").replace(" ", ""))
+    kind = _key(_NUMBER_TYPES, plain.replace("signed ", "").removesuffix(" int").replace(" ", ""))
     if kind is None:
         raise InvalidInputError(f"type: expected a type of numbers as uint8 or MET_UCHAR, got {word!r}")
     return np.dtype((">" if is_big else "<") + kind)
@@ -421,3 +420,71 @@ def _lines(stream: BinaryIO) -> Iterator[str]:
             yield line.decode("utf-8-sig").rstrip("\r\n")
         except UnicodeDecodeError:
             yield line.decode("latin-1").rstrip("\r\n")
+
+
+def write_image(
+    path: Path,
+    planes: Iterable[AnyArray],
+    shape: Sequence[int],
+    dtype: np.dtype[Any],
+    axes: str,
+    fields: Mapping[str, str],
+    is_packed: bool = False,
+) -> None:
+    """Write a header and pixels behind it, plane by plane, little-endian; the suffix chooses the format.
+
+    Parameters
+    ----------
+    shape : sequence of int
+        Lengths of the axes, fastest first.
+    axes : str
+        Lines of the format's own fields about the axes.
+    fields : mapping of str to str
+        All others.
+    is_packed : bool
+        Whether pixels are packed with deflate, at its lowest level: at higher ones speckle hardly shrinks
+        further, and takes several times as long.
+    """
+    is_nrrd, words = path.suffix == ".nrrd", _NUMBER_TYPES[dtype.str[1:]].split()
+    pack = isal_zlib.compressobj(1, isal_zlib.DEFLATED, _GZIP if is_nrrd else _ZLIB) if is_packed else None
+    sizes = " ".join(map(str, shape))
+
+    def header(packed_bytes: int) -> bytes:
+        """As long whatever the size of the packed pixels; read back as the same text."""
+        size = f"CompressedDataSize = {packed_bytes:<20}\n" if is_packed else ""
+        text = f"""ObjectType = Image
+NDims = {len(shape)}
+BinaryData = True
+BinaryDataByteOrderMSB = False
+CompressedData = {is_packed}
+{size}DimSize = {sizes}
+ElementType = MET_{words[0].upper()}
+{axes}
+{_field_lines(fields, " = ")}ElementDataFile = LOCAL
+"""
+        if is_nrrd:
+            text = f"""NRRD0004
+type: {words[-1]}
+dimension: {len(shape)}
+sizes: {sizes}
+{axes}
+endian: little
+encoding: {"gzip" if is_packed else "raw"}
+{_field_lines(fields, ":=")}
+"""
+        return text.encode("utf-8", "backslashreplace")
+
+    with path.open("wb") as file:
+        start = file.write(header(0))
+        for plane in planes:
+            raw = plane.astype(plane.dtype.newbyteorder("<"), order="C", copy=False).data.cast("B")
+            file.write(raw if pack is None else pack.compress(raw))
+        if pack is not None:
+            file.write(pack.flush())
+            size = file.tell() - start
+            file.seek(0)
+            file.write(header(size))
+
+
+def _field_lines(fields: Mapping[str, object], sign: str) -> str:
+    return "".join(f"{name}{sign}{value}\n" for name, value in fields.items())

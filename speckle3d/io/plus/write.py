@@ -22,8 +22,7 @@ from speckle3d.core.files import PathLike
 from speckle3d.core.progress import Progress
 from speckle3d.core.sweep import RFSettings, Sweep, stored_dtype
 from speckle3d.io.hdf5 import atomic_path, require_suffix
-from speckle3d.io.images.headers import NRRD_NAMES
-from speckle3d.io.images.image_writer import write_image
+from speckle3d.io.images.headers import NRRD_NAMES, write_image
 from speckle3d.io.plus.transforms import IMAGE, ORIENTATION, pixel_matrix
 from speckle3d.io.text import number_text, numbers
 

@@ -1,11 +1,20 @@
-"""Volumes and label maps as NRRD, MetaImage or NIfTI files, read here so that damage is told in one line."""
+"""Volumes and label maps as NRRD, MetaImage or NIfTI files.
+
+World axes are written as left, posterior, superior (LPS), mm.
+
+References
+----------
+.. [1] G. Kindlmann, "Definition of NRRD File Format", teem.sourceforge.net.
+.. [2] MetaIO documentation, Insight Software Consortium.
+.. [3] 3D Slicer developer guide, "Segmentation labelmap file format (.seg.nrrd)".
+"""
 
 from __future__ import annotations
 
 import json
 import re
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -18,13 +27,23 @@ from speckle3d.core.arrays import AnyArray, ByteArray, FloatArray
 from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.files import PathLike
 from speckle3d.core.geometry import transforms_from_matrices
+from speckle3d.core.text import printable
 from speckle3d.core.volume import VOXEL_TYPES, LabelMap, Segment, Volume
-from speckle3d.io.hdf5 import reading
-from speckle3d.io.images.headers import is_image, mm_per, read_header
+from speckle3d.io.hdf5 import LABELS_ALONE, atomic_path, reading, require_suffix
+from speckle3d.io.images.headers import is_image, mm_per, read_header, write_image
 from speckle3d.io.readers import first_bytes
-from speckle3d.io.text import numbers, unescape
-from speckle3d.io.voxels.volume_writer import COMMENT, LABELS, PREFIX, RAS_FROM_LPS
+from speckle3d.io.text import number_text, numbers, unescape
 
+SUFFIXES = (".nrrd", ".mha", ".nii.gz", ".nii")
+"""Of files that are written; labels may have .seg.nrrd, too."""
+_PREFIX = "Speckle3D_"
+"""Before the names of a volume's fields, so that none is taken for one of the format's own."""
+_RAS_FROM_LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
+"""World of NIfTI from that of the other formats."""
+_LABELS, _COMMENT = "label", "speckle3d"
+"""NIfTI's intent of an image of labels, and the name of fields in its comment."""
+_REPRESENTATION = "Binary labelmap"
+"""Of labels, as Slicer calls them [3]_."""
 _SIZES = {size.to_bytes(4, order) for size in (348, 540) for order in ("little", "big")}
 """First bytes of NIfTI-1 and NIfTI-2: the length of the header."""
 _SEGMENT = re.compile(r"Segment(?:ation|(\d{1,5}))_(\w+)")
@@ -207,8 +226,8 @@ def _read_image(path: PathLike) -> tuple[AnyArray, FloatArray, dict[str, str]]:
     matrix[:3, :3], matrix[:3, 3] = axes.T, origin
     # The first axis runs fastest in a file; a mapped file may be replaced while voxels are used.
     shape = (*header.size[::-1], *[header.channels] * (header.channels > 1))
-    names = [name for name in header.fields if name.startswith(PREFIX) or _SEGMENT.fullmatch(name)]
-    fields = {name.removeprefix(PREFIX): unescape(header.fields[name]) for name in names}
+    names = [name for name in header.fields if name.startswith(_PREFIX) or _SEGMENT.fullmatch(name)]
+    fields = {name.removeprefix(_PREFIX): unescape(header.fields[name]) for name in names}
     return np.array(header.numbers()).reshape(shape).T, matrix, fields
 
 
@@ -221,12 +240,121 @@ def _read_nifti(path: Path) -> tuple[AnyArray, FloatArray, dict[str, str], bool]
         image: Any = nibabel.load(path)
         voxels = np.asanyarray(image.dataobj)
         factor = mm_per(image.header.get_xyzt_units()[0])
-        is_labels = image.header.get_intent()[0] == LABELS
+        is_labels = image.header.get_intent()[0] == _LABELS
     while voxels.ndim > 3 and voxels.shape[-1] == 1:
         voxels = voxels[..., 0]
-    affine = np.diag([factor, factor, factor, 1.0]) @ RAS_FROM_LPS @ image.affine
+    affine = np.diag([factor, factor, factor, 1.0]) @ _RAS_FROM_LPS @ image.affine
     fields: dict[str, str] = {}
     for extension in image.header.extensions:
         with suppress(ValueError, LookupError, TypeError, AttributeError):  # of somebody else
-            fields |= json.loads(bytes(extension.get_content()).rstrip(b"\0"))[COMMENT]
+            fields |= json.loads(bytes(extension.get_content()).rstrip(b"\0"))[_COMMENT]
     return voxels, affine, fields, is_labels
+
+
+def write_volume(path: PathLike, volume: Volume, compress: bool = True) -> None:
+    """Write a volume whole or not at all; the suffix chooses the format.
+
+    World axes are written as left, posterior, superior, in mm: NRRD says so, MetaImage means it, and NIfTI
+    has the first two reversed (right, anterior, superior). Numbers are little-endian.
+
+    Parameters
+    ----------
+    path : path
+        Ends in .nrrd, .mha, .nii.gz or .nii.
+    volume : Volume
+    compress : bool
+        Whether voxels are packed, where the format can.
+
+    Raises
+    ------
+    InvalidInputError
+        If the suffix is none of `SUFFIXES`.
+    FileError
+        If the file cannot be written.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> volume = Volume(np.zeros((4, 3, 2), np.uint8), (0.5, 0.5, 1.0), RigidTransform.identity())
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     write_volume(f"{folder}/v.nrrd", volume)
+    ...     read_volume(f"{folder}/v.nrrd").shape
+    (4, 3, 2)
+    """
+    is_labels = isinstance(volume, LabelMap)
+    suffix = require_suffix(path, (LABELS_ALONE, *SUFFIXES) if is_labels else SUFFIXES)
+    plain = _segment_fields(volume.segments, volume.shape) if isinstance(volume, LabelMap) else {}
+    with atomic_path(path) as part:
+        if ".nii" in suffix:
+            _write_nifti(part, volume, {**volume.fields, **plain}, is_labels)
+            return
+        named = {f"{_PREFIX}{name}": value for name, value in volume.fields.items()} | plain
+        fields = {name: _escape(value) for name, value in named.items()}
+        axes = (_meta_axes if suffix == ".mha" else _nrrd_axes)(volume)
+        write_image(part, volume.voxels.T, volume.shape, volume.voxels.dtype, axes, fields, compress)
+
+
+def _segment_fields(segments: Iterable[Segment], shape: Sequence[int]) -> dict[str, str]:
+    """Header fields of a label map and its segments, all in one layer of the whole grid."""
+    extent = " ".join(f"0 {length - 1}" for length in shape)
+    fields = {
+        "Segmentation_ContainedRepresentationNames": f"{_REPRESENTATION}|",
+        # Before Slicer 5.2 the same was called master.
+        "Segmentation_MasterRepresentation": _REPRESENTATION,
+        "Segmentation_SourceRepresentation": _REPRESENTATION,
+        "Segmentation_ReferenceImageExtentOffset": "0 0 0",
+    }
+    for i, segment in enumerate(segments):
+        row = {
+            "ID": f"Segment_{segment.value}",
+            "Name": segment.name,
+            "NameAutoGenerated": "0",
+            "Color": " ".join(f"{part:g}" for part in segment.colour),
+            "ColorAutoGenerated": "0",
+            "Extent": extent,
+            "LabelValue": str(segment.value),
+            "Layer": "0",
+        }
+        fields |= {f"Segment{i}_{name}": value for name, value in row.items()}
+    return fields
+
+
+def _write_nifti(path: Path, volume: Volume, fields: Mapping[str, str], is_labels: bool) -> None:
+    image: Any = nibabel.Nifti1Image(volume.voxels, _RAS_FROM_LPS @ volume.world_from_index)
+    image.set_qform(image.affine, 1)
+    image.set_sform(image.affine, 1)
+    image.header.set_xyzt_units("mm")
+    if is_labels:
+        image.header.set_intent(_LABELS)
+    if fields:
+        text = json.dumps({_COMMENT: dict(fields)}, ensure_ascii=False).encode("utf-8", "backslashreplace")
+        image.header.extensions.append(nibabel.nifti1.Nifti1Extension("comment", text))
+    nibabel.save(image, path)
+
+
+def _nrrd_axes(volume: Volume) -> str:
+    *steps, origin = (f"({number_text(column, ',')})" for column in volume.world_from_index[:3].T)
+    return f"""space: left-posterior-superior
+space directions: {" ".join(steps)}
+kinds: domain domain domain
+space units: "mm" "mm" "mm"
+space origin: {origin}"""
+
+
+def _meta_axes(volume: Volume) -> str:
+    """Kinds are as PLUS tells a volume from a sequence of frames."""
+    pose = volume.world_from_grid
+    return f"""Kinds = domain domain domain
+TransformMatrix = {number_text(pose.rotation.as_matrix().T)}
+Offset = {number_text(pose.translation)}
+CenterOfRotation = 0 0 0
+ElementSpacing = {number_text(volume.spacing_mm)}"""
+
+
+def _escape(text: str) -> str:
+    r"""Write text on one line, with line breaks and backslashes as NRRD has them: ``\n`` and ``\\``.
+
+    Blanks at its ends are lost, and control characters are shown as Python writes them.
+    """
+    lines = printable(text.strip().replace("\r\n", "\n"), kept="\n")
+    return lines.replace("\\", "\\\\").replace("\n", "\\n")

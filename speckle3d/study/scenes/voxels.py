@@ -22,8 +22,7 @@ from speckle3d.imaging.measures.uncertainty import deviation_volume
 from speckle3d.imaging.voxels.grid import VoxelGrid, grid_around, spacing_within
 from speckle3d.imaging.voxels.settings import CompoundingSettings
 from speckle3d.imaging.voxels.volume import compound_onto
-from speckle3d.io.voxels.volume_writer import write_volume
-from speckle3d.io.voxels.volumes import read_volume
+from speckle3d.io.voxels.volumes import read_volume, write_volume
 from speckle3d.study.pose_errors import errors_of
 from speckle3d.study.posed import MARK, PosedSweep, pose_mark
 
@@ -150,7 +149,7 @@ def write_voxels(
     posed : PosedSweep
     settings : CompoundingSettings
     out : path
-        With a suffix of `speckle3d.io.voxels.volume_writer.SUFFIXES`.
+        With a suffix of `speckle3d.io.voxels.volumes.SUFFIXES`.
     grid_request : GridRequest, optional
         By default cubic voxels along the sweep that hold it.
     region : Region, optional

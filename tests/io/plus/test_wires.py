@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from speckle3d.io.plus.wires import read_wire_phantom
+from speckle3d.io.plus.device_set import read_wire_phantom
 
 N = """<Pattern Type="NWire">
   <Wire Name="a" EndPointFront="30 0 20" EndPointBack="30 40 20" />
