@@ -63,10 +63,10 @@ def own_values(path: str, fields: Mapping[str, str]) -> dict[str, Any]:
         Naming the field that does not make sense.
     """
     texts = {name.removeprefix(_PREFIX): text for name, text in fields.items() if name.startswith(_PREFIX)}
-    values: dict[str, Any] = {"probe": texts.pop("probe", "")}
+    values: dict[str, Any] = {}
     for name, text in texts.items():
-        first, *others = numbers(text, None, f"{path}: {_PREFIX}{name}")
-        values[name] = (first, *others) if others else first
+        parts = (text,) if name == "probe" else numbers(text, None, f"{path}: {_PREFIX}{name}")
+        values[name] = parts if len(parts) > 1 else parts[0]
     return values
 
 

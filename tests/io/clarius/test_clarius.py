@@ -54,6 +54,16 @@ def test_an_archive_cut_short_is_no_recording(tmp_path):
         _ = load_sweep(path, IMPORT_SETTINGS)
 
 
+def test_a_damaged_block_of_lzop_is_told(tmp_path):
+    folder = examples.write_package(tmp_path / "p", sweep_of("rf"), lzop=True)
+    (file,) = folder.glob("*.lzo")
+    content = bytearray(file.read_bytes())
+    content[-50] ^= 1
+    file.write_bytes(content)
+    with pytest.raises(FileError, match="check sum"):
+        load_sweep(folder, IMPORT_SETTINGS)
+
+
 def test_rf_is_preferred_and_a_raw_file_gives_its_own_kind(tmp_path):
     rf, iq = sweep_of("rf"), sweep_of("iq")
     folder = examples.write_files(tmp_path / "both", examples.package_files(iq) | examples.package_files(rf))
