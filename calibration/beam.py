@@ -27,7 +27,7 @@ class BeamBias:
     ----------
     width_mm : float
         Thickness of the beam.
-    simulated_mm : ndarray, shape (3,)
+    shift_mm : ndarray, shape (3,)
         Displacement of the middle of the lines' points along the image's axes when all parameters are
         estimated.
     rms_mm : float
@@ -35,7 +35,7 @@ class BeamBias:
     """
 
     width_mm: float
-    simulated_mm: FloatArray
+    shift_mm: FloatArray
     rms_mm: float
 
 

@@ -7,7 +7,6 @@ from textwrap import fill
 from typing import Any
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from calibration.beam import BeamBias
@@ -95,7 +94,7 @@ def text_report(calibration: Calibration, beam: Sequence[BeamBias] = (), notes: 
     if beam:
         lines += ["", "On a bare wall, lines at the first echo put the image too near to the probe, by"]
         lines += [
-            f"  {abs(bias.simulated_mm[1]):.2f} mm if the beam is {bias.width_mm:g} mm thick "
+            f"  {abs(bias.shift_mm[1]):.2f} mm if the beam is {bias.width_mm:g} mm thick "
             f"(with an RMS residual of {bias.rms_mm:.3f} mm)"
             for bias in beam
         ]
@@ -108,26 +107,18 @@ def text_report(calibration: Calibration, beam: Sequence[BeamBias] = (), notes: 
 
 def json_report(calibration: Calibration, beam: Sequence[BeamBias] = ()) -> dict[str, Any]:
     """Numbers of the report, angles in radians."""
-    lengths = calibration.translation_mm, calibration.pixel_mm
-    translation, pixel = (None if values is None else values.tolist() for values in lengths)
-    plain = ("method", "sensor", "rms", "rms_unit", "condition_number", "time_offset_s", "verdict")
+    frames, names = calibration.frames, ("tilt_rad", "yaw_rad", "roll_rad", "x_mm", "y_mm", "z_mm")
+    plain = ("method", "sensor", "translation_mm", "pixel_mm", "parameters")
+    plain += ("rms", "rms_unit", "condition_number", "time_offset_s", "verdict")
     return {
         **{name: getattr(calibration, name) for name in plain},
-        "parameters": [vars(parameter) for parameter in calibration.parameters],
-        "sensor_from_image_wxyz": calibration.rotation.as_quat(scalar_first=True).tolist(),
-        "translation_mm": translation,
-        "pixel_mm": pixel,
-        "standard_errors": np.sqrt(np.diag(calibration.covariance)).tolist(),
-        "standard_errors_of": ["tilt_rad", "yaw_rad", "roll_rad", "x_mm", "y_mm", "z_mm"][
-            : len(calibration.covariance)
-        ],
-        "frames_given": calibration.frames.given,
-        "frames_used": list(calibration.frames.used),
-        "frames_dropped": {str(frame): why for frame, why in calibration.frames.dropped.items()},
-        "beam": [
-            {"width_mm": bias.width_mm, "shift_mm": bias.simulated_mm.tolist(), "rms_mm": bias.rms_mm}
-            for bias in beam
-        ],
+        "sensor_from_image_wxyz": calibration.rotation.as_quat(scalar_first=True),
+        "standard_errors": np.sqrt(np.diag(calibration.covariance)),
+        "standard_errors_of": names[: len(calibration.covariance)],
+        "frames_given": frames.given,
+        "frames_used": frames.used,
+        "frames_dropped": frames.dropped,
+        "beam": beam,
     }
 
 
@@ -136,7 +127,6 @@ def figure_report(
 ) -> Figure:
     """One page: images with what was found in them, residuals, and the motion."""
     figure = Figure(figsize=(12.0, 7.5), layout="constrained")
-    FigureCanvasAgg(figure)
     panels = figure.subplots(2, 3)
     for axes in panels[0]:
         axes.set_axis_off()

@@ -12,8 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from calibration.clock.offset import ClockOffset, covered, delays_around, peak_of
-from calibration.clock.smoothing import SmoothReadings
+from calibration.clock.offset import ClockOffset, SmoothReadings, covered, delays_around, peak_of
 from calibration.motion import InadequateError
 from calibration.noise import fit_noise
 from calibration.points import SOME_FRAMES, ImagePoints, as_directions

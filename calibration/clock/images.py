@@ -21,8 +21,7 @@ import numpy as np
 from scipy.ndimage import uniform_filter1d
 from scipy.spatial.transform import RigidTransform
 
-from calibration.clock.offset import SEARCH_S, ClockOffset, covered, delays_around, peak_of
-from calibration.clock.smoothing import SmoothReadings
+from calibration.clock.offset import SEARCH_S, ClockOffset, SmoothReadings, covered, delays_around, peak_of
 from calibration.images.similarity import LEAST_OVERLAP, Comparison, spread_patches
 from calibration.images.stacks import read_stack
 from calibration.points import Recording

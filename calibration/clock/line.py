@@ -16,8 +16,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from calibration.clock.offset import SEARCH_S, ClockOffset, covered, delays_around, peak_of
-from calibration.clock.smoothing import SmoothReadings
+from calibration.clock.offset import SEARCH_S, ClockOffset, SmoothReadings, covered, delays_around, peak_of
 from calibration.solution import autocorrelation_time
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError

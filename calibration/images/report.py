@@ -12,7 +12,6 @@ from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from calibration.images.solver import SPECKLED_SIMILARITY, ImageCalibration
@@ -71,7 +70,6 @@ def notes_of(result: ImageCalibration) -> list[str]:
 def figure_of(result: ImageCalibration, sweeps: tuple[Recording, Recording]) -> Figure:
     """One page: an image of each sweep beside what the other shows in its place, before and after."""
     figure = Figure(figsize=(12.0, 8.0), layout="constrained")
-    FigureCanvasAgg(figure)
     panels = figure.subplots(2, 3)
     for row, frames, pair in zip(panels, result.sweeps.frames, (sweeps, sweeps[::-1]), strict=True):
         _draw_images(row, result, *pair, int(frames[len(frames) // 2]))

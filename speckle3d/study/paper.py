@@ -19,6 +19,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from importlib.metadata import version
 from importlib.resources import files
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -65,18 +66,14 @@ _Input = tuple[Path, SimulationSettings]
 """File of a sweep to be simulated, and its settings."""
 
 
-def paper_errors() -> dict[tuple[str, str], dict[str, tuple[float, float]]]:
-    """Tables 3 and 4: by data set and part (f forward, r reverse), the errors of each mode of `MODES`.
-
-    An error is that of length, per cent, and of tilt, degrees.
-    """
+def published_errors() -> dict[str, list[ModeError]]:
+    """Tables 3 and 4: errors of length and tilt by data set, of every part (f forward, r back) and mode."""
     text = files("speckle3d.study").joinpath("housden2008.csv").read_text(encoding="utf-8")
-    return {
-        (row["data_set"], row["part"]): {
-            mode: (float(row[f"{mode}_percent"]), float(row[f"{mode}_tilt_deg"])) for mode in MODES
-        }
-        for row in csv.DictReader(text.splitlines())
-    }
+    rows: dict[str, list[ModeError]] = {}
+    for name, part, mode, percent, tilt_deg in list(csv.reader(text.splitlines()))[1:]:
+        errors = {"length_error_percent": float(percent), "tilt_error_deg": float(tilt_deg)}
+        rows.setdefault(name, []).append(ModeError(part, mode, 0, **errors))
+    return rows
 
 
 def paper_study(
@@ -123,6 +120,7 @@ def paper_study(
         tell(count, len(paths))
     study = compare_sweeps(paths, directory, None, TRACKER, curves, scheduler=runner, progress=progress)
     rows: Rows = {
+        "published": published_errors(),
         TRACKER: {summary.sweep: summary.rows for summary in study.summaries},
         "truth": {o.name: _compare_with_truth(study.directory, o) for o in study.successes},
     }
@@ -141,23 +139,12 @@ def beside(rows: Rows) -> list[dict[str, Any]]:
         ``mode``, ``against`` ("published", or a reference of ours), ``quantity`` and its `mean_interval`.
         Parts, not sweeps, are the units, as there are 17 in the tables.
     """
-    errors = {"published": {mode: [part[mode] for part in paper_errors().values()] for mode in MODES}}
-    for name, by_sweep in rows.items():
-        errors[name] = {
-            mode: [_error(row) for rows in by_sweep.values() for row in rows if row.mode == mode]
-            for mode in MODES
-        }
     return [
-        {
-            "mode": mode,
-            "against": name,
-            "quantity": key,
-            **mean_interval(np.abs(errors[name][mode])[:, k]),
-        }
-        for k, key in enumerate(QUANTITIES)
+        {"mode": mode, "against": name, "quantity": key, **mean_interval(np.abs(errors))}
+        for key in QUANTITIES
         for mode in MODES
-        for name in errors
-        if errors[name][mode]
+        for name, by_sweep in rows.items()
+        if (errors := [getattr(row, key) for row in chain(*by_sweep.values()) if row.mode == mode])
     ]
 
 
@@ -167,17 +154,20 @@ def text_beside(rows: Rows) -> str:
     Of ours, the errors against the tracker are listed part by part.
     """
     lines = [["data set", *(f"{mode} {unit}" for unit in ("%", "°") for mode in MODES)]]
-    for (name, part), paper in paper_errors().items():
-        ours = {row.mode: _error(row) for row in rows[TRACKER].get(name, ()) if row.part == part}
-        cells = [
-            " | ".join(
-                number(key, errors[mode][k], signed=True) if mode in errors else "-"
-                for errors in (paper, ours)
-            )
-            for k, key in enumerate(QUANTITIES)
-            for mode in MODES
+    for name, published in rows["published"].items():
+        tables = [
+            {(row.part, row.mode): row for row in errors}
+            for errors in (published, rows[TRACKER].get(name, ()))
         ]
-        lines.append([f"{name} {part}", *cells])
+        for part in dict.fromkeys(row.part for row in published):
+            cells = [
+                " | ".join(
+                    number(key, getattr(table.get((part, mode)), key, None), signed=True) for table in tables
+                )
+                for key in QUANTITIES
+                for mode in MODES
+            ]
+            lines.append([f"{name} {part}", *cells])
     means = [["mean absolute error", "mode", "against", "mean [95 % of bootstrap samples]"]]
     means += [
         [words_of(row["quantity"]), row["mode"], row["against"], with_interval(row, "mean")]
@@ -188,10 +178,6 @@ def text_beside(rows: Rows) -> str:
         "the tracker.\nThe published sweeps of beef are 1.5 to 4 mm long, these 10 or 20 mm.\n\n"
         f"{text_table(lines)}\n{text_table(means, (0, 1, 2, 3))}"
     )
-
-
-def _error(row: ModeError) -> tuple[float, float]:
-    return row.length_error_percent, row.tilt_error_deg
 
 
 def _write_input(job: _Input) -> None:

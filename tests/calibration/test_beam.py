@@ -32,7 +32,7 @@ def test_what_is_predicted_is_what_a_thick_beam_does():
     # From exact lines; and, as on real ones, from lines that the beam has already moved.
     for solution in (thin, thick):
         bias = predict_bias(solution, width_mm)
-        np.testing.assert_allclose(bias.simulated_mm, shift, atol=0.005 * size)
+        np.testing.assert_allclose(bias.shift_mm, shift, atol=0.005 * size)
         assert bias.rms_mm == pytest.approx(thick.rms, rel=0.01)
         assert bias.width_mm == width_mm
     assert shift[1] < 0

@@ -45,10 +45,11 @@ class LinesViewer(PhantomViewer):
         plot.scatter("column", "row", source=self._inliers, size=6, line_color=ORANGE, fill_color=None)
 
     def view(self) -> Viewable:
-        """Lay out the sliders, two in a row."""
-        sliders = [self.widgets[name] for name in self.detection]
+        """Lay out the sliders and what the plane is, two in a row."""
+        names = [name for name in (*self.detection, "reflector") if name in self.widgets]
+        controls = [self.widgets[name] for name in names]
         return self.layout(
-            *(pn.Row(*sliders[at : at + 2]) for at in (0, 2, 4)), pn.pane.HTML(_HINT, width=600)
+            *(pn.Row(*controls[at : at + 2]) for at in (0, 2, 4)), pn.pane.HTML(_HINT, width=600)
         )
 
     def show(self, image: npt.NDArray[Any], settings: ScanSettings) -> str:

@@ -76,14 +76,16 @@ class PhantomViewer:
             name="frame", end=max(count - 1, 1), disabled=count < 2, sizing_mode="stretch_width"
         )
         self._words = pn.pane.HTML("", sizing_mode="stretch_width")
-        self._button = pn.widgets.Button(name="Run calibration", button_type="primary", width=150)
+        self._button = pn.widgets.Button(
+            name="Run calibration", button_type="primary", width=150, align="end"
+        )
         self._verdict = pn.pane.HTML(sentence("Not calibrated yet.", "#555555"), width=600)
         self._stale = pn.pane.HTML(
             sentence("Settings changed since this run: run again.", ORANGE), visible=False
         )
         self._table, self._note = pn.pane.HTML("", width=600), pn.pane.HTML("", width=600)
         self._name = pn.widgets.TextInput(
-            name="file of the result", value=f"{images.stem}-calibration.h5", width=460
+            name="file of the result", value=f"{images.stem}-calibration.h5", width=300
         )
         self._save = pn.widgets.Button(name="Save result", width=110, disabled=True, align="end")
         self._slider.param.watch(self._show, "value")
@@ -104,11 +106,9 @@ class PhantomViewer:
         right = pn.Column(
             *parts,
             pn.Row(self.widgets["region"], self.widgets["leave_out"]),
-            *filter(None, [self.widgets.get("reflector")]),
-            self._button,
+            pn.Row(self._button, self._save, self._name),
             self._stale,
             self._verdict,
-            pn.Row(self._save, self._name),
             self._note,
             self._table,
             scroll="y-auto",

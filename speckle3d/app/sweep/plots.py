@@ -7,7 +7,14 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from bokeh.models import ColumnDataSource, FactorRange, HoverTool, LinearColorMapper, Range1d
+from bokeh.models import (
+    ColumnDataSource,
+    FactorRange,
+    HoverTool,
+    LinearColorMapper,
+    PrintfTickFormatter,
+    Range1d,
+)
 from bokeh.models.annotations import ColorBar, Span
 from bokeh.palettes import Viridis256
 from bokeh.plotting import figure
@@ -74,7 +81,8 @@ class PatchPlot(ImagePlot):
             ("standard deviation of the distance", "@sigma{0.000} mm"),
         ]
         self.plot.add_tools(HoverTool(renderers=[patches], tooltips=tips))
-        self._bar = ColorBar(color_mapper=self._colours, title="mm", width=10, padding=4, visible=False)
+        ticks = PrintfTickFormatter(format="%.2f mm")
+        self._bar = ColorBar(color_mapper=self._colours, formatter=ticks, width=10, padding=4, visible=False)
         self.plot.add_layout(self._bar, "right")
 
     def colour(self, patches: PatchValues | None, by: str, most: float) -> None:

@@ -10,7 +10,7 @@ import typer
 import speckle3d as s3
 from speckle3d.cli.common import MaybeNumber, MaybePath, MaybeText, Out, Result, note
 from speckle3d.cli.outputs import require_own_place
-from speckle3d.core.errors import naming
+from speckle3d.core.errors import InvalidInputError, naming
 
 
 def measure(
@@ -149,10 +149,12 @@ def surface(
     from speckle3d.study.posed import MARK, pose_mark, require_made_at
 
     volume = s3.load_volume(volume_file)
-    errors: tuple[Any, ...] = ()
+    said, errors = volume.fields.get("poses"), tuple[Any, ...]()
+    if mode is not None and said not in (None, mode):
+        raise InvalidInputError(f"--mode: {volume_file} was made at the poses of {said}, got {mode}")
     if reconstruction is not None:
         posed = s3.load_reconstruction(reconstruction, with_pairs=False)
-        volume_mode = mode or volume.fields.get("poses", "image")
+        volume_mode = mode or said or "image"
         with naming(f"{volume_file}: made at the poses of {volume_mode}"):
             mark = pose_mark(poses_of(posed, volume_mode))
         require_made_at(volume.fields.get(MARK, ""), mark, str(volume_file))

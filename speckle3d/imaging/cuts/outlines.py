@@ -10,6 +10,8 @@ from speckle3d.core.grid import ImageGrid
 from speckle3d.imaging.images import image_corners
 
 _ON_PLANE_MM = 1e-6
+_STEPS = 256
+"""Places along a line at which it is looked whether it lies in a fan."""
 
 
 def frame_outlines(grid: ImageGrid, world_from_image: RigidTransform) -> FloatArray:
@@ -63,3 +65,27 @@ def crossings(outlines_mm: FloatArray, world_from_plane: RigidTransform) -> Floa
     ends = np.take_along_axis(at, nearer[..., None], axis=1)
     ends[crosses.sum(axis=1) != 2] = np.nan
     return ends
+
+
+def within_fan(lines_mm: FloatArray, plane_from_image: RigidTransform, grid: ImageGrid) -> FloatArray:
+    """The part of each line that lies in the image of its frame, which a fan does not fill up to its box.
+
+    Parameters
+    ----------
+    lines_mm : ndarray, shape (n, 2, 2)
+        From `crossings`.
+    plane_from_image : RigidTransform, length n
+    grid : ImageGrid
+        Of the images as they were recorded; the lines through parallel vectors stay as they are.
+    """
+    if grid.fan is None:
+        return lines_mm
+    points = np.linspace(lines_mm[:, 0], lines_mm[:, 1], _STEPS, axis=1)
+    image_from_plane = plane_from_image.inv().as_matrix()
+    places = np.einsum("nij,nkj->nki", image_from_plane[:, :2, :2], points) + image_from_plane[:, None, :2, 3]
+    sample = grid.sample_at(places)
+    inside = ((sample >= 0) & (sample <= [grid.vectors - 1, grid.samples - 1])).all(axis=-1)
+    ends = np.stack([inside.argmax(axis=1), _STEPS - 1 - inside[:, ::-1].argmax(axis=1)], axis=1)
+    parts = np.take_along_axis(points, ends[..., None], axis=1)
+    parts[~inside.any(axis=1)] = np.nan
+    return parts

@@ -20,7 +20,7 @@ from speckle3d.core.geometry import transforms_from_matrices
 from speckle3d.core.grid import Region
 from speckle3d.core.sweep import BModeSettings
 from speckle3d.core.volume import Volume
-from speckle3d.imaging.cuts.outlines import crossings, frame_outlines
+from speckle3d.imaging.cuts.outlines import crossings, frame_outlines, within_fan
 from speckle3d.imaging.cuts.planes import Cut
 from speckle3d.imaging.cuts.reslice import reslice_at
 from speckle3d.imaging.images import PosedImages
@@ -127,8 +127,9 @@ def cut_at_modes(
     for (mode, cut), image in zip(place.cuts.items(), levels, strict=True):
         cuts[mode] = DrawnCut(image, cut)
         if cut.world_from_picture is not None:
+            plane_from_image = cut.world_from_picture.inv() * poses[mode]
             lines = crossings(frame_outlines(grid, poses[mode]), cut.world_from_picture)
-            cuts[mode] = DrawnCut(image, cut, lines)
+            cuts[mode] = DrawnCut(image, cut, within_fan(lines, plane_from_image, modes.posed.sweep.grid))
     reference = Reference.over_all(modes.reference, poses[modes.reference])
     lengths = length_words(error_rows(poses, reference, grid.centre_mm), modes.reference)
     name = modes.posed.sweep.name
