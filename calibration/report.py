@@ -108,10 +108,12 @@ def text_report(calibration: Calibration, beam: Sequence[BeamBias] = (), notes: 
 def json_report(calibration: Calibration, beam: Sequence[BeamBias] = ()) -> dict[str, Any]:
     """Numbers of the report, angles in radians."""
     frames, names = calibration.frames, ("tilt_rad", "yaw_rad", "roll_rad", "x_mm", "y_mm", "z_mm")
-    plain = ("method", "sensor", "translation_mm", "pixel_mm", "parameters")
-    plain += ("rms", "rms_unit", "condition_number", "time_offset_s", "verdict")
+    alike = ("method", "sensor", "translation_mm", "pixel_mm", "parameters", "rms", "rms_unit")
     return {
-        **{name: getattr(calibration, name) for name in plain},
+        **{
+            name: getattr(calibration, name)
+            for name in (*alike, "condition_number", "time_offset_s", "verdict")
+        },
         "sensor_from_image_wxyz": calibration.rotation.as_quat(scalar_first=True),
         "standard_errors": np.sqrt(np.diag(calibration.covariance)),
         "standard_errors_of": names[: len(calibration.covariance)],

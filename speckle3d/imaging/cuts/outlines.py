@@ -84,7 +84,7 @@ def within_fan(lines_mm: FloatArray, plane_from_image: RigidTransform, grid: Ima
     image_from_plane = plane_from_image.inv().as_matrix()
     places = np.einsum("nij,nkj->nki", image_from_plane[:, :2, :2], points) + image_from_plane[:, None, :2, 3]
     sample = grid.sample_at(places)
-    inside = ((sample >= 0) & (sample <= [grid.vectors - 1, grid.samples - 1])).all(axis=-1)
+    inside = np.all((sample >= 0) & (sample <= [grid.vectors - 1, grid.samples - 1]), axis=-1)
     ends = np.stack([inside.argmax(axis=1), _STEPS - 1 - inside[:, ::-1].argmax(axis=1)], axis=1)
     parts = np.take_along_axis(points, ends[..., None], axis=1)
     parts[~inside.any(axis=1)] = np.nan
