@@ -1,7 +1,5 @@
 """Describe a file in rows of description, value and unit."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -14,8 +12,6 @@ from speckle3d.core.files import PathLike
 from speckle3d.core.sweep import BModeSettings, RFSettings, Sweep
 from speckle3d.core.volume import LabelMap
 from speckle3d.io.family import calibrations, curves, reconstructions
-from speckle3d.io.family.calibrations import read_calibration
-from speckle3d.io.family.reconstructions import read_reconstruction
 from speckle3d.io.load import kind_of, open_recording
 from speckle3d.io.recordings import Row, number_row, rate_of
 from speckle3d.io.voxels.volumes import is_volume, read_volume
@@ -105,12 +101,12 @@ def _rate_rows(name: str, times: FloatArray, unit: str) -> Iterator[Row]:
 
 
 def _reconstruction_rows(path: PathLike) -> Iterator[Row]:
-    result = read_reconstruction(path)
+    result = reconstructions.read_reconstruction(path)
     pairs, times = result.pairs, result.frame_time_s
     yield "frames", str(times.size), ""
     yield from _rate_rows("", times, "frames/s")
-    yield "frame pairs", str(0 if pairs is None else len(pairs)), ""
-    yield "patches", str(0 if pairs is None else len(pairs.patch_centre_mm)), ""
+    yield "frame pairs", str(len(pairs) if pairs else 0), ""
+    yield "patches", str(len(pairs.patch_centre_mm) if pairs else 0), ""
     yield from _source_rows(result.provenance)
     for calibration in result.provenance.calibrations:
         yield f"calibration of {calibration.sensor}", calibration.path, ""
@@ -125,7 +121,7 @@ def _source_rows(source: Any) -> Iterator[Row]:
 
 
 def _calibration_rows(path: PathLike) -> Iterator[Row]:
-    calibration = read_calibration(path)
+    calibration = calibrations.read_calibration(path)
     yield from calibration.rows()
     yield from _source_rows(calibration.source)
 

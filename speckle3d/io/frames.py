@@ -1,17 +1,14 @@
 """Frames that stay in a file and are read, and turned, one at a time."""
 
-from __future__ import annotations
-
 import operator
 import threading
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, Self, TypeAlias
 
 import h5py
 import numpy as np
-import numpy.typing as npt
 
 from speckle3d.core.arrays import AnyArray
 from speckle3d.core.errors import InvalidInputError, naming
@@ -23,6 +20,7 @@ ReadFrame: TypeAlias = Callable[[int], AnyArray]
 """Reads frame i of an open file, shape (vector, sample)."""
 
 
+@dataclass(eq=False, repr=False)
 class FileFrames:
     """Frames of a file that is opened when the first one is asked for; several threads may read.
 
@@ -39,21 +37,19 @@ class FileFrames:
         Numbers of the frames in the file; by default all of them in order.
     """
 
+    path: PathLike
+    open_file: Callable[[], ReadFrame]
+    shape: tuple[int, int, int]
+    dtype: Any
+    stored_dtype: Any = None
+    numbers: Any = None
     any_thread = True
 
-    def __init__(
-        self,
-        path: PathLike,
-        open_file: Callable[[], ReadFrame],
-        shape: tuple[int, int, int],
-        dtype: npt.DTypeLike,
-        stored_dtype: npt.DTypeLike | None = None,
-        numbers: Sequence[int] | None = None,
-    ) -> None:
-        self.path, self.open_file = Path(path).absolute(), open_file
-        self.numbers = range(shape[0]) if numbers is None else numbers
-        self.shape, self.dtype = (len(self.numbers), *shape[1:]), np.dtype(dtype)
-        self.stored_dtype = np.dtype(dtype if stored_dtype is None else stored_dtype)
+    def __post_init__(self) -> None:
+        self.path, self.dtype = Path(self.path).absolute(), np.dtype(self.dtype)
+        if self.numbers is None:
+            self.numbers = range(self.shape[0])
+        self.shape = (len(self.numbers), *self.shape[1:])
         self._read: ReadFrame | None = None
         self._lock = threading.Lock()
 
@@ -77,15 +73,12 @@ class FileFrames:
             require_finite(frame, where)
         return frame
 
-    def take(self, rows: AnyArray, axis: int = 0) -> FileFrames:
+    def take(self, rows: AnyArray, axis: int = 0) -> Self:
         """Subset of the frames, as by `numpy.take`."""
-        kind, (*others, numbers) = self.__reduce__()
-        part: FileFrames = kind(*others, [numbers[i] for i in rows.tolist()])
-        return part
+        return replace(self, numbers=[self.numbers[i] for i in rows.tolist()])
 
     def __reduce__(self) -> tuple[Any, tuple[Any, ...]]:
-        own = self.path, self.open_file, self.shape, self.dtype, self.stored_dtype, self.numbers
-        return FileFrames, own
+        return FileFrames, tuple(getattr(self, part.name) for part in fields(self))
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,5 @@
 """HDF5 files: written whole or not at all, read with errors that name the place."""
 
-from __future__ import annotations
-
 import ctypes
 import hashlib
 import os
@@ -124,21 +122,14 @@ def open_hdf5(path: PathLike) -> h5py.File:
         except OSError as error:
             if not any(words in str(error) for words in _HAS_WRITER):
                 raise
-            return _open_beside_writer(path)
-
-
-def _open_beside_writer(path: PathLike) -> h5py.File:
-    """Open a file as a reader beside its writer.
-
-    What is half written HDF5 reads a hundred times, each after twice the time: for ever in a file that was
-    copied while it grew. h5py has no word for fewer, so HDF5 itself is told.
-    """
-    access = h5py.h5p.create(h5py.h5p.FILE_ACCESS)
-    with suppress(OSError, AttributeError):  # Windows does not give away what a library loads
-        tell = ctypes.CDLL(h5py.h5p.__file__).H5Pset_metadata_read_attempts
-        tell(ctypes.c_int64(access.id), ctypes.c_uint(_READ_ATTEMPTS))
-    flags = h5py.h5f.ACC_RDONLY | h5py.h5f.ACC_SWMR_READ
-    return h5py.File(h5py.h5f.open(os.fsencode(path), flags, fapl=access))
+        # What is half written HDF5 reads a hundred times, each after twice the time: for ever in a file that
+        # was copied while it grew. h5py has no word for fewer, so HDF5 itself is told.
+        access = h5py.h5p.create(h5py.h5p.FILE_ACCESS)
+        with suppress(OSError, AttributeError):  # Windows does not give away what a library loads
+            tell = ctypes.CDLL(h5py.h5p.__file__).H5Pset_metadata_read_attempts
+            tell(ctypes.c_int64(access.id), ctypes.c_uint(_READ_ATTEMPTS))
+        flags = h5py.h5f.ACC_RDONLY | h5py.h5f.ACC_SWMR_READ
+        return h5py.File(h5py.h5f.open(os.fsencode(path), flags, fapl=access))
 
 
 @contextmanager

@@ -5,8 +5,6 @@ every recording of its folder; those for a folder ``scan`` in ``scan.toml``, ``s
 ``import.toml`` beside it. Options replace them one by one.
 """
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 from typing import Annotated

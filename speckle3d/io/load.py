@@ -1,7 +1,5 @@
 """Open any recording that holds a sweep; the reader is chosen by content, not by name."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Generator
 from dataclasses import replace

@@ -3,8 +3,6 @@
 A package adds a format by an entry point of the group ``speckle3d.readers`` that names a `Reader`.
 """
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext

@@ -5,8 +5,6 @@ its source, as in "0.05 (given by import.toml, the file says 0.2)". What is in n
 at once. Readers fill a `Recording`; it makes the sweep, describes itself and tells contradictions.
 """
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import suppress

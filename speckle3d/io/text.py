@@ -1,7 +1,5 @@
 """Text files of numbers, read line by line so that an error names the file and the line."""
 
-from __future__ import annotations
-
 import io
 import re
 from codecs import BOM_UTF16_BE, BOM_UTF16_LE

@@ -1,7 +1,5 @@
 """TOML files checked against a pydantic model, so that an error names the file and the setting."""
 
-from __future__ import annotations
-
 import tomllib
 from pathlib import Path
 from typing import Any, TypeVar

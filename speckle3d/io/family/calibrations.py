@@ -8,11 +8,8 @@ where it is known, ``time_offset_s``. Data sets: ``/sensor_from_image`` (4, 4), 
 ``given``; ``/source`` with attributes.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import h5py
 import numpy as np
@@ -145,9 +142,10 @@ def apply_calibrations(sweep: Sweep, paths: Sequence[PathLike]) -> tuple[Sweep, 
 
 def fitted_pixels(paths: Sequence[PathLike]) -> dict[str, float]:
     """Return the pixel size of the first calibration that has one, as import settings of B-mode images."""
-    sizes = (read_calibration(path).pixel_mm for path in paths)
-    pixel_mm = next((size for size in sizes if size is not None), ())
-    return dict(zip(("column_pitch_mm", "row_spacing_mm"), map(float, pixel_mm), strict=False))
+    for path in paths:
+        if (pixel_mm := read_calibration(path).pixel_mm) is not None:
+            return dict(zip(("column_pitch_mm", "row_spacing_mm"), pixel_mm.tolist(), strict=True))
+    return {}
 
 
 def resized(sweep: Sweep, sizes: dict[str, float]) -> Sweep:
@@ -155,14 +153,12 @@ def resized(sweep: Sweep, sizes: dict[str, float]) -> Sweep:
     if not isinstance(sweep.signal, BModeSettings):
         return sweep
     grid = sweep.grid
+    pitch_mm = sizes.get("column_pitch_mm", grid.vector_pitch_mm)
     row_mm = sizes.get("row_spacing_mm", grid.sample_spacing_mm)
-    changes: dict[str, Any] = {
-        "vector_pitch_mm": sizes.get("column_pitch_mm", grid.vector_pitch_mm),
-        "sample_spacing_mm": row_mm,
-        # Rows count from the probe's face, including those above the first stored row.
-        "first_sample_depth_mm": grid.first_sample_depth_mm * row_mm / grid.sample_spacing_mm,
-    }
-    return replace(sweep, grid=replace(grid, **changes))
+    # Rows count from the probe's face, including those above the first stored row.
+    first_mm = grid.first_sample_depth_mm * row_mm / grid.sample_spacing_mm
+    grid = replace(grid, vector_pitch_mm=pitch_mm, sample_spacing_mm=row_mm, first_sample_depth_mm=first_mm)
+    return replace(sweep, grid=grid)
 
 
 def _read_parameters(group: h5py.Group) -> tuple[Parameter, ...]:

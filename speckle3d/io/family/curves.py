@@ -1,7 +1,5 @@
 """Decorrelation curves on disk (format ``speckle3d.curves``, version 1; 2 with a spectrum)."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

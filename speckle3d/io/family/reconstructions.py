@@ -1,7 +1,5 @@
 """The reconstruction file, version 1."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import h5py

@@ -5,8 +5,6 @@ change. A frame is in the file before its time is, and a reading before its time
 either as there are times.
 """
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Iterator, Mapping
@@ -26,8 +24,7 @@ from speckle3d.core.grid import ImageGrid
 from speckle3d.core.progress import Progress
 from speckle3d.core.sweep import BModeSettings, OrientationSensor, RFSettings, Sweep, Tracker, stored_dtype
 from speckle3d.core.threads import ahead
-from speckle3d.io.family.meanings import label
-from speckle3d.io.family.records import put, put_fields, reserve, trim, written
+from speckle3d.io.family.records import label, put, put_fields, reserve, trim, written
 from speckle3d.io.family.sweeps import (
     FORMAT,
     GROWING,
@@ -99,7 +96,7 @@ def _append_frame(node: h5py.Dataset, frame: AnyArray) -> None:
     samples = np.ascontiguousarray(frame, kind)
     if kind != node.dtype:  # pairs of int16, as which they were read
         samples = samples.view(np.float32).reshape(shape).astype(node.dtype)
-    reserve(node.file.id, samples.nbytes)
+    reserve(h5py.h5i.get_file_id(node.id), samples.nbytes)
     node.id.set_extent((count + 1, *shape))
     if node.compression is None:
         node.id.write_direct_chunk((count, *(0,) * samples.ndim), samples)

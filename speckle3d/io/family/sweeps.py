@@ -1,7 +1,5 @@
 """Reading of the sweep file, versions 1 and 2 (with I/Q); frames stay on disk."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from pathlib import Path

@@ -15,8 +15,6 @@ References
 .. [1] Q. Li et al., TUS-REC challenge, data set and baseline, 2024 and 2025.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

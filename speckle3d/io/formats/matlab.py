@@ -16,8 +16,6 @@ SciPy, whole; version 7.3, which is HDF5 behind 512 bytes of text, frame by fram
 MATLAB, ``RcvData{1}`` or ``Trans.spacing`` or ``Receive(3).endSample``, counted from 1.
 """
 
-from __future__ import annotations
-
 import math
 import re
 import warnings
@@ -206,11 +204,8 @@ def _numbers(
     values, times = dict[str, Value](), None
     lengths = {"time_s": shape[0], "x_mm": shape[1], "z_mm": shape[2], "bandwidth_hz": 2}
     for name in sorted({*arrays} - {*_ROLES, "axes"}):
-        numbers, count, source = (
-            _product(variables, name, arrays[name]),
-            lengths.get(name, 1),
-            f"in {arrays[name]}",
-        )
+        numbers, source = _product(variables, name, arrays[name]), f"in {arrays[name]}"
+        count = lengths.get(name, 1)
         if name not in lengths and np.ptp(numbers) == 0:
             numbers = numbers[:1]
         if numbers.size != count:
@@ -233,10 +228,10 @@ def _numbers(
 def _product(variables: Any, name: str, text: str) -> FloatArray:
     """Numbers of an array, in one row, times the factor behind its name."""
     parts = _TERM.fullmatch(text.strip())
-    if parts is None or not float(parts[3] or 1.0):
+    factor = float(parts[3] or 1.0) if parts else 0.0
+    if not parts or not factor:
         raise InvalidInputError(f"{name}: expected as NAME, NAME * 1e6 or NAME / 2, got {text}")
     numbers = np.asarray(_array(variables, parts[1])[()], dtype=np.float64).ravel()
-    factor = float(parts[3] or 1.0)
     return numbers / factor if parts[2] == "/" else numbers * factor
 
 

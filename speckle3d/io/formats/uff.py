@@ -14,9 +14,6 @@ References
 .. [1] A. Rodriguez-Molares et al., "The UltraSound ToolBox", IEEE Int. Ultrasonics Symp., 2017.
 """
 
-from __future__ import annotations
-
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -85,7 +82,7 @@ def open_uff(file: h5py.File, settings: ImportSettings) -> Facts:
     modulation = Value(modulation_hz, f"in {name}/modulation_frequency")
     values["demodulation_frequency_hz"] = modulation
     if modulation_hz:
-        values["centre_frequency_hz"] = replace(modulation, source=f"assumed: {modulation.source[3:]}")
+        values["centre_frequency_hz"] = Value(modulation_hz, f"assumed: {name}/modulation_frequency")
     pulse = {"centre_frequency_hz": "pulse/center_frequency", "bandwidth_hz": "pulse/fractional_bandwidth"}
     values |= values_of(group, pulse)
     for channels in (channels for channels, kind in objects.items() if kind == _CHANNEL_CLASS):

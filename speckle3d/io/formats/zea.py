@@ -9,14 +9,12 @@ positions. ``metadata/probe_pose`` is the tracker: poses of the transducer's tip
 whose zero is the first transmission; its axes are x lateral, y elevational and z axial.
 
 zea's I/Q come both ways, by version: shifted down by ``demodulation_frequency``, or carrying their frequency
-again after delays were corrected. The phase of the data tells, see `carrier`.
+again after delays were corrected. The phase of the data tells, see `hdf5_values`.
 
 References
 ----------
 .. [1] zea documentation, "Data", ``zea.data.spec``.
 """
-
-from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
@@ -94,11 +92,8 @@ def open_zea(file: h5py.File, settings: ImportSettings) -> Facts:
     group, kind = find_member(file, names[0]), Path(names[0]).name
     is_alone = len({Path(name).parent for name in members}) == 1
     home = names[0].removesuffix(f"data/{kind}")
-    scan, has_channels, has_places = (
-        f"{home}scan",
-        kind == "beamformed_data",
-        has_member(group, "coordinates"),
-    )
+    scan, has_channels = f"{home}scan", kind == "beamformed_data"
+    has_places = has_member(group, "coordinates")
     node = group if isinstance(group, h5py.Dataset) else require_dataset(group, "values")
     sizes, channels = node.shape[:3], node.shape[3:]
     if len(sizes) < 3 or channels not in ([(1,), (2,)] if has_channels else [()]):

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from speckle3d.io.formats.carrier import demodulation_of
+from speckle3d.io.formats.hdf5_values import demodulation_of
 
 FREQUENCY, RATE = 6e6, 30e6
 
