@@ -246,12 +246,9 @@ def read_array(
         return np.asarray(node[()], dtype=dtype)
 
 
-def read_transforms(group: h5py.Group, name: str, count: int | None = None) -> RigidTransform:
-    """Read a data set of `count` rigid 4x4 matrices, or of a single one."""
-    shape = (4, 4) if count is None else (count, 4, 4)
-    matrices = read_array(group, name, shape).reshape(-1, 4, 4)
-    poses = transforms_from_matrices(matrices, locate(group, name))
-    return poses if count is not None else poses[0]
+def read_transforms(group: h5py.Group, name: str, count: int) -> RigidTransform:
+    """Read a data set of `count` rigid 4x4 matrices."""
+    return transforms_from_matrices(read_array(group, name, (count, 4, 4)), locate(group, name))
 
 
 def read_texts(group: h5py.Group, name: str, shape: tuple[int, ...]) -> Any:

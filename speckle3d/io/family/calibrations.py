@@ -13,14 +13,15 @@ from dataclasses import replace
 
 import h5py
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from speckle3d.core.calibration import Calibration, FramesUsed, Parameter, calibrated
 from speckle3d.core.errors import InvalidInputError, MismatchError, naming
-from speckle3d.core.geometry import rotations_from_quaternions
 from speckle3d.core.reconstruction import CalibrationFile
 from speckle3d.core.sweep import BModeSettings, Sweep
 from speckle3d.core.text import written_path
 from speckle3d.io.family.records import put, put_fields, read_record, written
+from speckle3d.io.family.sweeps import SENSORS
 from speckle3d.io.hdf5 import (
     PathLike,
     locate,
@@ -28,7 +29,6 @@ from speckle3d.io.hdf5 import (
     read_array,
     read_attribute,
     read_texts,
-    read_transforms,
     require_group,
     sha256_of,
 )
@@ -96,18 +96,14 @@ def read_calibration(path: PathLike) -> Calibration:
     [0.0, 0.0, 0.1]
     """
     with open_family(path, FORMAT) as file:
-        translation = None
-        if "sensor_from_image" in file:
-            pose = read_transforms(file, "sensor_from_image")
-            rotation, translation = pose.rotation, np.asarray(pose.translation)
-        else:
-            name = "sensor_from_image_wxyz"
-            rotation = rotations_from_quaternions(read_array(file, name, (4,))[None], locate(file, name))[0]
+        _, name, shape, check = SENSORS["tracker" if "sensor_from_image" in file else "orientation"]
+        pose = check(read_array(file, name, shape)[None], locate(file, name))[0]
+        is_rotation = isinstance(pose, Rotation)
         calibration = read_record(
             file,
             Calibration,
-            rotation=rotation,
-            translation_mm=translation,
+            rotation=pose if is_rotation else pose.rotation,
+            translation_mm=None if is_rotation else np.asarray(pose.translation),
             parameters=_read_parameters(require_group(file, "parameters")),
             frames=_read_frames(require_group(file, "frames")),
         )

@@ -99,14 +99,14 @@ def _times(group: h5py.Group, name: str = "time_s") -> FloatArray:
     return times
 
 
-def _shape(file: h5py.File, count: int, *row: int | str) -> tuple[int | str, ...]:
-    """Shape of a data set with a row for each of `count` times; of a file that grows it may have more."""
-    return ("row" if _is_growing(file) else count, *row)
+def _length(file: h5py.File, count: int) -> int | str:
+    """Length of a data set with a row for each of `count` times; free of one that grows: it may be more."""
+    return "row" if _is_growing(file) else count
 
 
 def _rows(group: h5py.Group, name: str, count: int, *row: int) -> AnyArray:
     """Read the rows of a data set that have a time."""
-    return read_array(group, name, _shape(group.file, count, *row))[:count]
+    return read_array(group, name, (_length(group.file, count), *row))[:count]
 
 
 def _read_image(file: h5py.File, count: int) -> tuple[FileFrames, ImageGrid, RFSettings | BModeSettings]:
@@ -117,7 +117,8 @@ def _read_image(file: h5py.File, count: int) -> tuple[FileFrames, ImageGrid, RFS
     where, dtype = locate(file, name), require_dataset(file, name).dtype.newbyteorder("=")
     require_sample_type(name, dtype, where)
     in_pairs = name == "iq" and dtype == np.int16
-    node = require_dataset(file, name, _shape(file, count, "vector", "sample", *((2,) if in_pairs else ())))
+    shape = _length(file, count), "vector", "sample", *((2,) if in_pairs else ())
+    node = require_dataset(file, name, shape)
     vectors, samples = node.shape[1:3]
     slices = HDF5Slices(Path(file.filename).absolute(), (name,), from_pairs if in_pairs else np.asarray)
     with naming(where):

@@ -152,8 +152,7 @@ def read_landmarks(path: PathLike) -> Landmarks | None:
 
 def companion_files(scan: Path) -> list[Path]:
     """Files beside a scan's own that say what is in it: transforms, calibration, landmarks."""
-    files = (_transforms_file(scan), _nearby(scan, _CALIBRATION), _landmark_file(scan))
-    return [file for file in files if file is not None]
+    return [*filter(None, (_transforms_file(scan), _nearby(scan, _CALIBRATION), _landmark_file(scan)))]
 
 
 def _transforms_file(scan: Path) -> Path | None:
