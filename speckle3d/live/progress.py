@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from speckle3d.io.igtl.messages import ImageReceived, Received, TransformReceived
+from speckle3d.io.igtl.messages import ImageReceived, Received
 
 
 @dataclass
@@ -84,9 +84,8 @@ class Devices:
 
     def hear(self, message: Received) -> None:
         """Note who sent a message."""
-        if isinstance(message, ImageReceived | TransformReceived):
-            kind = "IMAGE" if isinstance(message, ImageReceived) else "TRANSFORM"
-            self._heard.add((kind, message.device))
+        kind = "IMAGE" if isinstance(message, ImageReceived) else "TRANSFORM"
+        self._heard.add((kind, message.device))
 
     @property
     def missing(self) -> str:

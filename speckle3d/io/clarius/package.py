@@ -45,7 +45,6 @@ _NAME = re.compile(
     r"(?!\.)(?:(?P<name>.*)_)?(?P<kind>rf|iq|env|imu)\.(?P<content>raw|ya?ml|tgc)(?:(?<=raw)\.lzo)?"
 )
 HEADER = struct.Struct("<5I")
-_MAGIC = b"\x89LZO\x00\r\n\x1a\n"
 SAMPLES = {"RF": ("<i2", 1, np.int16), "IQ": ("<i2", 2, np.complex64), "envelope": ("u1", 1, np.uint8)}
 """By kind: type of the numbers in the file, how many make a sample, and type of the samples."""
 
@@ -295,9 +294,7 @@ def _content(member: Member) -> Any:
 def _unpack(member: Member, _: int) -> bytes:
     lzo = extra_module("lzallright", "clarius", "a file packed by lzop (.lzo)").LZOCompressor
     content, parts = member.read(), list[bytes]()
-    if not content.startswith(_MAGIC):
-        raise FileError(f"{member.where}: expected a file of lzop (.lzo), got another")
-    # Behind the versions, the method and the level: flags, a filter, mode, time, the name and a check sum.
+    # Behind mark, versions, method and level: flags, a filter, mode, time, the name and a check sum.
     (flags,) = struct.unpack_from(">I", content, 17)
     at = 37 if flags & 0x800 else 33
     at += 1 + content[at] + 4

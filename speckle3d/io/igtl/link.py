@@ -162,6 +162,8 @@ class End:
             except MessageError as error:
                 self.state.refused, self.state.last_refused = self.state.refused + 1, str(error)
                 continue
+            if message is None:
+                continue
             while self._inbox.full():
                 await asyncio.sleep(_LOOK_S)
             self._inbox.put_nowait(message)

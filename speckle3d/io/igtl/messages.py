@@ -82,16 +82,7 @@ class TransformReceived:
     valid: bool
 
 
-@dataclass(frozen=True)
-class Other:
-    """A message of a type that is not used here."""
-
-    device: str
-    time_s: float
-    type: str
-
-
-Received: TypeAlias = ImageReceived | TransformReceived | Other
+Received: TypeAlias = ImageReceived | TransformReceived
 
 
 def body_bytes(start: bytes) -> int:
@@ -110,8 +101,10 @@ def body_bytes(start: bytes) -> int:
     return int(size)
 
 
-def decode(start: bytes, body: bytes) -> Received:
-    """Decode a message from its first 58 bytes and its body; a check sum of 0 is not checked.
+def decode(start: bytes, body: bytes) -> Received | None:
+    """Decode a message from its first 58 bytes and its body; None of a type that is not used here.
+
+    A check sum of 0 is not checked.
 
     Raises
     ------
@@ -124,7 +117,7 @@ def decode(start: bytes, body: bytes) -> Received:
     if crc and ecma_182(body) != crc:
         raise MessageError(f"{where}: expected a body of check sum {crc:016x}, got another")
     if type_ not in _READ:
-        return Other(device, time_s, type_)
+        return None
     fields = {"message_type": type_, "device_name": device, "timestamp": time_s, "header_version": version}
     try:
         with np.errstate(all="ignore"):  # of infinite matrices

@@ -17,9 +17,7 @@ from speckle3d.core.arrays import AnyArray, FloatArray
 from speckle3d.core.grid import ImageGrid
 from speckle3d.core.sweep import Frames, OrientationSensor, Sweep, Tracker
 from speckle3d.io.igtl.messages import packed_image, packed_transform
-
-_SLICE_MM = 1.0
-"""Thickness that an image is given to be seen with."""
+from speckle3d.io.plus.transforms import pixel_matrix
 
 Played: TypeAlias = tuple[float, bytes, bool]
 """When a message was sent, s from the first frame, the message, and whether it is an image."""
@@ -101,7 +99,7 @@ def _pixels(frames: Frames, i: int, upright: bool) -> AnyArray:
 
 def _place(sweep: Sweep, grid: ImageGrid, upright: bool, i: int) -> FloatArray:
     """Where the pixels of a frame lie, (4, 4): in the world of a calibrated tracker, else in the image."""
-    image_from_pixel = np.insert(grid.image_from_sample, 2, [0.0, 0.0, _SLICE_MM, 0.0], axis=1)
+    image_from_pixel = pixel_matrix(grid)
     if not upright:
         # Columns are samples; slices turn round so that the axes stay right-handed.
         image_from_pixel = image_from_pixel[:, [1, 0, 2, 3]] @ np.diag([1.0, 1.0, -1.0, 1.0])

@@ -236,10 +236,7 @@ def read_header(path: PathLike) -> SequenceHeader:
     """
     data = Path(path)
     with reading(path), open_regular(path) as stream, naming(str(path)):
-        begin = stream.peek()
-        if not is_image(begin):
-            raise InvalidInputError("expected a MetaImage or NRRD header, got something else")
-        is_nrrd = begin.startswith(b"NRRD")
+        is_nrrd = stream.peek().startswith(b"NRRD")
         words = (_nrrd_words if is_nrrd else _meta_words)(stream)
         sizes = tuple(map(int, words["sizes"]))
         kinds = [kind.lower() for kind in words.get("kinds", ())]

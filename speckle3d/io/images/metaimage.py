@@ -63,7 +63,7 @@ class Layout:
     orientation: str
 
     @classmethod
-    def of(cls, header: SequenceHeader, machine: str | None = None) -> Layout:
+    def of(cls, header: SequenceHeader, machine: str) -> Layout:
         """Tell an image's layout; where the header does not say, by pixels and as PLUS does by default.
 
         PLUS stores B-mode as MF and RF as FM. A machine's orientation, from a device set, replaces that for
@@ -72,7 +72,7 @@ class Layout:
         by_pixels = "BRIGHTNESS" if header.dtype == np.uint8 else "RF_REAL"
         kind = header.fields.get("UltrasoundImageType", by_pixels)
         usual = "FM" if kind in RF_TYPES else "MF"
-        if machine is not None and (machine[:1].upper() in "FN") == (usual == "FM"):
+        if machine and (machine[:1].upper() in "FN") == (usual == "FM"):
             usual = machine
         return cls(kind, header.fields.get("UltrasoundImageOrientation", usual).upper())
 
@@ -131,7 +131,7 @@ def open_sequence(path: Path, settings: ImportSettings) -> Facts:
     """
     header, config = read_header(path), settings.plus_config
     device, names = DeviceSet() if config is None else read_device_set(config), names_of(header)
-    layout = Layout.of(header, device.text("PortUsImageOrientation") or None)
+    layout = Layout.of(header, device.text("PortUsImageOrientation"))
     yield "container", header.container, ""
     yield "size", _length_text(header.size) if header.has_images else "no images", ""
     if header.has_images:
@@ -228,8 +228,8 @@ def _times(header: SequenceHeader) -> FloatArray | None:
 def _faults(header: SequenceHeader) -> list[str]:
     """Why each image is of no use; older files of PLUS tell it in Status alone."""
     statuses = header.column("Status") | header.column("ImageStatus")
-    is_valid = (statuses.get(i, "OK") == "OK" for i in range(header.frame_count))
-    return ["" if valid else "not valid by their status" for valid in is_valid]
+    words = (statuses.get(i, "OK") for i in range(header.frame_count))
+    return ["" if word == "OK" else "not valid by their status" for word in words]
 
 
 def _calibration(

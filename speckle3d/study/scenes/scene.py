@@ -24,6 +24,7 @@ from speckle3d.imaging.cuts.outlines import frame_outlines
 from speckle3d.imaging.images import PosedImages
 from speckle3d.imaging.voxels.settings import CompoundingSettings
 from speckle3d.io.fileset import FileSet
+from speckle3d.io.plus.transforms import pixel_matrix
 from speckle3d.io.plus.write import write_sequence, write_transforms
 from speckle3d.io.shapes import write_polylines, write_transform
 from speckle3d.scoring.references import REFERENCES
@@ -179,7 +180,5 @@ def slicer_sequence(
     signal = signal if isinstance(signal, BModeSettings) else BModeSettings(dynamic_range_db)
     times, name = posed.sweep.frame_time_s[posed.frames], posed.sweep.name
     sweep = Sweep(_Bytes(source), grid, signal, times, name=name, probe=posed.sweep.probe)
-    thick_mm = (grid.vector_pitch_mm + grid.sample_spacing_mm) / 2
-    image_from_pixels = np.insert(grid.image_from_sample, 2, [0.0, 0.0, thick_mm, 0.0], axis=1)
-    lps_from_pixels = posed.world_from_image.as_matrix() @ image_from_pixels
+    lps_from_pixels = posed.world_from_image.as_matrix() @ pixel_matrix(grid)
     return sweep, {"ImageToWorld": np.asarray(_RAS_FROM_LPS @ lps_from_pixels)}
