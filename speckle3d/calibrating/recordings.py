@@ -101,8 +101,10 @@ def _readings_of(path: Path, sensor: str, transform: str | None) -> tuple[TimedP
         return _readings(load_sweep(path), path, sensor)
     recording = open_sweep(path, ImportSettings(tracker_transform=transform))
     if (tracker := recording.tracker) is None:
-        reason = "; ".join(recording.remarks) or recording.fault or "none"
-        raise InvalidInputError(f"{path}: expected poses, as ProbeToTrackerTransform: {reason}")
+        if recording.fault is not None and not recording.remarks:
+            raise recording.fault
+        reason = "; ".join(recording.remarks) or "none"
+        raise InvalidInputError(f"{path}: expected poses, as ProbeToTrackerTransform, got {reason}")
     for remark in recording.remarks:
         warnings.warn(f"{path}: {remark}", stacklevel=2)
     readings: TimedPoses | TimedRotations = tracker.readings

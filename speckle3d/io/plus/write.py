@@ -29,25 +29,19 @@ from speckle3d.io.text import number_text, numbers
 SUFFIXES = (".mha", ".nrrd")
 """Of the files that `write_sequence` writes, as .igs.mha."""
 
-_OF_SLICER = ".seq.nrrd"
-"""With four axes, the last of them the frames, as 3D Slicer reads it [3]_; other NRRD files have three."""
-
 _META_AXES = """Kinds = domain domain list
 Offset = 0 0 0
 TransformMatrix = 1 0 0 0 1 0 0 0 1
 CenterOfRotation = 0 0 0
 AnatomicalOrientation = RAI"""
-_NRRD_AXES = """space dimension: 2
-space directions: ({0},0) (0,{1}) none
-kinds: domain domain list
-space origin: (0,0)"""
-_SLICER_AXES = """space: right-anterior-superior
+_NRRD_AXES = """space: right-anterior-superior
 space directions: ({0},0,0) (0,{1},0) (0,0,1) none
 kinds: domain domain domain list
 labels: "" "" "" "time"
 units: "" "" "" "s"
 space origin: (0,0,0)"""
-"""Of images that are one pixel thick in space; transforms count pixels from its origin."""
+"""With four axes, the last of them the frames, as 3D Slicer reads it [3]_, and IGSIO, with which PLUS does;
+images are one pixel thick in space, and transforms count pixels from its origin."""
 _NRRD_NAMES = {name: nrrd for nrrd, name in NRRD_NAMES.items()}
 
 _PREFIX = "Speckle3D_"
@@ -106,7 +100,7 @@ def write_sequence(
     FileError
         If the file cannot be written.
     """
-    suffix = require_suffix(path, (_OF_SLICER, *SUFFIXES))
+    suffix = require_suffix(path, SUFFIXES)
     if sweep.grid.fan is not None:
         raise InvalidInputError(
             f"{path}: expected parallel vectors, got a fan's, which a sequence does not hold: write .h5"
@@ -119,13 +113,10 @@ def write_sequence(
     if dtype.kind == "c":
         dtype = np.dtype(np.int16 if stored_dtype(sweep.frames) == np.int16 else np.float32)
     shape, axes = (*_pixels(sweep.frames[0]).shape[::-1], len(sweep)), _META_AXES
-    if suffix.endswith(".nrrd"):
+    if suffix == ".nrrd":
+        axes, shape = _NRRD_AXES.format(*fields.pop("ElementSpacing").split()), (*shape[:2], 1, shape[2])
         fields = {_NRRD_NAMES.get(name, name): value for name, value in fields.items()}
-        spacing, axes = fields.pop("ElementSpacing").split(), _NRRD_AXES
-        if suffix == _OF_SLICER:
-            shape, axes = (*shape[:2], 1, shape[2]), _SLICER_AXES
-            fields |= _slicer_fields(sweep.frame_time_s)
-        axes = axes.format(*spacing)
+        fields |= _slicer_fields(sweep.frame_time_s)
 
     def planes() -> Iterator[AnyArray]:
         for i in range(len(sweep)):
