@@ -10,6 +10,7 @@ from clarius_examples import IMPORT_SETTINGS, sweep_of
 from sweep_examples import sizes_of
 
 from speckle3d.core.errors import FileError, InvalidInputError
+from speckle3d.core.sweep import stored_dtype
 from speckle3d.io.clarius.imu import read_samples
 from speckle3d.io.clarius.package import Member
 from speckle3d.io.clarius.reader import sensor_of
@@ -44,7 +45,7 @@ def test_what_is_written_is_read(tmp_path, kind, is_packed, place):
     back = load_sweep(examples.write_package(tmp_path / place, sweep, lzop=is_packed), IMPORT_SETTINGS)
     require_equal(back, sweep)
     assert back.probe == "Clarius L7HD3"
-    assert back.frames.stored_dtype == (np.uint8 if kind == "env" else np.int16)
+    assert stored_dtype(back.frames) == (np.uint8 if kind == "env" else np.int16)
 
 
 def test_an_archive_cut_short_is_no_recording(tmp_path):
