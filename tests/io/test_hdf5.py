@@ -1,4 +1,11 @@
-from speckle3d.io.hdf5 import atomic_path
+import pytest
+
+from speckle3d.io.hdf5 import atomic_path, reading
+
+
+def test_an_error_of_our_own_is_no_damaged_file():
+    with pytest.raises(TypeError), reading("a.h5"):
+        len(1)
 
 
 def test_a_link_is_written_through(tmp_path):

@@ -42,7 +42,7 @@ def test_settings_of_a_folder_stand_beside_it_or_in_it(tmp_path, monkeypatch):
     scan.mkdir()
     for i, image in enumerate(grey()):
         Image.fromarray(image).save(scan / f"{i}.png")
-    with pytest.raises(MissingSettingsError, match=r"--column-pitch-mm.*--frame-rate-hz"):
+    with pytest.raises(MissingSettingsError, match=r"import\.toml in it: --column-pitch-mm.*--frame-rate-hz"):
         load_sweep(scan)
     (tmp_path / "scan.toml").write_text(f"{BMODE}frame_rate_hz = 10\n")
     assert load_sweep(scan).frame_time_s.tolist() == [0.0, 0.1, 0.2]
