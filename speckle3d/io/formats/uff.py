@@ -85,8 +85,9 @@ def open_uff(file: h5py.File, settings: ImportSettings) -> Facts:
         values["centre_frequency_hz"] = Value(modulation_hz, f"assumed: {name}/modulation_frequency")
     pulse = {"centre_frequency_hz": "pulse/center_frequency", "bandwidth_hz": "pulse/fractional_bandwidth"}
     values |= values_of(group, pulse)
-    for channels in (channels for channels, kind in objects.items() if kind == _CHANNEL_CLASS):
-        values |= values_of(file, {"speed_of_sound_m_s": f"{channels}/sound_speed"})
+    for channels, kind in objects.items():
+        if kind == _CHANNEL_CLASS:
+            values |= values_of(file, {"speed_of_sound_m_s": f"{channels}/sound_speed"})
     shape = count, lines, samples
     source = HDF5Slices(path, parts, partial(frame_of, shape=shape[1:]), axis)
     frames = FileFrames(path, source, shape, np.complex64 if is_complex else np.float32)
