@@ -9,7 +9,7 @@ import os
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import BaseModel, ConfigDict, Field, StrictFloat, field_validator
 
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.files import PathLike
@@ -20,11 +20,10 @@ SPEED_OF_SOUND_M_S = 1540.0
 
 _FOLDER_FILE = "import.toml"
 
-Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
-Size = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0)]
+Size = Annotated[StrictFloat, Field(gt=0)]
 LEAST_HZ = 1e4
 """Of ultrasound or of its sampling: less is a number in MHz or kHz."""
-Hertz = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=LEAST_HZ)]
+Hertz = Annotated[StrictFloat, Field(ge=LEAST_HZ)]
 
 
 class ImportSettings(BaseModel):
@@ -33,7 +32,7 @@ class ImportSettings(BaseModel):
     Attributes are named as the options of ``speckle3d convert``, and as they are in TOML.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     sampling_rate_hz: Hertz | None = Field(
         None, description="samples per second along a line, in the scanner's export settings or log"
@@ -48,10 +47,10 @@ class ImportSettings(BaseModel):
         description="distance between elements of the array, in the probe's data sheet, where the file "
         "places its lines in elements",
     )
-    array_radius_mm: Number | None = Field(
+    array_radius_mm: StrictFloat | None = Field(
         None, ge=0, description="radius of a curved array's face, in the probe's data sheet; 0: phased array"
     )
-    line_angles_deg: tuple[Number, Number] | None = Field(
+    line_angles_deg: tuple[StrictFloat, StrictFloat] | None = Field(
         None,
         description="angles of the first and the last line of a curved or phased array, from straight down",
     )
@@ -64,10 +63,10 @@ class ImportSettings(BaseModel):
     bandwidth_hz: tuple[Hertz, Hertz] | None = Field(
         None, description="lowest and highest frequency of the echoes, at -6 dB in the probe's data sheet"
     )
-    demodulation_frequency_hz: Number | None = Field(
+    demodulation_frequency_hz: StrictFloat | None = Field(
         None, ge=0, description="frequency that I/Q were shifted down by, usually the transmit frequency"
     )
-    first_sample_depth_mm: Number | None = Field(
+    first_sample_depth_mm: StrictFloat | None = Field(
         None, description="depth of a line's first sample; 0 unless the scanner records later"
     )
     column_pitch_mm: Size | None = Field(
@@ -97,7 +96,7 @@ class ImportSettings(BaseModel):
         description="device set of PLUS, with the place of the image on the probe and the size of its "
         "pixels; in TOML, from the folder of that file",
     )
-    image_to_probe: tuple[tuple[Number, ...], ...] | None = Field(
+    image_to_probe: tuple[tuple[StrictFloat, ...], ...] | None = Field(
         None, description="image calibration of PLUS, pixels to mm, four rows of four numbers"
     )
     arrays: dict[str, str] = Field(

@@ -66,8 +66,8 @@ def _create_frames(
     require_sample_type(name, kind, f"/{name}")
     shape = (grid.vectors, grid.samples, *((2,) if name == "iq" and kind == np.int16 else ()))
     node = file.create_dataset(
-        name, (0, *shape), kind, maxshape=(None, *shape), chunks=(1, *shape), compression=compression,
-        compression_opts=_GZIP_LEVEL if compression == "gzip" else None, shuffle=compression is not None,
+        name, (0, *shape), kind, maxshape=(None, *shape), chunks=(1, *shape), shuffle=compression is not None,
+        compression=_GZIP_LEVEL if compression == "gzip" else compression,
     )  # fmt: skip
     put_fields(node, signal)
     first_mm = {"first_sample_depth_mm": grid.first_sample_depth_mm, "first_vector_mm": grid.first_vector_mm}
