@@ -134,9 +134,9 @@ def figure_report(
         axes.set_axis_off()
     # For an orientation sensor, only the ratio of the pixel sizes is known; no more is needed.
     aspect = float(solution.chain.pixel_mm[1] / solution.chain.pixel_mm[0])
-    # A used frame from the middle, one from the end, and the first that was dropped.
+    # A used frame from the middle, one from the end, and the first that was dropped, else the first used.
     frames, reasons = calibration.frames.used, calibration.frames.dropped
-    numbers = dict.fromkeys([frames[len(frames) // 2], frames[-1], *sorted(reasons)[:1]])
+    numbers = dict.fromkeys([frames[len(frames) // 2], frames[-1], *sorted(reasons)[:1], frames[0]])
     for axes, number in zip(panels[0], numbers, strict=False):
         image, note = np.asarray(recording.images[number]), reasons.get(number, "")
         marks_px = detections.pixels[detections.frame == number].reshape(-1, 2)

@@ -101,8 +101,6 @@ def reconstruct(
     note(*recording.remarks)
     curves_path = curves_file or curves_beside(sweep_file)
     curves = s3.load_curves(curves_path)
-    if curves_file is None:
-        note(trust_words(curves_path, curves, settings.curves.same_probe))
     mount(sweep, calibrations)
     crossing = None
     if crossing_file is not None or crossing_frames is not None:
@@ -115,6 +113,8 @@ def reconstruct(
         result = s3.run_job(
             sweep, sweep_file, curves, out, modes, reference, settings, progress, calibrations, crossing
         )
+    if curves_file is None:
+        note(trust_words(curves_path, curves, settings.curves.same_probe))
     if as_json:
         emit((result.directory / "summary.json").read_text(encoding="utf-8"))
         note(*result.summary.lines)

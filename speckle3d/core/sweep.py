@@ -163,7 +163,7 @@ class _Sensor(Generic[Samples]):
     @property
     def uncalibrated(self) -> str:
         """Message that the sensor's mounting is missing."""
-        return f"the {self.label} is not calibrated to the image (its attribute sensor_from_image)"
+        return f"the {self.label} is not calibrated to the image: give --calibration (speckle3d calibrate)"
 
     def covers(self, frame_time_s: npt.ArrayLike) -> BoolArray:
         """Mask of frames with a reading."""

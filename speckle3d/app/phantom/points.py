@@ -101,6 +101,7 @@ class PointsViewer(PhantomViewer):
             self._wire.value = missing[0]
         self._name_next()
         lacking = f"; none on {', '.join(missing)}" if points and missing else ""
+        lacking += f": {self._refusals[self.frame]}" if not points and self.frame in self._refusals else ""
         total = sum(map(len, self._picks.values()))
         return f"frame {self.frame}: {len(points)} points{lacking}; {total} in {len(self._picks)} frames"
 
@@ -146,7 +147,8 @@ class PointsViewer(PhantomViewer):
 
     def _mark_picks(self) -> None:
         self._picks = {frame: points for frame, points in self._picks.items() if points}
-        self.mark_frames(dict.fromkeys(self._picks, "has points"))
+        reasons = {frame: why for frame, why in self._refusals.items() if frame not in self._picks}
+        self.mark_frames(dict.fromkeys(self._picks, "has points"), reasons)
         self.changed()
 
     @batch_changes
@@ -157,10 +159,12 @@ class PointsViewer(PhantomViewer):
         try:
             settings = self.settings().model_copy(update={"points": None})
             self.tell("finding points in all frames ...")
-            self._take(await run_in_thread(self._search, partial(self._find_points, settings)))
+            points = await run_in_thread(self._search, partial(self._find_points, settings))
         except Speckle3DError as error:
             self.tell(str(error), ORANGE)
             return
+        self._take(points)
+        self._refusals = points.dropped
         self._mark_picks()
 
     def _find_points(self, settings: ScanSettings) -> Detections:

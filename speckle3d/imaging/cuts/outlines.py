@@ -68,7 +68,7 @@ def crossings(outlines_mm: FloatArray, world_from_plane: RigidTransform) -> Floa
 
 
 def within_fan(lines_mm: FloatArray, plane_from_image: RigidTransform, grid: ImageGrid) -> FloatArray:
-    """The part of each line that lies in the image of its frame, which a fan does not fill up to its box.
+    """Lines where they lie in the images of their frames: a fan does not fill its box.
 
     Parameters
     ----------
@@ -76,7 +76,12 @@ def within_fan(lines_mm: FloatArray, plane_from_image: RigidTransform, grid: Ima
         From `crossings`.
     plane_from_image : RigidTransform, length n
     grid : ImageGrid
-        Of the images as they were recorded; the lines through parallel vectors stay as they are.
+        Of the images as they were recorded.
+
+    Returns
+    -------
+    ndarray, shape (n, m, 2)
+        Of a fan, points along each line, NaN outside; of parallel vectors, the lines as they are.
     """
     if grid.fan is None:
         return lines_mm
@@ -85,7 +90,4 @@ def within_fan(lines_mm: FloatArray, plane_from_image: RigidTransform, grid: Ima
     places = np.einsum("nij,nkj->nki", image_from_plane[:, :2, :2], points) + image_from_plane[:, None, :2, 3]
     sample = grid.sample_at(places)
     inside = np.all((sample >= 0) & (sample <= [grid.vectors - 1, grid.samples - 1]), axis=-1)
-    ends = np.stack([inside.argmax(axis=1), _STEPS - 1 - inside[:, ::-1].argmax(axis=1)], axis=1)
-    parts = np.take_along_axis(points, ends[..., None], axis=1)
-    parts[~inside.any(axis=1)] = np.nan
-    return parts
+    return np.where(inside[..., None], points, np.nan)
