@@ -213,7 +213,9 @@ class PhantomViewer:
         calibration, lacking = outcome.calibration, outcome.solution.adequacy.missing
         self._verdict.object = sentence(calibration.verdict, _AMBER if lacking else BLUE)
         table = text_report(calibration, outcome.beam, remarks(outcome))
-        self._table.object = f"<pre class='calibration' style='margin:0'>{html.escape(table)}</pre>"
+        self._table.object = (
+            f"<pre class='calibration' style='margin:0;white-space:pre-wrap'>{html.escape(table)}</pre>"
+        )
         self.mark_frames(dict.fromkeys(calibration.frames.used, "used"), dict(calibration.frames.dropped))
 
     def _write_result(self, _: object) -> None:
