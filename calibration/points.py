@@ -8,11 +8,11 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
-from speckle3d.core.geometry import require_finite
+from speckle3d.core.geometry import require_finite, rigid
 from speckle3d.core.grid import ImageGrid
 from speckle3d.core.streams import TimedPoses, TimedRotations
 from speckle3d.core.sweep import Frames
@@ -93,8 +93,7 @@ class Recording:
     def world_from_sensor(self, frames: IntArray, offset_s: float | None = None) -> RigidTransform:
         """Pose of the sensor at frames by number, by a clock that is off by `offset_s` if not by its own."""
         at_s = self.frame_time_s[frames] - (self.time_offset_s if offset_s is None else offset_s)
-        poses: RigidTransform | Rotation = self.readings.at(at_s)
-        return RigidTransform.from_rotation(poses) if isinstance(poses, Rotation) else poses
+        return rigid(self.readings.at(at_s))
 
 
 @shown

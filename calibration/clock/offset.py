@@ -23,6 +23,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.errors import InsufficientDataError
+from speckle3d.core.geometry import rigid
 from speckle3d.core.streams import TimedPoses, TimedRotations
 
 SEARCH_S = 0.5
@@ -105,7 +106,7 @@ class SmoothReadings:
     def __init__(self, readings: TimedPoses | TimedRotations) -> None:
         time_s, samples = readings.time_s, readings.world_from_sensor
         self.time_s = time_s
-        self.poses = samples if isinstance(samples, RigidTransform) else RigidTransform.from_rotation(samples)
+        self.poses = rigid(samples)
         places, turns = self.poses.translation, self.poses.rotation.as_quat()
         back = np.append(False, np.sum(turns[1:] * turns[:-1], axis=1) < 0)
         turns = turns * np.where(np.cumsum(back) % 2, -1.0, 1.0)[:, None]

@@ -133,6 +133,11 @@ def transforms_from_matrices(matrices: npt.ArrayLike, where: str) -> RigidTransf
     return rigid
 
 
+def rigid(samples: RigidTransform | Rotation) -> RigidTransform:
+    """Poses as rigid transforms; an orientation sensor's are all at the origin."""
+    return samples if isinstance(samples, RigidTransform) else RigidTransform.from_rotation(samples)
+
+
 def require_finite(values: npt.NDArray[np.floating], where: str) -> None:
     """Raise `InvalidInputError` naming the first entry of `values` that is NaN or infinite."""
     for index in np.argwhere(~np.isfinite(values)).tolist():

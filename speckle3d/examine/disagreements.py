@@ -11,9 +11,9 @@ from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import Doubt
-from speckle3d.core.geometry import relative_poses
+from speckle3d.core.geometry import relative_poses, rigid
 from speckle3d.core.sweep import OrientationSensor, Sweep, Tracker
-from speckle3d.examine.sensors import SMOOTH, jitter, rigid
+from speckle3d.examine.sensors import SMOOTH, jitter
 
 JOINT_CLAIMS = 3.0
 """Joint standard deviations beyond which two numbers disagree (DESIGN, Disagreement)."""

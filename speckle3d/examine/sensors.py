@@ -17,7 +17,7 @@ from scipy.stats import median_abs_deviation
 
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import DECISIVE, Doubt, MismatchError
-from speckle3d.core.geometry import nearest_rotation
+from speckle3d.core.geometry import nearest_rotation, rigid
 from speckle3d.core.leastsquares import robust_sigma
 from speckle3d.core.sweep import OrientationSensor, Sweep, Tracker
 
@@ -239,11 +239,6 @@ def _gravity_from_vertical(sensor: OrientationSensor, readings: Rotation) -> flo
     up = np.median(readings.apply(sensor.accelerometer_m_s2), axis=0)
     size = float(np.linalg.norm(up))
     return float(np.degrees(np.arccos(min(1.0, abs(float(up[2])) / size)))) if size > 0 else float("nan")
-
-
-def rigid(samples: RigidTransform | Rotation) -> RigidTransform:
-    """Readings as rigid transforms; an orientation sensor's are all at the origin."""
-    return samples if isinstance(samples, RigidTransform) else RigidTransform.from_rotation(samples)
 
 
 def _steps(poses: RigidTransform, targets: RigidTransform) -> FloatArray:

@@ -6,8 +6,6 @@ and the new other files come to its side: whenever the process is killed, what i
 `primary` is there and whole.
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 from collections.abc import Iterator

@@ -12,8 +12,6 @@ centre of the first; images made from RF have fewer rows than it has samples. Th
 missing. A wire goes by its name or by its number in the phantom, from 0.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

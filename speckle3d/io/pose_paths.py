@@ -1,7 +1,5 @@
 """Filter rows and poses of recordings: leave out invalid ones, with a note."""
 
-from __future__ import annotations
-
 from bisect import bisect_left
 from collections import Counter
 from collections.abc import Mapping, Sequence

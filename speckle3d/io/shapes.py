@@ -10,8 +10,6 @@ References
 .. [1] 3D Slicer user guide, "Transforms", section "ITK transform files".
 """
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

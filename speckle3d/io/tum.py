@@ -4,8 +4,6 @@ A line that starts with a hash is a comment. The format says metres, and so do f
 otherwise; poses in memory are in mm.
 """
 
-from __future__ import annotations
-
 import re
 import warnings
 from contextlib import suppress

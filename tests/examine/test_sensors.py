@@ -7,9 +7,10 @@ from scipy.spatial.transform import Rotation
 
 from speckle3d.config import Config
 from speckle3d.core.errors import MismatchError
+from speckle3d.core.geometry import rigid
 from speckle3d.corrections import correct
 from speckle3d.examine.disagreements import differing_lengths, disagreements
-from speckle3d.examine.sensors import doubts_of_gyroscope, examine_sensors, jitter, repair_readings, rigid
+from speckle3d.examine.sensors import doubts_of_gyroscope, examine_sensors, jitter, repair_readings
 from speckle3d.motion.sensors import settle_direction
 
 AGAINST_THEMSELVES = {

@@ -28,8 +28,6 @@ References
 .. [1] clariusdev/motion, README.md: units and the sensor's location.
 """
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass
 

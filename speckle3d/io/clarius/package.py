@@ -19,8 +19,6 @@ References
    demodulation frequency", and `rxFreqDeep`.
 """
 
-from __future__ import annotations
-
 import math
 import re
 import struct
@@ -30,7 +28,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -168,7 +166,7 @@ class Description:
     where: str
 
     @classmethod
-    def of(cls, member: Member) -> Description:
+    def of(cls, member: Member) -> Self:
         """Parse a YAML document of fields.
 
         Raises

@@ -21,8 +21,6 @@ References
 .. [2] clariusdev/research, "Beamformed RF Acquisition" (docs/rf-frame-rate.md), "Probe reference".
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from functools import partial

@@ -7,8 +7,6 @@ at all depths together, lower than the probe's in tissue that attenuates. On sim
 move by 0.1 MHz from 40 to 0 dB over noise.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 

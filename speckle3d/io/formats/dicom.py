@@ -6,8 +6,6 @@ sector with black corners too; degrees along X where its columns are the lines o
 no element tells. Without regions, Pixel Spacing gives it. Elements that name a patient are never loaded.
 """
 
-from __future__ import annotations
-
 import warnings
 from bisect import bisect
 from collections.abc import Generator, Iterator

@@ -5,8 +5,6 @@ echoes (int16, float32, complex64) whose samples run down the rows. A folder of 
 order of their names, numbers in them counted. Colours become grey by luminance.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from functools import partial

@@ -10,8 +10,6 @@ Of RF and ``.bpr``, width counts vectors and height samples, and a vector's samp
 they are the image's columns and rows, and a row lies together.
 """
 
-from __future__ import annotations
-
 import struct
 from functools import partial
 from pathlib import Path

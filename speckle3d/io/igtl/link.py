@@ -3,8 +3,6 @@
 Each end has one thread, which connects, reads and writes: nobody else waits for the network.
 """
 
-from __future__ import annotations
-
 import asyncio
 import queue
 import socket

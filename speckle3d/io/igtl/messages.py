@@ -9,8 +9,6 @@ References
    Med. Robot. Comput. Assist. Surg., 2009; versions 1 to 3 at openigtlink.org/protocols.
 """
 
-from __future__ import annotations
-
 import re
 import struct
 from collections.abc import Callable

@@ -3,17 +3,15 @@
 RF has the samples of a vector as the columns of its images, as PLUS sends it, B-mode stands upright.
 """
 
-from __future__ import annotations
-
 import heapq
 import math
 from collections.abc import Iterator
 from typing import TypeAlias
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import AnyArray, FloatArray
+from speckle3d.core.geometry import rigid
 from speckle3d.core.grid import ImageGrid
 from speckle3d.core.sweep import Frames, OrientationSensor, Sweep, Tracker
 from speckle3d.io.igtl.messages import packed_image, packed_transform
@@ -78,10 +76,8 @@ def clock_shift_s(sweep: Sweep) -> float:
 def _readings(
     sensor: Tracker | OrientationSensor, name: str, first_s: float, later_s: float
 ) -> Iterator[Played]:
-    poses = sensor.readings.world_from_sensor
-    if isinstance(poses, Rotation):
-        poses = RigidTransform.from_rotation(poses)
-    for time_s, matrix in zip(sensor.readings.time_s, poses.as_matrix(), strict=True):
+    matrices = rigid(sensor.readings.world_from_sensor).as_matrix()
+    for time_s, matrix in zip(sensor.readings.time_s, matrices, strict=True):
         # Sent when the image of the same moment is; it tells its own clock.
         at_s = float(time_s) + sensor.time_offset_s - first_s
         yield at_s, packed_transform(name, time_s + later_s, matrix), False

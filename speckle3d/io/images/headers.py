@@ -10,8 +10,6 @@ References
 .. [2] ITK, "MetaIO documentation".
 """
 
-from __future__ import annotations
-
 import bz2
 import math
 import re

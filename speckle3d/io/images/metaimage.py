@@ -8,8 +8,6 @@ References
 .. [1] PLUS user manual, "Ultrasound image orientation".
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -63,7 +61,7 @@ class Layout:
     orientation: str
 
     @classmethod
-    def of(cls, header: SequenceHeader, machine: str) -> Layout:
+    def of(cls, header: SequenceHeader, machine: str) -> "Layout":
         """Tell an image's layout; where the header does not say, by pixels and as PLUS does by default.
 
         PLUS stores B-mode as MF and RF as FM. A machine's orientation, from a device set, replaces that for

@@ -9,8 +9,6 @@ References
    reconstruction".
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from functools import cached_property, partial, reduce
 from pathlib import Path

@@ -3,8 +3,6 @@
 ``XToY`` takes points of X to Y, in mm; ``Image`` counts pixels of the image turned to columns and rows.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass

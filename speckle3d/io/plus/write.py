@@ -7,18 +7,16 @@ References
 .. [3] 3D Slicer developer guide, "Volume sequence file format (.seq.nrrd)".
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import AnyArray, BoolArray, FloatArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.files import PathLike
+from speckle3d.core.geometry import rigid
 from speckle3d.core.progress import Progress
 from speckle3d.core.sweep import RFSettings, Sweep, stored_dtype
 from speckle3d.io.hdf5 import atomic_path, require_suffix
@@ -183,7 +181,7 @@ def _add_sensors(fields: dict[str, str], sweep: Sweep) -> Iterator[str]:
         at = times - sensor.time_offset_s
         reach, matrices = sensor.readings.covers(at), np.tile(np.eye(4), (count, 1, 1))
         if reach.any():
-            matrices[reach] = _rigid(sensor.readings.at(at[reach])).as_matrix()
+            matrices[reach] = rigid(sensor.readings.at(at[reach])).as_matrix()
         fields |= _transform(f"{tool}To{world}", matrices, reach)
         if name == "orientation" or not np.array_equal(sensor.readings.time_s, at[reach]):
             yield (
@@ -192,14 +190,10 @@ def _add_sensors(fields: dict[str, str], sweep: Sweep) -> Iterator[str]:
             )
         if (mounting := sensor.sensor_from_image) is not None:
             grid = replace(sweep.grid, skew_rad=getattr(sensor, "image_skew_rad", 0.0))
-            pixels = _rigid(mounting).as_matrix() @ pixel_matrix(grid)
+            pixels = rigid(mounting).as_matrix() @ pixel_matrix(grid)
             fields |= _transform(f"{IMAGE}To{tool}", np.tile(pixels, (count, 1, 1)))
     if sweep.truth is not None:
         yield "the true poses"
-
-
-def _rigid(pose: RigidTransform | Rotation) -> RigidTransform:
-    return RigidTransform.from_rotation(pose) if isinstance(pose, Rotation) else pose
 
 
 def _standard_fields(sweep: Sweep) -> dict[str, str]:

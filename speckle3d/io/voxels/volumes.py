@@ -9,8 +9,6 @@ References
 .. [3] 3D Slicer developer guide, "Segmentation labelmap file format (.seg.nrrd)".
 """
 
-from __future__ import annotations
-
 import json
 import re
 from collections import defaultdict
