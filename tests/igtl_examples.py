@@ -1,7 +1,7 @@
 """Messages of OpenIGTLink made by pyigtl, which knows nothing of our packing."""
 
 import struct
-from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pyigtl
@@ -39,12 +39,14 @@ def with_body(message, body):
 
 
 def decode_whole(message):
-    """A packed message as we read it; of a STRING, the words behind its type."""
+    """A packed message as we read it; of others their device and type, of a STRING its words, too."""
     start, body = message[: HEADER.size], message[HEADER.size :]
     body_bytes(start)
     content = decode(start, body)
-    is_text = getattr(content, "type", "") == "STRING"
-    return replace(content, type=f"STRING {body[4:].decode()}") if is_text else content
+    if content is not None:
+        return content
+    kind, device = (raw.rstrip(b"\0").decode() for raw in HEADER.unpack(start)[1:3])
+    return SimpleNamespace(device=device, type=f"STRING {body[4:].decode()}" if kind == "STRING" else kind)
 
 
 def with_values(at, form, *values):
