@@ -25,7 +25,7 @@ UNSEEN_S = 600.0
 """Without a viewer for so long, the server ends."""
 
 _LOOK_S = 1.0
-_SLOWEST_S = 60.0
+_SLOWEST_MS = 60_000
 """A browser may take so long to show a page. Bokeh waits for 15 s, then makes the session anew, whose styles
 Panel takes from the network."""
 
@@ -72,7 +72,7 @@ class AppServer:
             secret_key=key,
             sign_sessions=True,
             generate_session_ids=False,
-            unused_session_lifetime_milliseconds=round(1000 * _SLOWEST_S),
+            unused_session_lifetime_milliseconds=_SLOWEST_MS,
             # What is refused is told to who asked, not to the terminal.
             log_function=lambda _: None,
         )

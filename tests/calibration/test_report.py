@@ -1,7 +1,6 @@
 """What is saved of a solution: parameters with standard errors, frames, units; and what its report shows."""
 
 import re
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +10,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from calibration.orientation import calibrate_orientation
 from calibration.plane import calibrate_plane
 from calibration.points import ImagePoints
-from calibration.report import as_calibration, text_report
+from calibration.report import as_calibration
 from calibration.settings import PlaneFit
 from speckle3d.core.calibration import FramesUsed
 
@@ -44,17 +43,6 @@ def test_values_are_those_of_the_pose_and_in_the_units_that_they_name():
     errors = np.rad2deg(np.sqrt(np.diag(calibration.covariance)[2::-1]))
     halves = [float(row[1].split("+- ")[1].removesuffix(" (95 %)")) for row in angles]
     assert halves == pytest.approx(1.96 * errors, abs=6e-4)
-
-
-def test_frames_left_out_are_listed_up_to_twenty():
-    calibration = as_calibration(of_plane(), "plane", FRAMES)
-    for count in (1, 25):
-        frames = FramesUsed(300, (0,), {n + 1: f"no line: {n} of 9" for n in range(count)})
-        table = text_report(replace(calibration, frames=frames)).partition("Frames left out:\n")[2]
-        rows = table.partition("\n\n")[0].splitlines()
-        assert rows[0].split(":")[0].strip() == "1"
-        assert len(rows) == min(count, 21)
-        assert ("5 more" in rows[-1]) == (count == 25)
 
 
 def test_a_weak_verdict_names_what_is_known_least_with_its_interval():

@@ -46,11 +46,9 @@ class LinesViewer(PhantomViewer):
 
     def view(self) -> Viewable:
         """Lay out the sliders and what the plane is, two in a row."""
-        names = [name for name in (*self.detection, "reflector") if name in self.widgets]
-        controls = [self.widgets[name] for name in names]
-        return self.layout(
-            *(pn.Row(*controls[at : at + 2]) for at in (0, 2, 4)), pn.pane.HTML(_HINT, width=600)
-        )
+        names = *self.detection, "reflector"
+        controls = [self.widgets[name] for name in names if name in self.widgets]
+        return self.layout(pn.GridBox(*controls, ncols=2), pn.pane.HTML(_HINT, width=600))
 
     def show(self, image: npt.NDArray[Any], settings: ScanSettings) -> str:
         """Find the line in a frame."""

@@ -111,7 +111,7 @@ class FrameStrip:
         """Mark the frame that is looked at, and colour all by what became of them and why."""
         self._cursor.data = {"frame": [frame]}
         colours, reasons = [PALE] * self._count, ["not looked at"] * self._count
-        for colour, frames in ((BLUE, uses), (ORANGE, refusals), (GREY, left_out)):
+        for colour, frames in ((ORANGE, refusals), (BLUE, uses), (GREY, left_out)):
             for at, reason in frames.items():
                 colours[at], reasons[at] = colour, reason
         self._frames.data = {"frame": np.arange(self._count), "colour": colours, "reason": reasons}

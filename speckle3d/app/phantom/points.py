@@ -100,10 +100,10 @@ class PointsViewer(PhantomViewer):
         if missing and self._wire.value not in missing:
             self._wire.value = missing[0]
         self._name_next()
-        lacking = f"; none on {', '.join(missing)}" if points and missing else ""
-        lacking += f": {self._refusals[self.frame]}" if not points and self.frame in self._refusals else ""
+        lacking = f"none on {', '.join(missing)}" if points and missing else self._refusals.get(self.frame)
         total = sum(map(len, self._picks.values()))
-        return f"frame {self.frame}: {len(points)} points{lacking}; {total} in {len(self._picks)} frames"
+        words = f"frame {self.frame}: {len(points)} points", lacking, f"{total} in {len(self._picks)} frames"
+        return "; ".join(filter(None, words))
 
     def find(self, settings: ScanSettings) -> Detections:
         """Take the points that are there."""
@@ -147,8 +147,7 @@ class PointsViewer(PhantomViewer):
 
     def _mark_picks(self) -> None:
         self._picks = {frame: points for frame, points in self._picks.items() if points}
-        reasons = {frame: why for frame, why in self._refusals.items() if frame not in self._picks}
-        self.mark_frames(dict.fromkeys(self._picks, "has points"), reasons)
+        self.mark_frames(dict.fromkeys(self._picks, "has points"), self._refusals)
         self.changed()
 
     @batch_changes
