@@ -2,7 +2,6 @@
 from .accuracy.angles import AccuracyTable as AccuracyTable
 from .accuracy.angles import PairErrors as PairErrors
 from .accuracy.angles import common_readings as common_readings
-from .accuracy.angles import compare_orientations as compare_orientations
 from .accuracy.angles import mounting_from_motion as mounting_from_motion
 from .accuracy.angles import pair_errors as pair_errors
 from .accuracy.figures import figure_turns as figure_turns

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -18,6 +19,9 @@ from xsens.logs.samples import ImuLog, finite_rows
 
 _FORESEEN = 3
 """Standard deviations of the gyroscope's bias that are foreseen; a larger one widens them."""
+
+_SWING_SQRT_S = math.sqrt(2.0 * 0.25)
+"""Of a swing over which an error of scale persists, as `FusionSettings` has it."""
 
 _SHORTEST_S = 3.0
 """Shorter stretches are filtered, not smoothed: most of their time is the filter's start."""
@@ -123,7 +127,9 @@ def orient(
         raise InvalidInputError(f"expected an ImuLog, as read_log(path) gives, got {type(log).__name__}")
     settings, method = settings or FusionSettings(), Method(method)
     used = log if settings.use_magnetometer else replace(log, magnetometer_au=None)
-    rows, samples, notes = usable_samples(used)
+    rows, samples, notes, scale_error = usable_samples(used)
+    scale_noise = max(settings.gyro_scale_noise_sqrt_s, _SWING_SQRT_S * scale_error)
+    settings = replace(settings, gyro_scale_noise_sqrt_s=scale_noise)
     if settings.use_magnetometer and not finite_rows(samples.field_au).any():
         notes.append("no magnetometer: the heading is relative to the start")
         settings = replace(settings, use_magnetometer=False)

@@ -75,7 +75,7 @@ def turn_about_up(angles_rad: FloatArray | float, xyzw: FloatArray) -> FloatArra
     return np.column_stack([c * x - s * y, c * y + s * x, c * z + s * w, c * w - s * z])
 
 
-def usable_samples(log: ImuLog) -> tuple[IntArray, Samples, list[str]]:
+def usable_samples(log: ImuLog) -> tuple[IntArray, Samples, list[str], float]:
     """Prepare a log's readings for the filter.
 
     Returns
@@ -86,6 +86,8 @@ def usable_samples(log: ImuLog) -> tuple[IntArray, Samples, list[str]]:
         Those samples, accelerometer readings interpolated where missing.
     list of str
         Notes on what was left out, interpolated or contradictory.
+    float
+        Share of its turns by which the gyroscope is off.
 
     Raises
     ------
@@ -114,7 +116,7 @@ def usable_samples(log: ImuLog) -> tuple[IntArray, Samples, list[str]]:
             f"{source}: expected samples {SHORTEST_S:g} to {BRIDGED_S:g} s apart, got a median of "
             f"{median_s:.4g} s: times in milliseconds?"
         )
-    against = contradictions(log)
+    against, scale_error = contradictions(log)
     fatal = ["gravity", "gyroscope", "accelerometer's axis", "accelerometer"]
     if against.get("accelerometer") != "":  # nor does it agree: either may be wrong
         fatal += ["own orientation", "magnetometer"]
@@ -142,7 +144,7 @@ def usable_samples(log: ImuLog) -> tuple[IntArray, Samples, list[str]]:
     valid = turns[rows]
     lost_rad2[np.flatnonzero(valid)[1:]] = lost_variance(time_s[valid], rate[rows & turns], usual_s)
     field = np.full_like(means[0], np.nan) if field is None else field[rows]
-    return np.flatnonzero(rows), Samples(step_s, means[0], means[1], field, lost_rad2), notes
+    return np.flatnonzero(rows), Samples(step_s, means[0], means[1], field, lost_rad2), notes, scale_error
 
 
 def lost_variance(time_s: FloatArray, rate_rad_s: FloatArray, usual_s: float) -> FloatArray:

@@ -45,9 +45,7 @@ def by_vqf(stretch: Samples, claims: Estimate, offline: bool, magnetic: bool) ->
         ) from error
     magnetic = magnetic and bool(np.isfinite(stretch.field_au[:, 0]).any())
     time_s = np.cumsum(stretch.step_s)
-    mean_s = float(stretch.step_s.mean())
-    # Losses make the mean step longer than the median, bursts shorter: at most two for one.
-    step_s = float(np.clip(np.median(stretch.step_s), 0.5 * mean_s, mean_s))
+    step_s = float(stretch.step_s.mean())
     place = (time_s - time_s[0]) / step_s
     grid = np.arange(max(round(float(place[-1])), 1) + 1.0)
     # A gyroscope's reading is the mean rate since the one before, here too: turns stay what they were.

@@ -58,18 +58,19 @@ _TURNS_APART = 5.0
 """Of rows in turn of several sensors, how much farther neighbours are apart than rows of one sensor."""
 
 _NOISY = 10.0
-"""Last digits: readings that change by more are not repeated by chance. Usual changes: more is a jump."""
+"""Last digits: readings that change by more are not repeated by chance. Usual changes: more is a jump.
+Runs that chance makes: longer ones are none, where readings change by many last digits."""
 
 _STUCK = 5
 """Samples in which an axis may stand still by chance, where its noise is a few of its last digits."""
 
-_SCATTERED = 0.5
-"""Share of white noise in readings, of their square and of their steps', from which they are noise."""
+_END_TO_END = 1.5
+"""Of an axis's largest reading, the change that only a number that wraps round makes, of two at most."""
 
 _ENOUGH = 50
 _MOST_SENSORS = 8
 _LOOKED_AT = 1000
-"""Rows on either side of the log's middle that tell whether sensors take turns, or readings are noise."""
+"""Rows on either side of the log's middle that tell whether sensors take turns."""
 
 
 def without_faults(log: ImuLog) -> ImuLog:
@@ -130,23 +131,8 @@ def _bad(name: str, rows: FloatArray, force: FloatArray, rate: FloatArray) -> di
         "repeated": repeats,
         "with an axis that stands still": stuck_axes(rows, _SLOW_RAD_S if name == VECTORS[1] else 0.0),
         "single spikes": _spikes(rows, limits.spike * unit),
-        "noise": valid & (name == VECTORS[2] and _is_noise(rows[valid])),
+        "beyond a jump from end to end of the range": _wrapped(rows) & (name == VECTORS[1]),
     }
-
-
-def _middle(rows: FloatArray) -> FloatArray:
-    middle = len(rows) // 2
-    return rows[max(middle - _LOOKED_AT, 0) : middle + _LOOKED_AT]
-
-
-def _is_noise(rows: FloatArray) -> bool:
-    """Whether readings of a vector of constant length are scattered about zero, each on its own."""
-    rows = _middle(rows)
-    if len(rows) < _ENOUGH:
-        return False
-    step, spread = row_norms(np.diff(rows, axis=0)) ** 2, np.mean(row_norms(rows - rows.mean(axis=0)) ** 2)
-    scattered = spread > _SCATTERED * np.mean(row_norms(rows) ** 2)
-    return bool(scattered and usual_step(step, 0.0) > 2.0 * _SCATTERED * spread)
 
 
 def _repeats(name: str, change: float, rows: FloatArray, force: FloatArray, rate: FloatArray) -> BoolArray:
@@ -185,7 +171,7 @@ def _repeats(name: str, change: float, rows: FloatArray, force: FloatArray, rate
 def stuck_axes(rows: FloatArray, least: float = 0.0) -> BoolArray:
     """Rows in which an axis repeats a value, at least so large, while others go on: saturated, or dead.
 
-    At the end of its range slopes before and after are steep; a dead axis jumps, or never changes again.
+    At the end of its range slopes before and after are steep; a dead axis repeats a value for long.
     """
     bad = np.zeros(len(rows), dtype=bool)
     same = rows[1:] == rows[:-1]
@@ -201,10 +187,11 @@ def stuck_axes(rows: FloatArray, least: float = 0.0) -> BoolArray:
         usual = usual_step(steps, np.inf)
         at_end = (value == np.fmax.reduce(axis)) | (value == np.fmin.reduce(axis))
         steep = np.fmin(steps[first], steps[end + 2]) > 3.0 * _digit(steps)
-        dead = np.fmax(steps[first + 1], steps[end + 1]) > _NOISY * usual
-        dead |= (end == len(rows)) & (value != 0.0) & (usual < np.inf)
-        stuck = (at_end & steep & (value != 0.0)) | (dead & (length > longest))
-        stuck &= (np.abs(value) >= least) & (np.add.reduceat(np.append(alone[:, k], 0), first) > 1)
+        stuck = at_end & steep & (value != 0.0) & (np.abs(value) >= least)
+        # Noise of many last digits repeats nothing, unless a gyroscope's small readings are cut to zero.
+        if usual > _NOISY * _digit(steps) and (not least or np.nanmin(np.abs(axis[axis != 0.0])) < usual):
+            stuck |= length > _NOISY * longest
+        stuck &= np.add.reduceat(np.append(alone[:, k], 0), first) > 1
         bad |= np.repeat(stuck, length)
     return bad
 
@@ -217,12 +204,32 @@ def _spikes(rows: FloatArray, height: float) -> BoolArray:
     return (away > height) & (row_norms(after - before) < 0.2 * away)
 
 
+def _wrapped(rows: FloatArray) -> BoolArray:
+    """Rows between jumps of an axis from one end of its range to the other, and back: the rarer ones.
+
+    Beside the jumps of numbers that wrap round it changes little, unlike in a knock.
+    """
+    bad = np.zeros(len(rows), dtype=bool)
+    for axis in rows.T:
+        steps = np.diff(axis, prepend=axis[:1])
+        size = np.abs(steps)
+        jump = size > max(
+            _END_TO_END * np.fmax.reduce(np.abs(axis), initial=0.0), _NOISY * usual_step(size, np.inf)
+        )
+        rough = np.pad(~jump & (size > 0.1 * np.fmax.reduce(size)), 1)
+        jump &= ~(rough[:-2] | rough[2:])
+        turns = np.cumsum(np.where(jump, np.sign(steps), 0.0)).astype(np.int64)
+        bad |= turns != np.bincount(turns - turns.min()).argmax() + turns.min()
+    return bad
+
+
 def _require_one_sensor(readings: dict[str, FloatArray]) -> None:
     """Raise if every second, third... row is alike and neighbours are not: sensors that take turns."""
     for name, rows in readings.items():
         if name == VECTORS[1] or len(rows) < _ENOUGH:  # a gyroscope's noise is as large as its rate
             continue
-        rows = _middle(rows)
+        middle = len(rows) // 2
+        rows = rows[max(middle - _LOOKED_AT, 0) : middle + _LOOKED_AT]
         rows = np.where(row_norms(rows)[:, None] > 0.0, rows, np.nan)
         difference = [median_norm(rows[lag:] - rows[:-lag]) for lag in range(1, _MOST_SENSORS + 1)]
         least = 0.02 * median_norm(rows)

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import replace
 from io import TextIOWrapper
 
 import numpy as np
 
 from speckle3d.core.arrays import ByteArray
-from speckle3d.core.errors import FileError, InvalidInputError, naming
+from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.files import PathLike, open_regular
 from xsens.logs.datamessages import legacy_samples, mtdata2_samples
 from xsens.logs.parts import Hints, assemble_log
@@ -17,10 +16,6 @@ from xsens.logs.samples import ImuLog
 from xsens.logs.textlogs import parse_text
 from xsens.messages.control import MessageId
 from xsens.messages.framing import find_frames
-
-MOST_BYTES = 1 << 27
-"""Of a log: five hours of raw counts at 256 Hz. Reading takes 2 times the memory of text, 4 to 10 times that
-of messages, whose numbers are shorter than a double."""
 
 _HEAD_BYTES = 1 << 16
 _WIDE = (b"\xff\xfe", b"\xfe\xff")
@@ -46,7 +41,7 @@ def read_log(path: PathLike, hints: Hints | None = None) -> ImuLog:
     Raises
     ------
     FileError
-        If the file cannot be read, is no file, or is larger than `MOST_BYTES`.
+        If the file cannot be read, or is no file.
     InvalidInputError
         If it holds no samples of the sensor, or lacks what is needed to understand them.
 
@@ -63,11 +58,8 @@ def read_log(path: PathLike, hints: Hints | None = None) -> ImuLog:
     """
     with open_regular(path) as file:
         head = file.read(_HEAD_BYTES)
-        size = file.seek(0, os.SEEK_END)
         file.seek(0)
-        if size > MOST_BYTES:
-            raise FileError(f"{path}: expected at most {MOST_BYTES} bytes, got {size}")
-        if not size:
+        if not head:
             raise InvalidInputError(f"{path}: expected a log of the sensor, got an empty file")
         wide = head.startswith(_WIDE)
         if (wide or 100 * head.count(0) <= len(head)) and not len(find_frames(head)):

@@ -31,8 +31,8 @@ any number format (1e-6), far below the effect of damage."""
 
 _WORST_ANGLE_DEG = 720.0
 
-_FEWEST, _MOST = 8, 20_000
-"""Samples that tell a world, and that are looked at: medians of more are no better."""
+_FEWEST = 8
+"""Samples that tell a world."""
 
 _AT_REST = 0.05
 """Share of its median by which the acceleration's length may differ in samples that are preferred."""
@@ -206,9 +206,8 @@ def _north_deg(fields: FloatArray) -> float:
 
 
 def _in_world(log: ImuLog, wxyz: FloatArray, vectors: FloatArray | None) -> FloatArray:
-    """Readings turned into the world, shape (n, 3), of some thousand samples; none if they are too few."""
-    oriented = np.flatnonzero(log.oriented)
-    part = oriented[:: len(oriented) // _MOST + 1]
+    """Readings turned into the world, shape (n, 3); none if they are too few."""
+    part = np.flatnonzero(log.oriented)
     if vectors is not None:
         part = part[row_norms(vectors[part]) > 0.0]
     if vectors is None or len(part) < _FEWEST:

@@ -162,13 +162,11 @@ class RawCalibration:
     misalignments: FloatArray
 
     def __post_init__(self) -> None:
-        if not (self.gains > 0.0).all():
-            raise InvalidInputError("calibration block: expected gains above 0, got 0")
         # Axes of a real unit are within a few degrees of square: a determinant near 1.
         worst = np.abs(np.linalg.det(self.misalignments)).min()
-        if worst < 0.1:
+        if worst < 0.1 or not self.gains.all():
             raise InvalidInputError(
-                f"calibration block: expected axes nearly square, got determinant {worst:.2g}"
+                f"calibration block: expected gains and axes nearly square, got determinant {worst:.2g}"
             )
 
     @classmethod

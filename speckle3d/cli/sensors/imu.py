@@ -45,7 +45,11 @@ def note_gaps(log: xsens.ImuLog) -> None:
     """Report on stderr what a log lacks, and what was assumed in its place."""
     from xsens.logs.contradictions import contradictions
 
-    note(*log.notes, contradictions(log).get("gravity"), log.losses and f"{log.losses}; nothing filled in")
+    note(
+        *log.notes,
+        contradictions(log).sentences.get("gravity"),
+        log.losses and f"{log.losses}; nothing filled in",
+    )
 
 
 def orientation_of(
@@ -59,7 +63,7 @@ def orientation_of(
         note("no gyroscope and no accelerometer: the orientation is the sensor's own")
         method = "sensor"
     if method == "sensor":
-        against = contradictions(log)
+        against = contradictions(log).sentences
         if against.get("own orientation") and against.get("accelerometer") == "":
             raise InvalidInputError(
                 f"{against['own orientation']} The accelerometer agrees with the gyroscope"
@@ -101,7 +105,7 @@ def info(log_file: Path, rate_hz: MaybeNumber = None, world: World = None) -> Re
         values, noun = getattr(log, name), name.split("_")[0]
         norm = math.nan if values is None else median_norm(values)
         rows.append((f"{noun}, median norm", f"{norm:.4f}", unit) if norm == norm else (noun, "none", ""))
-    notes = [*log.notes, *filter(None, contradictions(log).values())]
+    notes = [*log.notes, *filter(None, contradictions(log).sentences.values())]
     return rows_of([*rows, *(("note", text, "") for text in notes)])
 
 

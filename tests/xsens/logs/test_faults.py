@@ -115,11 +115,12 @@ def with_every(step, rows, value):
     ("name", "spoil"),
     [
         (VECTORS[1], lambda rows: np.clip(rows, -1.2, 1.2)),
+        (VECTORS[1], lambda rows: (rows + 1.5) % 3.0 - 1.5),
         (VECTORS[1], lambda rows: with_every(97, rows, [25.0, -25.0, 25.0])),
         (VECTORS[2], lambda rows: with_every(97, rows, [9.0, 0.0, 0.0])),
         (VECTORS[0], lambda rows: rows * np.where(np.arange(len(rows))[:, None] < 600, 1.0, [1.0, 1.0, 0.0])),
     ],
-    ids=["saturated", "spikes", "a field's spikes", "half dead"],
+    ids=["saturated", "wrapped round", "spikes", "a field's spikes", "half dead"],
 )
 @pytest.mark.parametrize("method", ["smoother", "filter"])
 def test_saturation_and_values_no_hand_makes_are_missing(name, spoil, method):
@@ -174,6 +175,13 @@ def test_a_gyroscope_in_another_unit_rate_or_axes_or_a_dead_one_raises(mixing, s
     log, _ = swinging(20.0, speed=speed)
     with pytest.raises(Speckle3DError, match="gyroscope"):
         orient(with_rows(log, [VECTORS[1]], lambda rows: rows @ mixing))
+
+
+@pytest.mark.parametrize("method", ["smoother", "filter"])
+def test_times_ten_per_cent_wrong_cost_certainty(method):
+    log, truth = swinging(20.0)
+    _, tilt, claim, *_ = errors(replace(log, time_s=1.1 * log.time_s), truth, method)
+    assert tilt < 1.5 * claim
 
 
 def test_a_magnetometer_on_other_axes_is_left_out_and_a_dead_accelerometer_refused():
