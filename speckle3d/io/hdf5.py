@@ -182,8 +182,10 @@ def find_member(group: h5py.Group, name: str) -> Any:
     where = locate(group, name)
     with reading(where):
         node = group.get(name) if isinstance(group, h5py.Group) else None
-        is_inside = node is None or node.file.filename == group.file.filename
-        if not is_inside or (isinstance(node, h5py.Dataset) and (node.is_virtual or node.external)):
+        if node is None or getattr(node, "shape", ()) is None:  # HDF5's data set of nothing
+            return None
+        is_elsewhere = isinstance(node, h5py.Dataset) and (node.is_virtual or node.external)
+        if is_elsewhere or node.file.filename != group.file.filename:
             raise InvalidInputError(f"{where}: expected data in the file itself, got a link out of it")
         return node
 

@@ -69,8 +69,9 @@ def _members(file: h5py.File) -> list[str]:
     tracks = find_member(file, "tracks")
     names = tracks if isinstance(tracks, h5py.Group) else ()
     homes = ["data", *(f"tracks/{name}/data" for name in names)]
-    groups = ((home, find_member(file, home)) for home in homes)
-    return [f"{home}/{name}" for home, group in groups if isinstance(group, h5py.Group) for name in group]
+    nodes = ((home, find_member(file, home)) for home in homes)
+    groups = [(home, node) for home, node in nodes if isinstance(node, h5py.Group)]
+    return [f"{home}/{name}" for home, group in groups for name in group if has_member(group, name)]
 
 
 def open_zea(file: h5py.File, settings: ImportSettings) -> Facts:
@@ -195,7 +196,8 @@ def _tracker(file: h5py.File, left_mm: float | None) -> tuple[Tracker | None, li
     """The probe's poses, with the image on the probe where the file says where its lines lie."""
     if (node := find_member(file, _POSES)) is None:
         return None, []
-    kind = text_of(node["rotation_representation"][()]) if "rotation_representation" in node else ""
+    word = find_member(node, "rotation_representation")
+    kind = text_of(word[()]) if isinstance(word, h5py.Dataset) else ""
     if kind not in _ROTATIONS:
         return None, [f"{_POSES}: not read: expected a rotation_representation among {', '.join(_ROTATIONS)}"]
     is_euler, places_m = kind == "euler_xyz", read_array(node, "translation", ("pose", 3))
