@@ -58,14 +58,15 @@ def pairs(comparisons: Sequence[Row]) -> Table:
 def records_table(
     records: Sequence[Row], columns: Sequence[str] = (), anchors: Mapping[str, str] | None = None
 ) -> Table:
-    """Any list of records, by default a column for each of their names in the order they first appear.
+    """Any list of records, by default a column for each of their names that has a value somewhere.
 
     Parameters
     ----------
     anchors : mapping of str to str, optional
         Places on the page that the names of sweeps lead to.
     """
-    keys = columns or list(dict.fromkeys(key for record in records for key in record))
+    values = (item for record in records for item in record.items())
+    keys = columns or list(dict.fromkeys(key for key, value in values if value is not None))
     heads = ["+- 95 % / mm" if key == "interval_mm" else words_of(key) for key in keys]
     lines = [[_cell(key, record.get(key), anchors or {}) for key in keys] for record in records]
     return [heads, *lines] if lines else []
