@@ -292,8 +292,8 @@ def play(
         note(f"times in the messages are the sweep's and {shift_s:g} s")
     with Server(port) as server, s3.progress_bar(f"playing {read.name}") as progress:
         note(f"127.0.0.1:{server.port}: {len(read)} frames of {read.name}; waiting for a client")
-        while not server.wait_connected(1.0):
-            server.receive(0.0)
+        while not server.state.peers:
+            server.receive(0.02)
         count, start_s = 0, time.monotonic()
         for at_s, message, is_frame in send(shift_s):
             time.sleep(max(0.0, start_s + at_s / rate - time.monotonic()))

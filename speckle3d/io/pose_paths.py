@@ -106,9 +106,9 @@ def timed_poses(time_s: FloatArray, matrices: FloatArray) -> tuple[TimedPoses | 
 
 def _loss(noun: str, total: int, reasons: Mapping[str, int], time_s: FloatArray) -> list[str]:
     """Tell how many rows are left out and why, and the longest gap between those that stay."""
-    if not any(reasons.values()):
+    if not reasons:
         return []
-    counts = ", ".join(f"{count} {reason}" for reason, count in reasons.items() if count)
+    counts = ", ".join(f"{count} {reason}" for reason, count in reasons.items())
     text = f"{noun}: {sum(reasons.values())} of {total} left out ({counts})"
     if time_s.size > 1:
         i = int(np.argmax(np.diff(time_s)))

@@ -29,8 +29,6 @@ SUFFIXES = (".stl", ".ply", ".vtk")
 SPACE = "SPACE=LPS"
 """What 3D Slicer looks for in the header of STL and VTK, and among the comments of PLY."""
 _STL_HEADER_BYTES = 80
-_TRANSFORM, _TYPE = ".tfm", "AffineTransform_double_3_3"
-"""Rigid, but of the type that all of ITK's readers know."""
 
 
 def write_surface(path: PathLike, surface: Surface) -> None:
@@ -171,7 +169,7 @@ def write_transform(path: PathLike, world_from_image: RigidTransform) -> None:
     ...     print(Path(f"{folder}/t.tfm").read_text().splitlines()[3])
     Parameters: 1 0 0 0 1 0 0 0 1 -1 -2 -3
     """
-    require_suffix(path, [_TRANSFORM])
+    require_suffix(path, [".tfm"])
     if not world_from_image.single:
         raise InvalidInputError(f"{path}: expected one pose, got a row of {len(world_from_image)}")
     matrix = world_from_image.inv().as_matrix()
@@ -180,7 +178,7 @@ def write_transform(path: PathLike, world_from_image: RigidTransform) -> None:
     lines = (
         "#Insight Transform File V1.0",
         "#Transform 0",
-        f"Transform: {_TYPE}",
+        "Transform: AffineTransform_double_3_3",  # rigid, of the type that all of ITK's readers know
         f"Parameters: {number_text(parameters)}",
         "FixedParameters: 0 0 0",
     )

@@ -147,8 +147,8 @@ def test_a_connection_waits_for_its_server_and_reconnects():
         assert not connection.state.peers
         for _ in range(2):
             with Server(port) as server:
-                assert connection.wait_connected(WAIT_S)
-                assert server.wait_connected(WAIT_S)
+                until(lambda: connection.state.peers)
+                until(lambda: server.state.peers)
                 server.send(LAST)
                 assert [message.device for message in take(connection, 1)] == ["Last"]
             until(lambda: not connection.state.peers)
@@ -198,7 +198,7 @@ def test_pyigtl_connects_to_our_server():
     with Server(0) as server:
         try:
             client = pyigtl.OpenIGTLinkClient("127.0.0.1", server.port)
-            assert server.wait_connected(WAIT_S)
+            until(lambda: server.state.peers)
             server.send(packed_image("Volume", 1.5, np.ones((3, 4, 5), np.uint8), np.eye(4)))
             assert client.wait_for_message("Volume", WAIT_S).image.shape == (5, 4, 3)
             client.send_message(pyigtl.TransformMessage(np.eye(4), 2.0, "Back"), wait=False)

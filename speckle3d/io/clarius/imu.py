@@ -116,7 +116,8 @@ def read_samples(member: Member) -> SensorSamples:
     has_column = np.isfinite(table).sum(axis=0) > 0.5 * len(table)
     table[:, ~has_column] = 0.0
     sound = np.isfinite(table).all(axis=1) & table[:, :3].any(axis=1)
-    if has_column[9:].all():
+    has_quaternion = has_column[9:].all()
+    if has_quaternion:
         sound &= np.abs(np.linalg.norm(table[:, 9:], axis=1) - 1.0) < RIGID_TOLERANCE
     faults = np.where(sound, "", "without a value, or a quaternion of unit length").astype(object)
     repeats = np.flatnonzero(sound)[1:][(np.diff(table[sound], axis=0) == 0).all(axis=1)]
@@ -132,7 +133,7 @@ def read_samples(member: Member) -> SensorSamples:
             "or scale is another than assumed"
         )
     rotation, sign, fault, facts = None, -1.0, "is missing", list[Row]()
-    if has_column[9:].all():
+    if has_quaternion:
         rotation = Rotation.from_quat(wxyz, scalar_first=True)
         along = rotation.apply(measured_g)[:, 2] / norms
         sign = 1.0 if along.mean() >= 0 else -1.0

@@ -87,13 +87,6 @@ class End:
         if self._thread.is_alive():
             self._thread.join()
 
-    def wait_connected(self, timeout_s: float) -> bool:
-        """Wait for a peer; False if none came in time."""
-        end_s = time.monotonic() + timeout_s
-        while not self.state.peers and time.monotonic() < end_s:
-            time.sleep(_LOOK_S)
-        return self.state.peers > 0
-
     def receive(self, timeout_s: float) -> list[Received]:
         """Take all messages in the order in which they came, waiting for the first one.
 
@@ -181,7 +174,8 @@ class Connection(End):
     >>> from speckle3d.io.igtl.messages import packed_transform
     >>> import numpy as np
     >>> with Server(0) as server, Connection("127.0.0.1", server.port) as connection:
-    ...     _ = connection.wait_connected(5.0) and server.wait_connected(5.0)
+    ...     while not server.state.peers:
+    ...         time.sleep(0.01)
     ...     server.send(packed_transform("ProbeToTracker", 12.5, np.eye(4)))
     ...     received = connection.receive(5.0)
     >>> received[0].device, received[0].time_s, received[0].valid

@@ -172,8 +172,7 @@ def packed_status(device: str, time_s: float, text: str, code: int = _OK) -> byt
 
 
 def _pack(message: Any, device: str, time_s: float) -> bytes:
-    message.header_version = 2 if message.metadata else 1
-    message.device_name, message.timestamp = device, time_s
+    message.header_version, message.device_name, message.timestamp = 1, device, time_s
     try:
         return bytes(message.pack())
     except (struct.error, IndexError) as error:  # of an image too long, or of a type that it does not know
