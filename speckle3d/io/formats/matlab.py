@@ -136,7 +136,7 @@ def _children(node: Any) -> Mapping[str, Any]:
         return {name: node[name] for name in node.dtype.names}
     if not isinstance(node, np.ndarray | h5py.Dataset) or node.dtype != object:
         return {}
-    elements = node.T if isinstance(node, np.ndarray) else node[()]
+    elements = node.T if isinstance(node, np.ndarray) else np.asarray(node[()])
     return {str(k): element for k, element in enumerate(elements.ravel(), 1)}
 
 
