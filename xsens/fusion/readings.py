@@ -102,8 +102,7 @@ def usable_samples(log: ImuLog) -> tuple[IntArray, Samples, list[str], float]:
     rows = _near(log.time_s, turns) & _near(log.time_s, pulls)
     count = int(min((rows & turns).sum(), (rows & pulls).sum()))
     if rate is None or force is None or count < 2:
-        missing = {"no gyroscope": rate, "no accelerometer": force}
-        problems = [name for name, part in missing.items() if part is None] or [str(count)]
+        problems = ["no gyroscope"] * (rate is None) + ["no accelerometer"] * (force is None) or [str(count)]
         problems += [note for note in log.notes if note.startswith(("columns", "gyro", "accel"))]
         if log.oriented.any():
             problems.append("--method sensor takes the sensor's own orientation")
