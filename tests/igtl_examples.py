@@ -39,14 +39,14 @@ def with_body(message, body):
 
 
 def decode_whole(message):
-    """A packed message as we read it; of others their device and type, of a STRING its words, too."""
+    """A packed message as we read it; of others their device, and their type with what it says."""
     start, body = message[: HEADER.size], message[HEADER.size :]
     body_bytes(start)
     content = decode(start, body)
     if content is not None:
         return content
     kind, device = (raw.rstrip(b"\0").decode() for raw in HEADER.unpack(start)[1:3])
-    return SimpleNamespace(device=device, type=f"STRING {body[4:].decode()}" if kind == "STRING" else kind)
+    return SimpleNamespace(device=device, type=f"{kind} {body[4:].decode(errors='replace')}")
 
 
 def with_values(at, form, *values):

@@ -11,11 +11,7 @@ from pyigtl.messages import MessageBase
 
 from speckle3d.io.igtl import link
 from speckle3d.io.igtl.link import Connection, Server
-from speckle3d.io.igtl.messages import (
-    MessageError,
-    packed_image,
-    packed_transform,
-)
+from speckle3d.io.igtl.messages import MessageError, packed_image, packed_transform
 
 WAIT_S = 60.0
 # Places are single precision in messages.
@@ -33,24 +29,20 @@ def by_pyigtl(message):
 def test_an_image_of_pyigtl_is_read(version):
     message, pixels, place = image(dtype="f4", version=version)
     ours = decode_whole(message)
-    assert (ours.device, ours.time_s, ours.components, ours.pixels.dtype) == (
-        "Image_Reference",
-        12.25,
-        1,
-        "f4",
-    )
+    assert (ours.device, ours.time_s, ours.components) == ("Image_Reference", 12.25, 1)
+    assert ours.pixels.dtype == "f4"
     np.testing.assert_array_equal(ours.pixels, pixels)
     np.testing.assert_allclose(ours.image_to_world, place, atol=SINGLE)
     np.testing.assert_allclose(ours.spacing_mm, [0.3, 0.1, 2.0], atol=SINGLE)
 
 
-@pytest.mark.parametrize("shape", [(6, 9), (6, 9, 4), (6, 9, 3)])
+@pytest.mark.parametrize("shape", [(6, 9), (6, 9, 3)])
 def test_pyigtl_and_we_read_an_image_of_ours(shape):
     pixels = np.random.default_rng(0).integers(0, 100, shape).astype(np.int16)
     colours, place = 3 if shape[-1] == 3 else 1, image()[2]
     message = packed_image("Volume", 1700000000.123456, pixels, place, colours)
     reference, ours = by_pyigtl(message), decode_whole(message)
-    whole = pixels[:, :, None] if pixels.ndim == 2 or colours == 3 else pixels
+    whole = pixels[:, :, None]
     np.testing.assert_array_equal(reference.image, whole.transpose(2, 1, 0, *range(3, whole.ndim)))
     np.testing.assert_array_equal(ours.pixels, pixels)
     assert ours.components == colours
@@ -84,8 +76,8 @@ def test_what_makes_no_sense_is_refused_in_one_line(message):
     assert str(error.value).isprintable()
 
 
-def until(is_so, timeout_s=WAIT_S):
-    end = time.monotonic() + timeout_s
+def until(is_so):
+    end = time.monotonic() + WAIT_S
     while not is_so():
         assert time.monotonic() < end, "waited too long"
         time.sleep(0.005)

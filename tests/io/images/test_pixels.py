@@ -1,25 +1,20 @@
-"""Pixels of image files lie in the header's own folder."""
-
-import os
+"""Pixels of image files, beside their headers or in them, of either byte order."""
 
 import numpy as np
 import pytest
 from image_examples import frame_fields, grey, write_mha
 
 from speckle3d.io.images.headers import read_header
-from speckle3d.io.import_settings import ImportSettings
-
-BMODE = ImportSettings(column_pitch_mm=0.1, row_spacing_mm=0.2, dynamic_range_db=60.0)
 
 
-def header_and_pixels(folder, name, suffix=".mhd"):
+def header_and_pixels(folder, name, suffix):
     """A header whose pixels are in another file."""
     whole = write_mha(folder / "whole.mha", grey(), frames=frame_fields(3)[2]).read_bytes()
     head, _, pixels = whole.partition(b"LOCAL\n")
     path = folder / f"header{suffix}"
     if suffix == ".nhdr":
         head = b"NRRD0004\ndimension: 3\nencoding: raw\nsizes: 5 4 3\ntype: uint8\nData File: "
-    path.write_bytes(head + os.fsencode(name) + b"\n")
+    path.write_bytes(head + name.encode() + b"\n")
     return path, pixels
 
 

@@ -43,7 +43,7 @@ def sequence(tmp_path):
     return write_mha(tmp_path / "a.mha", grey(), frames=frame_fields(3)[2])
 
 
-HALF = np.diag([1.0, 1.0, 1.0, 1.0])
+HALF = np.eye(4)
 HALF[:3, 3] = -2.5, 5.0, 0.0
 
 
