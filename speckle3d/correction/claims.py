@@ -10,7 +10,7 @@ import numpy as np
 from numpy.polynomial import legendre
 from scipy.spatial.transform import RigidTransform
 
-from speckle3d.core.arrays import FloatArray
+from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.geometry import skew
 from speckle3d.correction.curves import CUBIC
 from speckle3d.correction.settings import FusedSettings
@@ -33,10 +33,10 @@ def length_sigma(poses: RigidTransform, covariance: FloatArray, centre_mm: Float
 
 
 def correlated_readings(error: FloatArray) -> float:
-    """Autocorrelation time of the residuals of a cubic, shape (m,), in readings.
+    """Autocorrelation time of the residuals of the curves, shape (m,), in readings.
 
-    The cubic's coefficients make every autocovariance smaller by their number / m of the sum of all, which is
-    put back.
+    The coefficients make every autocovariance smaller by their number / m of the sum of all, which is put
+    back.
     """
     error = error - error.mean()
     energy = total = float((error**2).sum())
@@ -46,31 +46,34 @@ def correlated_readings(error: FloatArray) -> float:
         if product <= 0.0:
             break
         total, lags = total + 2.0 * product, lags + 1
-    bias = min((2 * lags - 1) * (CUBIC + 1) / len(error), 0.75) if lags > 1 else 0.0
+    bias = min((2 * lags - 1) * (CUBIC + 2) / len(error), 0.75) if lags > 1 else 0.0
     return max(total / max(energy, np.finfo(float).tiny) / (1.0 - bias), 1.0)
 
 
-def curve_errors(error: FloatArray, frames: int) -> FloatArray:
+def curve_errors(error: FloatArray, has_reading: BoolArray) -> FloatArray:
     """Covariance of poses corrected by cubics, from the readings' residuals, shape (n, 6, 6).
 
-    A cubic through m readings of variance s2 errs at t in -1 to 1 by s2 / m times the sum of
-    (2 k + 1) P_k(t)^2 over Legendre's polynomials of order 0 to 3. What it leaves beyond white jitter is an
-    error of single frames.
+    Steps corrected by cubics bend the path by polynomials of one degree more. Fitted to m readings of
+    variance s2 these err at t, which is -1 to 1 from the first reading to the last, by s2 / m times the sum
+    of (2 k + 1) P_k(t)^2 over Legendre's polynomials: more beyond the readings. What the curves leave beyond
+    white jitter is an error of single frames.
 
     Parameters
     ----------
     error : ndarray, shape (m, 6)
         Readings less corrected poses, (x, y, z, tilt, yaw, roll), in the order of frames.
-    frames : int
-        n, nearly all of which have a reading.
+    has_reading : ndarray of bool, shape (n,)
+        Frames with a reading, m in all.
     """
-    order = np.arange(CUBIC + 1)
-    basis = legendre.legvander(np.linspace(-1.0, 1.0, frames), CUBIC) * np.sqrt(2.0 * order + 1.0)
+    order, readings = np.arange(CUBIC + 2), np.flatnonzero(has_reading)
+    at = (2.0 * np.arange(has_reading.size) - readings[0] - readings[-1]) / np.ptp(readings)
+    basis = legendre.legvander(at, CUBIC + 1) * np.sqrt(2.0 * order + 1.0)
     against_first = ((basis - basis[0]) ** 2).sum(axis=1) / len(error)
     runs = [correlated_readings(column) for column in error.T]
     white = np.mean((error[2:] - 2.0 * error[1:-1] + error[:-2]) ** 2, axis=0) / 6.0
     excess = 2.0 * np.maximum(error.var(axis=0) - white, 0.0)
-    variance = against_first[:, None] * error.var(axis=0) * runs
+    scatter = error.var(axis=0) * len(error) / (len(error) - order.size)
+    variance = against_first[:, None] * scatter * runs
     variance[1:] += excess
     return np.asarray(variance[:, :, None] * np.eye(6))
 

@@ -249,7 +249,7 @@ def _correction(
     centre_mm: FloatArray,
 ) -> DriftCorrection:
     """The result, with what the readings' scatter about the curves claims."""
-    covariance = curve_errors(error, len(poses))
+    covariance = curve_errors(error, has_reading)
     sigma, values = length_sigma(poses, covariance, centre_mm), chain.values(fit.x)
     return DriftCorrection(
         poses, fit, chain.names, values, float(has_reading.mean()), settings, covariance, sigma

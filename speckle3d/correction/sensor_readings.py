@@ -18,7 +18,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import FloatArray, IntArray
-from speckle3d.core.geometry import skew
+from speckle3d.core.geometry import rigid, skew
 from speckle3d.core.leastsquares import robust_sigma
 from speckle3d.core.sweep import OrientationSensor, Tracker
 from speckle3d.correction.image_path import HAND_TURN_RAD, ImagePath, knot_intervals
@@ -27,42 +27,12 @@ from speckle3d.correction.settings import FusedSettings
 FEWEST_READINGS = 10
 PER_PIECE = 512
 """Readings whose equations are held in memory at a time."""
-WANDER_KNOTS = 20
-"""Knots of the wandering error: twice the fastest that is tried. Half and twice as many of a tracker move no
-length by 0.1 %, no claim by 3 %."""
-WANDER_MM = np.geomspace(0.03, 3.0, 7)
-"""Sizes of a tracker's wandering error that are tried: from what optical ones have to what metal does to a
-field."""
-WANDER_TIMES = (0.1, 0.3, 1.0, 3.0)
-"""Times in which it changes, over the sweep's: shorter ones look like jitter, longer ones like a line."""
-STEADY = 0.5
-"""Probability, before anything is read, that it does not wander, as in calibrations: nothing says more.
-Half of it moves lengths of 56 parts of sweeps by at most 0.3 %, their claims by at most 6 %."""
 LEAST_JITTER = np.array([2e-5, 2e-3])
 """Of a turn, rad, and a place, mm: the last digits of sensors; simulated ones may have no noise."""
-ANYWHERE = 1e4
-"""Standard deviation of what is not known at all, mm and rad."""
+TICK = float(np.sqrt(np.finfo(float).eps))
+"""Step of a difference quotient, and inverse deviation of what is not known at all."""
 RIGID = 14
 """Unknowns before the wander's: turn and shift of world and mounting, clock, logarithm of millimetres."""
-
-
-@dataclass(frozen=True)
-class Wander:
-    """A slow error of Ornstein and Uhlenbeck's kind.
-
-    Attributes
-    ----------
-    size : ndarray, shape (3,)
-        Standard deviation along the world's axes, rad or mm.
-    time_s : float
-        In which it changes.
-    probability : float
-        Before anything is read.
-    """
-
-    size: FloatArray
-    time_s: float
-    probability: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -81,8 +51,11 @@ class SensorReadings:
         On the images' clock.
     jitter : ndarray, shape (2,)
         Standard deviation of a turn, rad, and of a place, mm, about each axis.
-    wander : Wander
-        Of an orientation sensor's turns or of a tracker's places.
+    wander : ndarray, shape (3,)
+        Standard deviation along the world's axes of an error that changes in `wander_s`: of an orientation
+        sensor's turns, rad, as its settings have it, or of a tracker's places, mm.
+    noise_mm : float
+        White noise of a place, mm: the jitter but for what the path does not resolve.
     """
 
     name: str
@@ -94,7 +67,8 @@ class SensorReadings:
     frame_time_s: FloatArray
     settings: FusedSettings
     jitter: FloatArray
-    wander: Wander
+    wander: FloatArray
+    noise_mm: float = 0.0
 
     @classmethod
     def of(
@@ -124,14 +98,14 @@ class SensorReadings:
         readings = cls(
             sensor.label,
             places,
-            (_rigid(sensor.sensor_from_image) * centre).inv(),
+            (rigid(sensor.sensor_from_image) * centre).inv(),
             RigidTransform.identity(),
-            _rigid(sensor.readings.world_from_sensor[inside]),
+            rigid(sensor.readings.world_from_sensor[inside]),
             time_s[inside],
             frame_time_s,
             settings,
             np.ones(2),
-            Wander(np.array(slow), settings.wander_s),
+            np.array(slow),
         )
         readings = replace(readings, world=readings._consensus_world(path))
         second = [
@@ -143,23 +117,38 @@ class SensorReadings:
         interval_s = np.ptp(frame_time_s) / knot_intervals(frame_time_s.size)
         unresolved = HAND_TURN_RAD * np.sqrt(interval_s / 6.0)
         lever_mm = np.linalg.norm(readings.centre_from_sensor.translation)
+        wander, noise_mm = np.full(3, jitter[1]) if places else readings.wander, jitter[1]
         jitter = np.hypot(jitter, unresolved * np.array([1.0, lever_mm]))
-        return replace(readings, jitter=jitter)
+        return replace(readings, jitter=jitter, wander=wander, noise_mm=noise_mm)
 
     @property
     def knots_s(self) -> FloatArray:
         """Times at which the wandering error is unknown."""
-        return np.linspace(self.time_s[0], self.time_s[-1], WANDER_KNOTS)
+        return np.linspace(self.time_s[0], self.time_s[-1], 1 + knot_intervals(self.frame_time_s.size))
 
-    def wanders(self) -> list[SensorReadings]:
-        """The readings with all that a tracker's wandering error may be; an orientation sensor's is known."""
+    def with_wander(self, unknowns: FloatArray, covariance: FloatArray) -> SensorReadings:
+        """A tracker's readings with the likeliest size of its wander; an orientation sensor's is known.
+
+        By the fixed point of MacKay 1992. White noise hides a wander of its own size, which counts as one
+        observation more: so the size is never zero.
+
+        Parameters
+        ----------
+        unknowns : ndarray, shape (size,)
+        covariance : ndarray, shape (size, size)
+            Of them.
+
+        References
+        ----------
+        .. [1] D. J. C. MacKay, "Bayesian interpolation", Neural Computation 4(3), 1992.
+        """
         if not self.places:
-            return [self]
-        span = float(np.ptp(self.time_s))
-        share = (1.0 - STEADY) / (len(WANDER_MM) * len(WANDER_TIMES))
-        sizes = [Wander(np.full(3, LEAST_JITTER[1]), span, STEADY)]
-        sizes += [Wander(np.full(3, mm), span * time, share) for mm in WANDER_MM for time in WANDER_TIMES]
-        return [replace(self, wander=wander) for wander in sizes]
+            return self
+        residual, root = self.prior(unknowns)
+        unobserved = ((root @ covariance) * root).sum(axis=1)[RIGID:]
+        square = (self.wander**2).mean() * (residual[RIGID:] ** 2).sum() + self.noise_mm**2
+        size = np.sqrt(square / (1.0 + np.maximum(1.0 - unobserved, 0.0).sum()))
+        return replace(self, wander=np.full(3, size))
 
     @property
     def size(self) -> int:
@@ -231,11 +220,16 @@ class SensorReadings:
         """
         poses = path.chain.poses(coefficients)
         errors = np.stack(self.errors(poses, unknowns))
-        tick = np.sqrt(np.finfo(float).eps)
-        nudged = (self.errors(poses, unknowns + step) for step in tick * np.eye(RIGID, self.size))
-        rigid = (np.stack([np.stack(error) for error in nudged], axis=-1) - errors[..., None]) / tick
+        expected, rigid = self._expected(poses, unknowns), np.zeros((*errors.shape, RIGID))
+        place = expected.translation - self.world_from_sensor.translation.mean(axis=0)
+        rigid[0, :, :, 0:3] = rigid[1, :, :, 3:6] = np.eye(3)
+        rigid[1, :, :, 0:3] = -skew(place)
+        rigid[0, :, :, 6:9] = rigid[1, :, :, 9:12] = expected.rotation.as_matrix()
+        later = self.errors(poses, unknowns + TICK * np.eye(self.size)[12])
+        rigid[..., 12] = (np.stack(later) - errors) / TICK
+        rigid[1, :, :, 13] = place - place.mean(axis=0)
         world, hats = self.world_of(unknowns), self._hats()
-        to_world, on_path = world.rotation.as_matrix(), world.inv() * self._expected(poses, unknowns)
+        to_world, on_path = world.rotation.as_matrix(), world.inv() * expected
         twists, (before, share) = path.chain.twists(coefficients, poses), self._frames(unknowns)
         for first in range(0, self.time_s.size, PER_PIECE):
             rows = slice(first, first + PER_PIECE)
@@ -252,16 +246,12 @@ class SensorReadings:
         """Residuals of what is known of mounting, clock, millimetres and wander, and their derivatives."""
         s = self.settings
         mounting = [*[s.mounting_sigma_rad] * 3, *[s.mounting_sigma_mm] * 3]
-        rigid = 1.0 / np.array([*[ANYWHERE] * 6, *mounting, s.clock_sigma_s, s.tracker_scale_sigma])
+        rigid = 1.0 / np.array([*[1.0 / TICK] * 6, *mounting, s.clock_sigma_s, s.tracker_scale_sigma])
         k = self.knots_s.size
         matrix = np.zeros((self.size, self.size))
         matrix[range(RIGID), range(RIGID)] = rigid
-        decay = np.exp(-np.diff(self.knots_s)[:1] / self.wander.time_s)
+        decay = np.exp(-np.diff(self.knots_s)[:1] / s.wander_s)
         change = np.eye(k) - decay * np.eye(k, k=-1)
         change[1:] /= np.sqrt(1.0 - decay**2)
-        matrix[RIGID:, RIGID:] = np.kron(change, np.diag(1.0 / self.wander.size))
+        matrix[RIGID:, RIGID:] = np.kron(change, np.diag(1.0 / self.wander))
         return matrix @ unknowns, matrix
-
-
-def _rigid(samples: RigidTransform | Rotation) -> RigidTransform:
-    return RigidTransform.from_rotation(samples) if isinstance(samples, Rotation) else samples

@@ -28,8 +28,6 @@ from speckle3d.motion.planes import LEAST_CORRELATION
 IMAGES = "images"
 """What all doubts of this module are about."""
 
-SHADOW_SHARE = 0.02
-"""Share of patches without an echo that is told."""
 OPEN_SHARE = 0.25
 """Standard error over length from which a length is flagged. Good sweeps
 claim up to 0.06, those with noise of half the signal's power 0.15."""
@@ -51,15 +49,17 @@ and spine have 0.01 to 0.05. A quarter of the intensity's variation is half of t
 
 OUT_OF_TURN = 0.1
 """By how much a frame must be less like the last one than like an earlier one: ten times what the median
-over fifty patches scatters by."""
+over fifty patches scatters by. At 0 sweeps at rest are refused; half and twice as much change nothing."""
 MOST_OUT_OF_TURN = 0.6
-"""Share of such frames. A wobble of 3 Hz at 25 frames a second has a quarter of them, at its turns."""
+"""Share of such frames. A wobble of 3 Hz at 25 frames a second has a quarter of them, at its turns. Half and
+half as much again change nothing, of thirty-two made motions."""
 
 LARGEST_AVERAGING = 0.03
 """Of the length, from which averaging refuses it: the share is known to a factor of two."""
 
-ALIKE = (0.2, 0.9)
-"""Median correlations between which distances are compared: more hides in noise, less in what stays."""
+LEAST_ALIKE = 0.2
+"""Median correlation from which distances are compared: less hides in what stays. Where speckle ends, at
+0.03, honest fast sweeps are doubted."""
 WINDOW = 8
 """Frames over which distances are compared with what pairs as alike have elsewhere: a fold of the path takes
 no more. A quarter of a window on comes the next."""
@@ -198,7 +198,7 @@ def examine_images(
 
 
 def doubt_shadow(echoless: FloatArray) -> Doubt | None:
-    """Report patches without an echo, which are left out.
+    """Report a patch or more without an echo, which are left out.
 
     Parameters
     ----------
@@ -206,7 +206,7 @@ def doubt_shadow(echoless: FloatArray) -> Doubt | None:
         Share of the frames in which each patch of the region was.
     """
     share = float(echoless.mean())
-    if share < SHADOW_SHARE:
+    if share * echoless.size < 1.0:
         return None
     evidence = (
         f"expected echoes all over the image, got none in {share:.0%} of it (shadow, noise, lost contact, or "
@@ -316,8 +316,7 @@ def doubt_path(
         In the image.
     usable : ndarray of bool, shape (n,)
     """
-    low, high = ALIKE
-    rows = np.flatnonzero((table.median > low) & (table.median < high) & table.joins(usable))
+    rows = np.flatnonzero((table.median > LEAST_ALIKE) & table.joins(usable))
     rows = rows[np.argsort(-table.median[rows], kind="stable")]
     if rows.size < LEAST_PAIRS or len(patch_centre_mm) < LEAST_PAIRS:
         return None

@@ -23,16 +23,12 @@ from speckle3d.core.sweep import OrientationSensor, Sweep, Tracker
 
 REFUTED = 2.0
 """Doubts refute from so many times the figure from which they are told."""
-LONGEST_STILL_S = 0.2
-"""Beyond which unchanged readings are told: loggers repeat one until the next, of 5 Hz at least."""
-MOST_STILL, MOST_STILL_S = 0.2, 0.5
-"""Share of the sweep, and time, over which readings that do not change at all refute a sensor."""
+MOST_STILL = 0.2
+"""Share of the sweep over which readings that do not change at all refute a sensor."""
 LEAST_TRAVEL_MM = 0.5
 """By which images must have moved meanwhile: a probe may rest, and a simulated sensor have no noise."""
 DOUBTFUL_JITTER = 2.5
 """Jitter of a step, mm and degrees, that is told; of sensors in use below 0.5 and 0.3."""
-MOST_SPIKES = 0.3
-"""Share of readings; with more, there is no stream that spikes stand out of."""
 SMOOTH = 9
 """Readings of which the running median is taken: neither jitter nor four spikes in a row move it."""
 _SPIKE_SIGMA = 10.0
@@ -82,18 +78,16 @@ def repair_readings(sweep: Sweep) -> tuple[Sweep, tuple[Doubt, ...]]:
     doubts: list[Doubt] = []
     for name in ("tracker", "orientation"):
         sensor = getattr(sweep, name)
-        wild = np.zeros(0, dtype=bool) if sensor is None else spikes(sensor)
-        share = f"{int(wild.sum())} of {wild.size} readings jump away from those around them and back"
-        is_noise = wild.sum() > MOST_SPIKES * wild.size
-        if is_noise:
-            doubts.append(Doubt(sensor.label, "scrambled values", f"expected a path, but {share}", True))
-        elif wild.any():
+        if sensor is None:
+            continue
+        wild = spikes(sensor)
+        if wild.any():
+            evidence = f"{int(wild.sum())} of {wild.size} readings jump away from those around them and back"
             where = frames_at(sensor, np.flatnonzero(wild), sweep.frame_time_s)
-            doubts.append(Doubt(sensor.label, "spikes", f"{share}, and are left out", False, where))
+            doubts.append(Doubt(sensor.label, "spikes", f"{evidence}, and are left out", False, where))
             sensor = without(sensor, wild)
             sweep = replace(sweep, **{name: sensor})
-        if sensor is not None and not is_noise:
-            doubts += _doubt_jumps(sensor, sweep.frame_time_s)
+        doubts += _doubt_jumps(sensor, sweep.frame_time_s)
     return sweep, tuple(doubts)
 
 
@@ -149,10 +143,13 @@ def _doubt_still(sensor: OrientationSensor | Tracker, sweep: Sweep, image: Rigid
     same_s, whole_s = float(np.ptp(time_s[during])), float(np.ptp(time_s))
     path_mm = image[during].apply(sweep.grid.centre_mm)
     travel_mm = float(np.linalg.norm(path_mm - path_mm[0], axis=1).max())
-    if travel_mm > LEAST_TRAVEL_MM and same_s > LONGEST_STILL_S:
+    # Loggers repeat a reading until the next: it is as old as one that interpolation still bridges.
+    bridged_s = sensor.readings.max_gap_s
+    if travel_mm > LEAST_TRAVEL_MM and same_s > bridged_s:
         evidence = f"expected readings that change, got the same one for {same_s:.2f} of {whole_s:.2f} s"
         where = runs_of(np.flatnonzero(during))
-        yield Doubt(sensor.label, "frozen", evidence, same_s > max(MOST_STILL * whole_s, MOST_STILL_S), where)
+        most_s = max(MOST_STILL * whole_s, REFUTED * bridged_s)
+        yield Doubt(sensor.label, "frozen", evidence, same_s > most_s, where)
 
 
 def conventions(turned: Rotation) -> Iterator[tuple[str, Rotation]]:

@@ -36,15 +36,17 @@ _MOST_STEPS = 30
 _LEAST_STEP = 0.02
 """Step, in the posterior's own standard deviations, at which a level has converged."""
 PART_MM = 6.0
-"""Side of the parts of tissue that are taken to move, or to err, as one."""
+"""Side of the parts of tissue that are taken to move, or to err, as one. Half of it makes claims of two
+simulated pairs 1.4 times as large, twice as much 0.9; lengths stay."""
 _REACH_MM = 12.0
 """Over which the correlation of tissue's displacement falls to 1 / e: a probe's contact is centimetres wide,
-and what it presses moves in one piece."""
+and what it presses moves in one piece. Half and twice as much move claims by 5 %."""
 _DISPLACEMENT_RATIO = 1.5
 """True displacements over what parts show of them: parts see shifts through images that are alike in part
-only, and the smoothest of it passes for place and turn. Of simulated pairs."""
+only, and the smoothest of it passes for place and turn. Of simulated pairs; at 1 claims are 6 % smaller."""
 _USUAL_MM = 0.3
-"""Displacement, mm over the deviation of speckle's part, for which it is found best."""
+"""Displacement, mm over the deviation of speckle's part, for which it is found best. At 0, without weights,
+claims of six simulated pairs are up to 15 % smaller; lengths stay."""
 FACES = 0.006
 """Relative standard deviation of the scale by what is not understood: lengths of simulated pairs with exact
 poses came out 0.6 % long, cause unknown. Sweeps of simulated radio-frequency data do not show it."""

@@ -29,9 +29,7 @@ from speckle3d.correction.scale import ScaledPoses, ScaleEvidence
 from speckle3d.correction.settings import FusedSettings
 
 _STARTS = 4
-"""Candidates refined."""
-_FEWEST, _PER_CELL = 3000, 12.0
-"""Points looked up: at least so many, and so many for each such volume."""
+"""Candidates refined. The best alone gives the same lengths, and does not tell whether another place fits."""
 _LARGEST_SHARE = 0.45
 """Displacement over blur above which residuals no longer follow it: at 0.9 mm, 0.6 mm rms are taken for 0.46
 and 1.0 mm for 0.62, and lengths came out wrong by up to 8 %. Of 0.3 mm at most 0.41 were made."""
@@ -316,8 +314,7 @@ def _comparison(
     volume = min(float(np.isfinite(s.texture).sum() * s.spacing_mm.prod()) for s in sides)
     # Under a Gaussian blur so much volume counts as one comparison.
     cells = volume / (2.0 * np.sqrt(np.pi) * blur_mm) ** 3
-    points = int(min(settings.samples, max(_FEWEST, _PER_CELL * cells)))
-    pair = [BlurredSweep.of(side, blur_mm, points) for side in sides]
+    pair = [BlurredSweep.of(side, blur_mm, settings.samples) for side in sides]
     return pair, _prior(sweeps, sides, settings), min(settings.effective_samples, cells)
 
 

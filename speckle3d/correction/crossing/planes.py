@@ -28,7 +28,8 @@ BENDS = len(ELEVATIONAL) * ORDERS
 tilt and yaw per signed elevational mm of the images, rad/mm."""
 
 _SMOOTH_MM = 1.0
-"""Travel over which the path is smoothed: a hand's slow wander stays."""
+"""Travel over which the path is smoothed: a hand's slow wander stays. A third of it and twice as much move
+lengths by up to 0.2 %, a quarter of their claims."""
 _WIDEST_GAP_MM = 1.5
 """Travel without a frame that is interpolated: about an elevational beam width."""
 

@@ -17,16 +17,10 @@ from speckle3d.correction.crossing.similarity import Placing
 from speckle3d.correction.crossing.texture import gaussian_mean
 
 VOXEL_MM = 1.6
-"""Blur and voxel of the search: refinement starts from 6 mm away."""
+"""Blur and voxel of the search: refinement starts from 6 mm away, so that twice as much moves no length."""
 _TURNS_DEG = np.array([30.0, 45.0, 60.0, 75.0, 90.0, 105.0, 120.0, 135.0, 150.0])
 """Turns about the beam tried, either way: refinement starts from 12 degrees away. Beyond a right angle the
 probe is held the other way round."""
-_SCALES = (-0.13, 0.0, 0.15)
-"""Relative errors of both sweeps' scale tried."""
-_LEAST_SHARE = 0.25
-"""Share of the smaller volume that must overlap."""
-_APART_MM = 5.0
-"""Candidates of one turn nearer than this are one."""
 
 
 class Candidate(NamedTuple):
@@ -47,7 +41,7 @@ class Candidate(NamedTuple):
     def is_near(self, start: Candidate) -> bool:
         """Whether refinement of both would end in one place."""
         alike = self.mirrored == start.mirrored
-        return alike and self.placing.is_near(start.placing, 1.2 * _APART_MM, np.deg2rad(20.0))
+        return alike and self.placing.is_near(start.placing, 1.2 * VOXEL_MM, np.deg2rad(20.0))
 
 
 def candidates(
@@ -72,15 +66,12 @@ def candidates(
         pair = [sides(number, flip) for number, flip in enumerate(mirrored)]
         textures = [gaussian_mean(side.texture, VOXEL_MM, side.spacing_mm) for side in pair]
         sensed_turn = relative_turn(*pair)
-        for scale in _SCALES:
-            bends = np.zeros((2, BENDS))
-            bends[:, 0] = scale
-            first = _resample(pair[0], textures[0], Rotation.identity(), scale)
-            for turn in turns if sensed_turn is None else [sensed_turn]:
-                second = _resample(pair[1], textures[1], turn, scale)
-                for shift, score in _peaks(first, second, depth_shift_mm):
-                    place = RigidTransform.from_components(shift, turn)
-                    starts.append(Candidate(Placing(place, bends), mirrored, score))
+        first = _resample(pair[0], textures[0], Rotation.identity())
+        for turn in turns if sensed_turn is None else [sensed_turn]:
+            second = _resample(pair[1], textures[1], turn)
+            for shift, score in _peaks(first, second, depth_shift_mm):
+                place = Placing(RigidTransform.from_components(shift, turn), np.zeros((2, BENDS)))
+                starts.append(Candidate(place, mirrored, score))
     distinct: list[Candidate] = []
     for start in sorted(starts, key=lambda c: -c.score):
         if len(distinct) < keep and not any(start.is_near(better) for better in distinct):
@@ -96,9 +87,9 @@ class _Volume(NamedTuple):
     mask: Float32Array
 
 
-def _resample(sweep: StraightSweep, texture: Float32Array, turn: Rotation, scale: float) -> _Volume:
+def _resample(sweep: StraightSweep, texture: Float32Array, turn: Rotation) -> _Volume:
     """Take the planes for parallel: refinement starts from further away than paths bend."""
-    size, shape = np.array([1.0 + scale, 1.0, 1.0]) * sweep.spacing_mm, np.array(texture.shape)
+    size, shape = sweep.spacing_mm, np.array(texture.shape)
     first = np.array([-(shape[0] // 2) * size[0], *sweep.pixels[2:]])
     # From (along, across, deep) to the path's axes (across, deep, along), turned.
     axes = turn.as_matrix()[:, [2, 0, 1]]
@@ -126,8 +117,7 @@ def _peaks(fixed: _Volume, moving: _Volume, depth_shift_mm: float) -> list[tuple
     # Without shift both volumes begin at index `shape - 1` of the moving one.
     origin_mm = fixed.low_mm - moving.low_mm - VOXEL_MM * (np.array(moving.mask.shape) - 1)
     depth_mm = origin_mm[1] + VOXEL_MM * np.arange(score.shape[1])
-    score[count < _LEAST_SHARE * min(fixed.mask.sum(), moving.mask.sum())] = -np.inf
     score[:, np.abs(depth_mm) > depth_shift_mm] = -np.inf
-    top = np.isfinite(score) & (score == maximum_filter(score, 1 + 2 * int(_APART_MM / VOXEL_MM)))
+    top = np.isfinite(score) & (score == maximum_filter(score, 3))
     best = np.argwhere(top)[np.argsort(-score[top])[:2]]
     return [(origin_mm + VOXEL_MM * at, float(score[tuple(at)])) for at in best]

@@ -14,8 +14,6 @@ local mean, over whose neighbourhood the contrast is made one; last layers, whic
 look alike at any turn and place."""
 _LEAST_DB = 0.5
 """Contrast below which there is nothing but noise to divide by, dB."""
-_REACH = 2.5
-"""Standard deviations to which Gaussians are cut."""
 
 
 def local_contrast(volume: Float32Array, spacing_mm: FloatArray) -> Float32Array:
@@ -32,7 +30,7 @@ def gaussian_mean(
     """Gaussian mean over the neighbours that are not NaN; NaN where there was none."""
     valid, sigma = np.isfinite(volume), np.divide(sigma_mm, spacing_mm)
     total, share = (
-        gaussian_filter(values, sigma, truncate=_REACH, mode="constant")
+        gaussian_filter(values, sigma, mode="constant")
         for values in (np.where(valid, volume, np.float32(0.0)), valid.astype(np.float32))
     )
     return np.asarray(np.where(valid, total / np.maximum(share, 1e-3), np.nan), dtype=np.float32)
