@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 from speckle3d.config import Config
 from speckle3d.core.errors import naming
+from speckle3d.core.reconstruction import SharedErrors
 from speckle3d.core.sweep import Sweep
 from speckle3d.correction.crossing.pair import CrossedPair
 from speckle3d.correction.drift import DriftCorrection
@@ -13,6 +14,7 @@ from speckle3d.correction.fused import fuse
 from speckle3d.correction.modes import CUBIC_MODES, correct_mode, require_modes, sensor_of
 from speckle3d.correction.scale import ScaledPoses
 from speckle3d.examine.sensors import credible_sensors, repair_readings, require_credible
+from speckle3d.motion.uncertainty import shared_covariance
 from speckle3d.tracked import Tracked
 from speckle3d.tracking import require_kind
 
@@ -83,9 +85,10 @@ def correct(
         if mode in CUBIC_MODES:
             # What wander the sensed orientation shows, cubics need not make up for.
             start = tracked.subset if tracked.subset is not None else tracked.image
-            corrections[mode] = correct_mode(
-                mode, start, sweep, settings.drift, tracked.covariance, settings.fused
-            )
+            # Turns are the sensor's, and what the images' move the path by is no error of it.
+            turns = SharedErrors(0.0, 0.0, tracked.shared.turn_sigma_per_mm)
+            places = tracked.covariance - shared_covariance(tracked.image, sweep.grid.centre_mm, turns)
+            corrections[mode] = correct_mode(mode, start, sweep, settings.drift, places, settings.fused)
         elif mode == "crossed" and crossed is not None:
             corrections[mode] = crossed.of(sweep.frame_time_s, sweep.name)
         elif mode == "fused":

@@ -17,7 +17,6 @@ from speckle3d.matching.texture import measured_texture
 from speckle3d.motion.diffraction import (
     BACKSCATTER_EXPONENT,
     SPEED_M_S,
-    SUB_DEPTHS,
     band_nodes,
     log_width,
     sheet_spectrum,
@@ -113,23 +112,21 @@ def data_sheet_curves(sheet: ProbeSheet, like: Sweep, config: Config | None = No
     if isinstance(key.signal, RFSettings):
         band, edge_fraction = key.signal.bandwidth_hz, key.edge_fraction
     frequency = band_nodes(band, edge_fraction)
-    inside = key.patch_height_mm * ((np.arange(SUB_DEPTHS) + 0.5) / SUB_DEPTHS - 0.5)
-    depths = np.maximum(rows[:, None] + inside, 1.0)
     if spectra is None:
         exponents = sheet.attenuation_db_cm_mhz, BACKSCATTER_EXPONENT
-        spectrum = sheet_spectrum(frequency, (probe.low_hz, probe.high_hz), *exponents, depths)
+        spectrum = sheet_spectrum(frequency, (probe.low_hz, probe.high_hz), *exponents, rows)
     else:
-        spectrum = spectra.at(depths, frequency)
+        spectrum = spectra.at(rows, frequency)
     weight = spectrum * band_weights(frequency, *band, edge_fraction * (band[1] - band[0])) ** 2
-    area = area if np.isfinite(area).all() else _speckle_area(sheet, frequency, weight.mean(axis=1))
+    area = area if np.isfinite(area).all() else _speckle_area(sheet, frequency, weight)
     cells = key.patch_width_mm * key.patch_height_mm / area
     grid = GRID_MM * np.arange(round(settings.curves.largest_mm / GRID_MM) + 1, dtype=float)
-    rho = speckle_correlation(probe, depths, frequency, weight, grid, speed, spectra is None)
+    rho = speckle_correlation(probe, rows, frequency, weight, grid, speed, spectra is None)
     if key.correlation_of == "echo":
         rho += (1.0 - rho) ** 2 / cells[:, None]
     rho, tilt = np.minimum.accumulate(np.clip(rho, LEAST_AMPLITUDE, 1.0), axis=1), None
     if isinstance(key.signal, RFSettings):
-        pivot = tilt_pivot(probe, rows, frequency, weight.mean(axis=1), speed)
+        pivot = tilt_pivot(probe, rows, frequency, weight, speed)
         tilt = TiltResponse(pivot, two_way_wavenumber(key.signal) * curve_widths(grid, rho) ** 2)
     sigma = sheet_sigma(sheet, rows, spectra is not None)
     return DecorrelationCurves(

@@ -93,7 +93,8 @@ def correct_mode(
     world_from_image : RigidTransform, length n
         Of every frame of `sweep`.
     image_covariance : ndarray, shape (n, 6, 6)
-        Claimed for the image-based poses; `orientation` leaves their errors of place as they are.
+        Claimed for the image-based poses but for their turns; `orientation` leaves errors of place as they
+        are.
     errors : FusedSettings
         Errors of the sensors that their readings do not show.
     """

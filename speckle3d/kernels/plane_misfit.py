@@ -69,7 +69,6 @@ class FitRules(NamedTuple):
     huber: float
     outlying: float
     crossing_evidence: float
-    rounds: int
 
 
 class PairPatches(NamedTuple):
@@ -235,7 +234,7 @@ def descend(
     """Levenberg-Marquardt from `plane`, which it overwrites; returns the robust and the capped cost."""
     damping, least, capped = 1e-3, np.inf, np.inf
     trial, step, sums, best = plane.copy(), np.zeros(3), np.zeros(11), np.zeros(11)
-    for _ in range(rules.rounds + 1):
+    while damping < 1e9:
         _evaluate(trial, size, patches, rules, sums)
         _with_prior(trial, expected, precision, sums)
         total = sums[0]

@@ -16,13 +16,11 @@ class PathRules(NamedTuple):
 
     hypotheses: int
     relative_error: float
-    placed: float
     cap: float
     turning_cost: float
     trend_mm: float
     same_mm: float
     apart_mm: float
-    apart_slope: float
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
@@ -41,9 +39,10 @@ def _agree(
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
 def _invert(covariance: FloatArray, move: FloatArray, rules: PathRules, weight: FloatArray) -> None:
     """Fill the three numbers of a pair's inverse covariance."""
-    a = rules.placed * covariance[0, 0] + (rules.relative_error * move[0]) ** 2
-    b = rules.placed * covariance[0, 1]
-    c = rules.placed * covariance[1, 1] + (rules.relative_error * move[1]) ** 2
+    # The earlier frame was placed by such pairs, too.
+    a = 2.0 * covariance[0, 0] + (rules.relative_error * move[0]) ** 2
+    b = 2.0 * covariance[0, 1]
+    c = 2.0 * covariance[1, 1] + (rules.relative_error * move[1]) ** 2
     determinant = a * c - b * b
     weight[0], weight[1], weight[2] = c / determinant, -b / determinant, a / determinant
 
@@ -138,9 +137,8 @@ def follow_paths(
             if (candidates[n, 0] - paths[h, earlier[latest], 0]) * trend[h] < 0.0:
                 total[n] += rules.turning_cost
             for stranger in unlike[unlike_start[f] : unlike_start[f + 1]]:
-                off = abs(candidates[n, 0] - paths[h, stranger, 0])
-                tilt = abs(candidates[n, 1] - paths[h, stranger, 1])
-                if off < rules.apart_mm and tilt < rules.apart_slope:
+                # Such a pair disagrees altogether.
+                if abs(candidates[n, 0] - paths[h, stranger, 0]) < rules.apart_mm:
                     total[n] += rules.cap
             if not moving and candidates[n, 0] < 0.0:
                 # The overall sign is open: of two mirror images one is enough.

@@ -18,10 +18,6 @@ from speckle3d.matching.schedule import KnownSchedule, PairSchedule
 from speckle3d.matching.table import CorrelationTable
 from speckle3d.matching.texture import FRAMES, Texture
 
-SEARCHES = 3
-"""References against which the in-plane motion of a frame is searched, if it resembles none before: the last
-sound frame may show other tissue, or be the first of the sweep, and without an echo."""
-
 ImageSink = Callable[[int, Float32Array], None]
 """Called with each frame's number and intensity image (vector, sample), in order."""
 
@@ -120,7 +116,8 @@ class FrameByFrame:
         references, least = self._schedule.references(number), self._schedule.least_correlation
         fixed = {first: self._frames[first][0] for first in sorted(references)}
         table = self._matcher.match({}, number, frame, [])
-        for anchor in references[:SEARCHES]:
+        # The last sound frame may show other tissue, or be the first of the sweep, and without an echo.
+        for anchor in references:
             before = self._frames[anchor][1]
             motion = compose(before, self._matcher.search(fixed[anchor], frame))
             starts = [compose(inverse(self._frames[first][1]), motion) for first in fixed]

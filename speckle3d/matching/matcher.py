@@ -25,11 +25,6 @@ from speckle3d.matching.patches import PatchSettings, lay_patches
 from speckle3d.matching.quality import FrameFeatures, QualitySettings, inspect_frame
 from speckle3d.matching.table import CorrelationTable
 
-_POOLED_BELOW_MM = 0.05
-"""Sample spacing below which two samples are pooled for the coarse search: intensity comes with two to four
-in a speckle, and the peak is still found to the sample from which the matching goes on."""
-
-
 _STANDING = 0.5
 """Share of a sample's power that is in the mean of the frames' echoes, from which it stands still. Of n
 independent frames of speckle (1 - 0.5)^(n - 1) of the samples have it by chance."""
@@ -153,13 +148,15 @@ class FrameMatcher:
         self._least_overlap = s.inplane.least_overlap
         self._counted = self.laid.region
         spacing, sides = self.laid.spacing_mm, np.array([self.grid.vectors, self.grid.samples])
-        self._pool = np.array([1, 2 if spacing[1] < _POOLED_BELOW_MM else 1])
+        rf = signal if isinstance(signal, RFSettings) else None
+        # Of echoes two samples are pooled for the coarse search: speckle has four, and matching goes on from
+        # the peak's sample.
+        self._pool = np.array([1, 1 if rf is None else 2])
         self._reach = np.minimum(
             np.ceil(s.inplane.search_mm / (spacing * self._pool)), sides // self._pool - 1
         )
         self._reach = self._reach.astype(np.int64)
         self._lengths = [fft.next_fast_len(int(n), True) for n in sides // self._pool + self._reach]
-        rf = signal if isinstance(signal, RFSettings) else None
         self.of_echo = rf is not None and s.matching.correlate == "echo"
         self._wavenumber, fan = two_way_wavenumber(rf) if rf is not None else 0.0, sweep.grid.fan
         self.key = CurveKey(

@@ -18,6 +18,7 @@ import enum
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from textwrap import shorten
 from typing import Any
 
 import numpy as np
@@ -28,17 +29,11 @@ from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.matching.patches import PatchGrid
 
-_CONSTANT = 1e-4
-"""Contrast of a patch up to which it is a constant, but for rounding. A step of grey in one pixel is 1e-3."""
-
 _SAMPLES = 40
 """Samples in depth of which a patch's statistics are taken at least, where it has more: speckle has four."""
 
 LARGEST_LOSS = 0.3
 """Share of frames that may not be placed; with more, lengths are mostly guesses."""
-
-_LONGEST_LIST = 8
-"""Frames named in a line of `describe`."""
 
 
 class FrameFlag(enum.IntFlag):
@@ -154,7 +149,7 @@ def inspect_frame(
     echo = (contrast > s.least_contrast) & np.isfinite(intensity.sum())
     together = (alike > s.neighbour_correlation) | (patches.spacing_mm[0] > s.neighbour_pitch_mm)
     fine = (across < s.halves_correlation) & (along < s.halves_correlation)
-    varies = patches.rows_of(contrast > _CONSTANT)
+    varies = patches.rows_of(np.ptp(tiles, axis=(1, 2)) > 0.0)
     countable = inside & np.repeat(varies.any(axis=0), len(varies))
 
     def share(mask: BoolArray) -> float:
@@ -238,7 +233,6 @@ def describe(flags: npt.ArrayLike) -> list[str]:
     for flag, words in _WORDS.items():
         frames = np.flatnonzero(values & int(flag)).tolist()
         if frames:
-            remainder = f" and {len(frames) - _LONGEST_LIST} more" if len(frames) > _LONGEST_LIST else ""
-            numbers = ", ".join(map(str, frames[:_LONGEST_LIST]))
-            lines.append(f"{len(frames)} frame{'s' * (len(frames) > 1)} {words}: {numbers}{remainder}")
+            numbers = shorten(", ".join(map(str, frames)), 40, placeholder=" ...")
+            lines.append(f"{len(frames)} frame{'s' * (len(frames) > 1)} {words}: {numbers}")
     return lines

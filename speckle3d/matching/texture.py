@@ -25,7 +25,7 @@ speckle."""
 CONTRAST = (0.75, 1.15)
 """Standard deviation over mean of intensity in patches that count: 1 for speckle, scattered by its 50 to 90
 cells. Coherent structure is above; its patches look coarser than speckle."""
-SPECKLE_SPREAD_DB = 8.19, 5.21
+SPECKLE_SPREAD_DB = 10.0 * np.abs(np.diff(np.log10(-np.log([0.9, 0.5, 0.1]))))
 """Distances of the 10th and the 90th percentile of an exponential variable's decibels from the median."""
 
 
@@ -121,7 +121,7 @@ class Texture:
         """
         levels = [look.level for look in self._looks.values() if look.level.size]
         if not levels:
-            return np.array(SPECKLE_SPREAD_DB)
+            return SPECKLE_SPREAD_DB
         low, middle, high = 10.0 * np.log10(np.e) * np.concatenate(levels, axis=1)
         return np.asarray(np.median([middle - low, high - middle], axis=1))
 

@@ -32,14 +32,11 @@ from speckle3d.kernels.diffraction import lens_fields
 
 FREQUENCIES = 11
 """Nodes over the band; twice as many change distances by less than 0.1 %."""
-SUB_DEPTHS = 4
-"""Depths in a patch over which the echo's correlation is averaged; twice as many: less than 0.3 %."""
-STEP_MM = 0.04
-_STRIPS_PER_WAVELENGTH = 4.0
+_STEPS_PER_WAVELENGTH = 4.0
+"""Of the shortest wavelength, along the aperture and along the elevation of the field."""
 _OFF_AXIS = 0.2
 """Mean square distance of an aperture's elements from its middle over half its width squared: 1/3 for equal
 weights, 0.13 for a raised cosine."""
-NEPER_PER_DB = float(np.log(10.0) / 20.0)
 SPEED_M_S = 1540.0
 """Of sound in soft tissue, where no sheet says otherwise."""
 BACKSCATTER_EXPONENT = 1.1
@@ -74,8 +71,8 @@ def sheet_spectrum(
     centre, half = np.mean(band_hz), (band_hz[1] - band_hz[0]) / 2.0
     pulse = 2.0 ** -(((frequency_hz - centre) / half) ** 2)
     scattered = (frequency_hz / centre) ** (backscatter_exponent - 2.0)
-    lost = 4.0 * attenuation_db_cm_mhz * NEPER_PER_DB * 1e-7 * depth_mm[..., None] * frequency_hz
-    return np.asarray(pulse**2 * scattered * np.exp(-lost))
+    lost_db = 2e-7 * attenuation_db_cm_mhz * depth_mm[..., None] * frequency_hz
+    return np.asarray(pulse**2 * scattered * 10.0 ** (-lost_db / 10.0))
 
 
 def speckle_correlation(
@@ -91,10 +88,9 @@ def speckle_correlation(
 
     Parameters
     ----------
-    depth_mm : ndarray, shape (r, y)
-        Depths over each patch.
-    power : ndarray, shape (r, y, f)
-        Of the echo at the frequencies, in any unit: each depth counts the same, as images are equalised.
+    depth_mm : ndarray, shape (r,)
+    power : ndarray, shape (r, f)
+        Of the echo at the frequencies, in any unit.
     distance_mm : ndarray, shape (k,)
     at_focus : bool
         Whether the power is that of scatterers at the lens's focus. Away from it, high frequencies lose what
@@ -103,11 +99,11 @@ def speckle_correlation(
     fields, z = _two_way_fields(probe, np.append(depth_mm, probe.focus_mm), frequency_hz, speed_m_s)
     spectra = np.abs(fft.fft(fields, 2 * z.size, axis=-1)) ** 2
     energy = spectra.mean(axis=-1)
-    shares = power.reshape(-1, power.shape[-1]) / (energy[-1] if at_focus else energy[:-1])
-    kept = fft.ifft((shares[..., None] * spectra[:-1]).sum(axis=1), axis=-1).real[:, : z.size]
-    mean = (kept / kept[:, :1]).reshape(*depth_mm.shape, -1).mean(axis=1)
-    inside = np.minimum(distance_mm, STEP_MM * (z.size - 1))
-    return np.asarray(CubicSpline(STEP_MM * np.arange(z.size), mean, axis=1)(inside) ** 2)
+    shares = power / (energy[-1] if at_focus else energy[:-1])
+    product = fft.ifft((shares[..., None] * spectra[:-1]).sum(axis=1), axis=-1).real[:, : z.size]
+    apart_mm = z - z[0]
+    inside = np.minimum(distance_mm, apart_mm[-1])
+    return np.asarray(CubicSpline(apart_mm, product / product[:, :1], axis=1)(inside) ** 2)
 
 
 def tilt_pivot(
@@ -129,7 +125,7 @@ def tilt_pivot(
     fields, z = _two_way_fields(probe, depth_mm, frequency_hz, speed_m_s)
     two_way = 4e-3 * np.pi * frequency_hz / speed_m_s
     # Of the phase's slope across the beam, its variance, and its covariance with the place.
-    slope = fft.ifft(2j * np.pi * fft.fftfreq(z.size, STEP_MM) * fft.fft(fields, axis=-1), axis=-1)
+    slope = fft.ifft(2j * np.pi * fft.fftfreq(z.size, z[1] - z[0]) * fft.fft(fields, axis=-1), axis=-1)
     weight = power / (np.abs(fields) ** 2).sum(axis=-1)
     variance = (weight * (np.abs(slope) ** 2).sum(axis=-1)).sum(axis=1)
     along = (weight * two_way * (z * (fields.conj() * slope).imag).sum(axis=-1)).sum(axis=1)
@@ -142,11 +138,10 @@ def _two_way_fields(
     """Two-way field at each depth and frequency over elevation, shape (y, f, z), and the elevations."""
     wavenumber = 2e-3 * np.pi * frequency_hz / speed_m_s
     shortest = 2.0 * np.pi / wavenumber[-1]
-    count = int(np.ceil(_STRIPS_PER_WAVELENGTH * probe.aperture_mm / shortest))
+    step = shortest / _STEPS_PER_WAVELENGTH
+    count = int(np.ceil(probe.aperture_mm / step))
     strip = probe.aperture_mm * ((np.arange(count) + 0.5) / count - 0.5)
-    reach = 0.8 * probe.aperture_mm + 1.5
-    steps = int(np.ceil(reach / STEP_MM))
-    z: FloatArray = STEP_MM * np.arange(steps + 1, dtype=float)
+    z: FloatArray = step * np.arange(np.ceil((0.8 * probe.aperture_mm + 1.5) / step) + 1.0)
     delay = probe.focus_mm - np.hypot(probe.focus_mm, strip)
     off_mm = np.sqrt(_OFF_AXIS) * probe.transmit_mm / 2.0
     distance = np.append(depth_mm, np.hypot(depth_mm, off_mm))
@@ -164,9 +159,7 @@ def log_width(
     """Logarithm of the curves' widths at each depth, shape (r,); see `curve_widths`."""
     band = probe.low_hz, probe.high_hz
     frequency = band_nodes(band, 0.1)[::2]
-    power = sheet_spectrum(
-        frequency, band, probe.attenuation_db_cm_mhz, backscatter_exponent, depth_mm[:, None]
-    )
-    distance = STEP_MM / 2 * np.arange(int(probe.aperture_mm / STEP_MM), dtype=float)
-    rho = speckle_correlation(probe, depth_mm[:, None], frequency, power, distance)
+    power = sheet_spectrum(frequency, band, probe.attenuation_db_cm_mhz, backscatter_exponent, depth_mm)
+    distance = np.linspace(0.0, probe.aperture_mm / 2.0, 129)
+    rho = speckle_correlation(probe, depth_mm, frequency, power, distance)
     return np.log(curve_widths(distance, np.maximum(rho, 1e-9)))

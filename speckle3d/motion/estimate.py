@@ -31,8 +31,6 @@ from speckle3d.motion.uncertainty import SlopeWeights, claimed_covariance, weigh
 ROUNDS = 2
 """Rounds in which shares and scale, and the path that they are read from, are estimated in turn; a third
 moves lengths by less than 0.2 %."""
-LENS_ROUNDS = 4
-"""Fits of a data sheet's lens: a path read with a wrong lens bends the rows otherwise than the right one."""
 
 
 @dataclass(frozen=True)
@@ -103,11 +101,9 @@ class Motion:
 
 
 def estimate_motion(problem: MotionProblem, table: CorrelationTable) -> Motion:
-    """Estimate shares of structure, scale of distances and path by alternation.
+    """Estimate the motion of a sweep's frames; with curves from a data sheet, the lens before it.
 
-    All that iterates does so here. Distances and their scale need the path, the path needs distances: both
-    are repeated `ROUNDS` times. For curves from a data sheet the lens is fitted to what depths then disagree
-    on, and all is read again with it.
+    The lens is fitted to what depths disagree on in a first estimate, and all is read again with it.
 
     Parameters
     ----------
@@ -119,25 +115,32 @@ def estimate_motion(problem: MotionProblem, table: CorrelationTable) -> Motion:
     InsufficientDataError
         If no pair determines a plane.
     """
+    curves = problem.curves
+    if curves.origin == "data sheet":
+        # Tilt bends rows as a lens does: it is left out until the lens is known.
+        first = _alternate(replace(problem, curves=replace(curves, tilt=None)), table)
+        if first.coherence.rows:
+            problem = replace(problem, curves=with_fitted_lens(curves, first.coherence.rows))
+    return _alternate(problem, table)
+
+
+def _alternate(problem: MotionProblem, table: CorrelationTable) -> Motion:
+    """Estimate shares of structure, scale of distances and path.
+
+    All that iterates does so here. Distances and their scale need the path, the path needs distances: both
+    are repeated `ROUNDS` times.
+    """
     rows, models = alike_pairs(problem, table, table.median), fully_developed(table.correlation.shape[1])
     _, path = _signed_planes(problem, table, rows, models)
-    sheet, tilt = problem.curves.nominal, problem.curves.tilt
-    lens_rounds = LENS_ROUNDS * (problem.curves.origin == "data sheet")
-    for lens_round in range(lens_rounds, -1, -1):
-        # Tilt bends rows as a lens does: it is left out until the lens is known.
-        problem = replace(problem, curves=replace(problem.curves, tilt=None if lens_round else tilt))
-        for _ in range(ROUNDS):
-            coherence = estimate_coherence(problem, table, path)
-            apart_mm = coherence.scale * np.abs(path[table.second, 0] - path[table.first, 0])
-            rows = alike_pairs(problem, table, problem.typical_correlation(apart_mm))
-            pairs, _ = _signed_planes(problem, table, rows, coherence.models(table.first[rows]))
-            slopes = weigh_slopes(pairs, coherence.false_turn, problem.planes, path)
-            _, trajectory = solve_planes(problem, table, slopes.applied(pairs))
-            path = elevation_of(trajectory.poses, problem.centre_mm)
+    coherence = estimate_coherence(problem, table, path)
+    for _ in range(ROUNDS):
+        apart_mm = coherence.scale * np.abs(path[table.second, 0] - path[table.first, 0])
+        rows = alike_pairs(problem, table, problem.typical_correlation(apart_mm))
+        pairs, _ = _signed_planes(problem, table, rows, coherence.models(table.first[rows]))
+        slopes = weigh_slopes(pairs, coherence.false_turn, problem.planes, path)
+        _, trajectory = solve_planes(problem, table, slopes.applied(pairs))
+        path = elevation_of(trajectory.poses, problem.centre_mm)
         coherence = estimate_coherence(problem, table, path)
-        if lens_round and sheet and coherence.rows:
-            path = path * coherence.scale
-            problem = replace(problem, curves=with_fitted_lens(problem.curves, coherence.rows, sheet))
     slopes = weigh_slopes(pairs, coherence.false_turn, problem.planes, path)
     pairs = pairs.scaled(coherence.scale)
     edges, trajectory = solve_planes(problem, table, slopes.applied(pairs))

@@ -16,8 +16,6 @@ from speckle3d.motion.diffraction import log_width
 FOCUS_SIGMA = 0.15
 """Standard deviation of the logarithm of the focal length about its data sheet's: the tolerance that sheets
 state, 15 %. With 0.087, as if uniform, a focus 15 % off leaves up to 5 % more of the length over tissue."""
-FOCI = np.linspace(-0.6, 0.6, 13)
-"""Logarithms of focal lengths over the sheet's for which curves are calculated: four deviations."""
 
 
 def stretched(curves: DecorrelationCurves, log_factor: FloatArray) -> DecorrelationCurves:
@@ -32,9 +30,7 @@ def stretched(curves: DecorrelationCurves, log_factor: FloatArray) -> Decorrelat
     )
 
 
-def with_fitted_lens(
-    curves: DecorrelationCurves, rows: RowScales, sheet: NominalProbe
-) -> DecorrelationCurves:
+def with_fitted_lens(curves: DecorrelationCurves, rows: RowScales) -> DecorrelationCurves:
     """Fit the focal length of a data sheet's probe to the distance scales of rows of patches.
 
     All depths of one image move together, so that rows show how far curves are wrong against each other; a
@@ -43,31 +39,31 @@ def with_fitted_lens(
     Parameters
     ----------
     curves : DecorrelationCurves
-        From a data sheet, perhaps with another focal length by now.
+        From a data sheet, about whose focal length the fitted one is to be.
     rows : RowScales
         Of a sweep that was read with them.
-    sheet : NominalProbe
-        Of the data sheet, about whose focal length the fitted one is to be.
     """
-    assert curves.nominal is not None
+    sheet = curves.nominal
+    assert sheet is not None
     clear = rows.gain >= NOISY_GAIN
     if not clear.any():
         return curves
-    width = CubicSpline(FOCI, _log_widths_by_focus(sheet, tuple(rows.depth_mm.tolist())))
-    focus = np.linspace(FOCI[0], FOCI[-1], 601)
-    wider = width(focus) - width(np.log(curves.nominal.focus_mm / sheet.focus_mm))
+    width = _log_widths_by_focus(sheet, tuple(rows.depth_mm.tolist()))
+    focus = np.linspace(width.x[0], width.x[-1], 601)
+    wider = width(focus) - width(0.0)
     # A row that reads long asks for narrower curves.
     left = -rows.logarithm[clear] - wider[:, clear]
     left = (left - np.median(left, axis=1, keepdims=True)) / ROW_SIGMA
     # Rows may be wrong (the loss is SciPy's soft_l1), what the sheet says is not.
     cost = 2.0 * (np.hypot(1.0, left) - 1.0).sum(axis=1) + (focus / FOCUS_SIGMA) ** 2
     best = int(cost.argmin())
-    fitted = replace(curves.nominal, focus_mm=sheet.focus_mm * float(np.exp(focus[best])))
+    fitted = replace(sheet, focus_mm=sheet.focus_mm * float(np.exp(focus[best])))
     return replace(stretched(curves, np.interp(curves.depth_mm, rows.depth_mm, wider[best])), nominal=fitted)
 
 
 @lru_cache(maxsize=2)
-def _log_widths_by_focus(sheet: NominalProbe, depth_mm: tuple[float, ...]) -> FloatArray:
-    """Logarithm of the curves' widths by `FOCI` and depth."""
-    probes = [replace(sheet, focus_mm=sheet.focus_mm * float(np.exp(step))) for step in FOCI]
-    return np.stack([log_width(probe, np.array(depth_mm)) for probe in probes])
+def _log_widths_by_focus(sheet: NominalProbe, depth_mm: tuple[float, ...]) -> CubicSpline:
+    """Logarithm of the curves' widths at each depth by that of the focal length over the sheet's."""
+    foci = FOCUS_SIGMA * np.linspace(-4.0, 4.0, 13)
+    probes = [replace(sheet, focus_mm=sheet.focus_mm * float(np.exp(focus))) for focus in foci]
+    return CubicSpline(foci, [log_width(probe, np.array(depth_mm)) for probe in probes])

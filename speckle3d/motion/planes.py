@@ -46,7 +46,6 @@ SENSED_SLOPE = 5e-4
 """Standard deviation of slopes between near frames from a smoothed orientation sensor: 0.03 degrees."""
 LEAST_SIGMA_MM = 1e-3
 """Of a patch's distance where the curve is flat: a hundredth of what it is known to elsewhere."""
-ROUNDS = 12
 
 
 class PlaneSettings(BaseModel):
@@ -243,7 +242,7 @@ def pair_planes(
     side = np.zeros(rows.size, dtype=bool) | either_side
     settings = problem.planes
     slope_sd = SENSED_SLOPE if from_sensor else HAND_SLOPE
-    rules = FitRules(from_sensor, slope_sd, CROSSING_SLOPE, settings.huber, OUTLYING, 2.0 * DECISIVE, ROUNDS)
+    rules = FitRules(from_sensor, slope_sd, CROSSING_SLOPE, settings.huber, OUTLYING, 2.0 * DECISIVE)
     shift = _lever_shift(problem, table.inplane[rows, :2])
     fits = FittedPlanes(
         np.full((rows.size, 3), np.nan), np.tile(np.eye(3), (rows.size, 1, 1)), np.zeros(rows.size)

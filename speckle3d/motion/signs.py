@@ -24,13 +24,8 @@ TREND_MM = 0.3
 """Travel over which a direction is remembered: a few frames of a hand-held sweep."""
 TURNING_COST = 2.0
 """Squared deviations by which the planes must speak for turning back: hands turn back rarely."""
-PLACED = 2.0
-"""Variance of an offset between frames over a pair's own: the earlier frame was placed by such pairs, too."""
 SAME_MM = 0.05
 """Paths that end this close to each other at all frames still of use are one."""
-APART_SLOPE = 0.01
-"""Frames that turn more than this against each other may differ although their centres meet. Such as turn
-less and do not resemble each other are a pair that disagrees altogether."""
 
 
 class Strangers(NamedTuple):
@@ -78,13 +73,11 @@ def likeliest_path(
     rules = PathRules(
         HYPOTHESES,
         RELATIVE_ERROR,
-        PLACED,
         OUTLYING,
         TURNING_COST,
         TREND_MM,
         SAME_MM,
         strangers.apart_mm,
-        APART_SLOPE,
     )
     path, every = np.zeros((frames, 2)), np.arange(frames + 1)
     start = path[:1] if start is None else start

@@ -20,8 +20,6 @@ from speckle3d.motion.planes import PairPlanes
 
 ROUNDS = 4
 """Of Gauss-Newton; the next has steps below 1e-4 mm and rad."""
-INPLANE_FLOOR = (1e-6, 1e-6, 1e-9)
-"""Variances of in-plane motion (mm^2, mm^2, rad^2) that interpolation leaves, however many patches agree."""
 
 
 @dataclass(frozen=True)
@@ -141,7 +139,7 @@ def edges_of(table: CorrelationTable, planes: PairPlanes) -> RelativePoses:
     rotation = rotation_from_fixed_angles(roll, yaw, tilt)
     poses = RigidTransform.from_components(np.column_stack([x, y, a]), rotation)
     covariance = np.zeros((len(planes), 6, 6))
-    covariance[:, [[0], [1], [5]], [0, 1, 5]] = table.inplane_covariance[planes.row] + np.diag(INPLANE_FLOOR)
+    covariance[:, [[0], [1], [5]], [0, 1, 5]] = table.inplane_covariance[planes.row]
     # (a, b, c) is (z, -yaw, tilt) for small angles.
     order = np.array([[1.0, 0, 0], [0, 0, 1.0], [0, -1.0, 0]])
     covariance[:, 2:5, 2:5] = order @ planes.covariance @ order.T

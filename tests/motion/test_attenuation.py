@@ -29,7 +29,7 @@ def _power(attenuation, rng=None, exponent=0.0, noise=0.0, band=BAND):
 @cache
 def _curves(attenuation=0.5):
     power = _power(attenuation)
-    rho = speckle_correlation(LENS, DEPTH[:, None], FREQUENCY, power[:, None], DISTANCE)
+    rho = speckle_correlation(LENS, DEPTH, FREQUENCY, power, DISTANCE)
     key = CurveKey(RFSettings(200e6 / 3, 1540.0, 7.5e6, BAND), 0.3, 3.6, 3.0, 2.0, "echo")
     rho = np.minimum.accumulate(np.clip(rho, 1e-4, 1.0), axis=1)
     return DecorrelationCurves(
