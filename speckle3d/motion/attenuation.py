@@ -117,7 +117,7 @@ def estimate_attenuation(curves: DecorrelationCurves, spectra: EchoSpectra | Non
 
 def _loss(depth_mm: FloatArray) -> FloatArray:
     """Fall of the logarithm of power per MHz, for 1 dB/cm/MHz, there and back."""
-    return 0.02 * np.log(10.0) * depth_mm
+    return np.asarray(0.02 * np.log(10.0) * depth_mm)
 
 
 def _attenuate(

@@ -153,13 +153,12 @@ def _two_way_fields(
     return np.concatenate([half[..., :0:-1], half], axis=-1), np.concatenate([-z[:0:-1], z])
 
 
-def log_width(
-    probe: NominalProbe, depth_mm: FloatArray, backscatter_exponent: float = BACKSCATTER_EXPONENT
-) -> FloatArray:
+def log_width(probe: NominalProbe, depth_mm: FloatArray) -> FloatArray:
     """Logarithm of the curves' widths at each depth, shape (r,); see `curve_widths`."""
     band = probe.low_hz, probe.high_hz
     frequency = band_nodes(band, 0.1)[::2]
-    power = sheet_spectrum(frequency, band, probe.attenuation_db_cm_mhz, backscatter_exponent, depth_mm)
+    exponents = probe.attenuation_db_cm_mhz, BACKSCATTER_EXPONENT
+    power = sheet_spectrum(frequency, band, *exponents, depth_mm)
     distance = np.linspace(0.0, probe.aperture_mm / 2.0, 129)
     rho = speckle_correlation(probe, depth_mm, frequency, power, distance)
     return np.log(curve_widths(distance, np.maximum(rho, 1e-9)))

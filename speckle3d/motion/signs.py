@@ -16,14 +16,18 @@ from speckle3d.kernels.signs import PathRules, follow_paths
 from speckle3d.motion.planes import OUTLYING, PairPlanes
 
 HYPOTHESES = 8
-"""Paths that are followed; 4 move lengths by at most 0.06 %."""
+"""Paths that are followed. Of 800 made paths with 10 and 30 % of wrong pairs 7 get a wrong sign, 18 with one
+path alone; 4 move lengths by at most 0.06 %."""
 RELATIVE_ERROR = 0.25
 """Of distances, besides their covariance: coherent tissue makes long distances too short, so that a misfit of
-a quarter is no sign of turning back. A half of a person's sweep of bone folds with 0.1."""
+a quarter is no sign of turning back. A half of a person's sweep of bone folds with 0.1; without, 50 steps of
+six made wobbles of 3 Hz get the wrong sign, 3 with it."""
 TREND_MM = 0.3
-"""Travel over which a direction is remembered: a few frames of a hand-held sweep."""
+"""Travel over which a direction is remembered: a few frames of a hand-held sweep. Without memory, or with one
+that lasts, 50 steps of those wobbles get the wrong sign."""
 TURNING_COST = 2.0
-"""Squared deviations by which the planes must speak for turning back: hands turn back rarely."""
+"""Squared deviations by which the planes must speak for turning back: hands turn back rarely. Without, 138
+steps of those wobbles get the wrong sign."""
 SAME_MM = 0.05
 """Paths that end this close to each other at all frames still of use are one."""
 

@@ -15,7 +15,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.ndimage import uniform_filter1d
 from scipy.stats import ttest_1samp
 
 from speckle3d.core.curves import DecorrelationCurves
@@ -26,8 +25,6 @@ from speckle3d.matching.texture import SPECKLE_SPREAD_DB, Texture
 from speckle3d.motion.attenuation import Attenuation, estimate_attenuation
 from speckle3d.motion.lens import stretched
 
-SMOOTHED = 21
-"""Frames over which tissue goes by: what changes more slowly is no effect of speed."""
 LEAST_PAIRS = 6
 """Pairs of neighbouring frames from which averages are told."""
 SINGLE_SLOPE, LEVEL = -0.1, 0.025
@@ -120,9 +117,8 @@ def averaging_loss(table: CorrelationTable, features: Sequence[FrameFeatures]) -
     lost = 1.0 - table.median[last]
     if lost.size < LEAST_PAIRS or not usable.any():
         return 0.0
-    faster, flatter = (v - uniform_filter1d(v, SMOOTHED, axis=0) for v in (lost, spread[:, usable]))
-    faster -= faster.mean()
-    slopes = faster @ flatter / max(float(faster @ faster), 1e-12)
+    faster = lost - lost.mean()
+    slopes = faster @ spread[:, usable] / max(float(faster @ faster), 1e-12)
     if not ttest_1samp(slopes, SINGLE_SLOPE, alternative="less").pvalue <= LEVEL:
         return 0.0
     return float(-SHORT_BY_SPREAD * slopes.mean() * np.median(lost))

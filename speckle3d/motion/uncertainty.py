@@ -121,7 +121,8 @@ def joint_errors(
 
 
 BEYOND_DOUBT = 2.0
-"""Deviations at which a turn is taken for deliberate, however large it is."""
+"""Deviations at which a turn is taken for deliberate, however large it is. If none is, a turned phantom's
+tilt is 3.4 degrees off; if any is, that of B-mode over tissue by 1.9."""
 
 
 @dataclass(frozen=True)
