@@ -139,7 +139,8 @@ def edges_of(table: CorrelationTable, planes: PairPlanes) -> RelativePoses:
     rotation = rotation_from_fixed_angles(roll, yaw, tilt)
     poses = RigidTransform.from_components(np.column_stack([x, y, a]), rotation)
     covariance = np.zeros((len(planes), 6, 6))
-    covariance[:, [[0], [1], [5]], [0, 1, 5]] = table.inplane_covariance[planes.row]
+    # Images that are the same, one not next to the other, leave no error at all, which no graph can weigh.
+    covariance[:, [[0], [1], [5]], [0, 1, 5]] = table.inplane_covariance[planes.row] + 1e-9 * np.eye(3)
     # (a, b, c) is (z, -yaw, tilt) for small angles.
     order = np.array([[1.0, 0, 0], [0, 0, 1.0], [0, -1.0, 0]])
     covariance[:, 2:5, 2:5] = order @ planes.covariance @ order.T
