@@ -168,7 +168,9 @@ class FrameMatcher:
             "echo" if self.of_echo else "intensity",
             s.intensity.edge_fraction,
             sweep.probe,
-            *(("parallel",) if fan is None else ("fan", fan.radius_mm, fan.step_rad)),
+            "parallel" if fan is None else "fan",
+            0.0 if fan is None else fan.radius_mm,
+            0.0 if fan is None else fan.step_rad,
         )
         if curves is not None:
             curves.key.require_same(self.key)
