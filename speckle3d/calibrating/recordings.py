@@ -13,6 +13,7 @@ from speckle3d.imaging.voxels.settings import Levels
 from speckle3d.io.import_settings import ImportSettings, MissingSettingsError
 from speckle3d.io.load import IMAGE, SIZED, kind_of, load_sweep
 from speckle3d.io.load import open_recording as open_sweep
+from speckle3d.io.toml import validated
 from speckle3d.study.images import GreyImages
 
 DYNAMIC_RANGE_DB = 60.0
@@ -60,7 +61,8 @@ def open_recording(
 
 def _load(path: Path, pixel_mm: tuple[float, float] | None, transform: str | None) -> Sweep:
     column, row = pixel_mm or (None, None)
-    options = ImportSettings(tracker_transform=transform, column_pitch_mm=column, row_spacing_mm=row)
+    sizes = {"column_pitch_mm": column, "row_spacing_mm": row}
+    options = validated(sizes | {"tracker_transform": transform}, "--pixel-mm", ImportSettings)
     require_unsaid(path, options)
     try:
         return load_sweep(path, options.model_copy(update={"dynamic_range_db": DYNAMIC_RANGE_DB}))

@@ -81,6 +81,7 @@ def test_every_setting_is_printed_with_its_default(run):
         (("reslice", "{sweep}", "-o", "c.png", "--state=s.nrrd"), "--state=s.nrrd was removed: "),
         (("calibrate", "images", "a", "b", "-o", "c.h5", "--scales"), "--pixel-mm takes them"),
         (("view", "{sweep}", "--pixel-mm", "1", "1"), "--pixel-mm: expected --calibrate"),
+        (("calibrate", "plane", "{sweep}", "-o", "t.h5", "--pixel-mm", "0", "1"), "greater than 0, got 0"),
     ],
 )
 def test_what_is_refused_is_refused_before_work(

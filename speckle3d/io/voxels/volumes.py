@@ -318,7 +318,9 @@ def _segment_fields(segments: Iterable[Segment], shape: Sequence[int]) -> dict[s
 
 
 def _write_nifti(path: Path, volume: Volume, fields: Mapping[str, str], is_labels: bool) -> None:
-    image: Any = nibabel.Nifti1Image(volume.voxels, _RAS_FROM_LPS @ volume.world_from_index)
+    # NIfTI-1 counts voxels along an axis by two bytes.
+    kind: Any = nibabel.Nifti2Image if max(volume.shape) >= 2**15 else nibabel.Nifti1Image
+    image = kind(volume.voxels, _RAS_FROM_LPS @ volume.world_from_index)
     image.set_qform(image.affine, 1)
     image.set_sform(image.affine, 1)
     image.header.set_xyzt_units("mm")
