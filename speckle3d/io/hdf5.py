@@ -180,11 +180,11 @@ def find_member(group: h5py.Group, name: str) -> Any:
         If the name leads to another file, or data are in another file.
     """
     where = locate(group, name)
-    with reading(where):
+    with reading(where, TypeError):  # h5py refuses types that NumPy lacks
         node = group.get(name) if isinstance(group, h5py.Group) else None
         if node is None or getattr(node, "shape", ()) is None:  # HDF5's data set of nothing
             return None
-        is_elsewhere = isinstance(node, h5py.Dataset) and (node.is_virtual or node.external)
+        is_elsewhere = isinstance(node, h5py.Dataset) and node.dtype and (node.is_virtual or node.external)
         if is_elsewhere or node.file.filename != group.file.filename:
             raise InvalidInputError(f"{where}: expected data in the file itself, got a link out of it")
         return node
@@ -260,6 +260,11 @@ def read_texts(group: h5py.Group, name: str, shape: tuple[int, ...]) -> Any:
         return np.asarray(node.asstr(errors="replace")[()], dtype=object).tolist()
 
 
+def _attribute(node: Node, name: str) -> Any:
+    with reading(f"{locate(node)} attribute {name}", TypeError):
+        return node.attrs.get(name)
+
+
 def read_attribute(node: Node, name: str, default: float | None = None) -> float:
     """Read a number; `default` stands in for a missing one unless it is None."""
     if default is not None and name not in node.attrs:
@@ -269,7 +274,7 @@ def read_attribute(node: Node, name: str, default: float | None = None) -> float
 
 def read_vector_attribute(node: Node, name: str, size: int) -> FloatArray:
     """Read an attribute of `size` numbers, which may be infinite, as a flat array."""
-    raw = node.attrs.get(name)
+    raw = _attribute(node, name)
     value = np.asarray(raw)
     if value.dtype.kind not in "fiu" or value.size != size or np.isnan(value).any():
         where = f"{locate(node)} attribute {name}"
@@ -279,7 +284,7 @@ def read_vector_attribute(node: Node, name: str, size: int) -> FloatArray:
 
 def read_text(node: Node, name: str, default: str | None = None) -> str:
     """Read a text attribute; `default` stands in for what is none unless it is None."""
-    raw = node.attrs.get(name)
+    raw = _attribute(node, name)
     text = raw.decode("utf-8", errors="replace") if isinstance(raw, bytes) else raw
     if not isinstance(text, str) and (text := default) is None:
         raise InvalidInputError(f"{locate(node)} attribute {name}: expected a text, got {raw!r:.60}")

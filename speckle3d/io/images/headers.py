@@ -233,7 +233,8 @@ def read_header(path: PathLike) -> SequenceHeader:
         If it is neither, or the header does not make sense.
     """
     data = Path(path)
-    with reading(path), open_regular(path) as stream, naming(str(path)):
+    # Fields of a damaged header may be texts where numbers are expected, or of other axes than the sizes.
+    with reading(path, TypeError, LookupError), open_regular(path) as stream, naming(str(path)):
         is_nrrd = stream.peek().startswith(b"NRRD")
         words = (_nrrd_words if is_nrrd else _meta_words)(stream)
         sizes = tuple(map(int, words["sizes"]))
@@ -264,11 +265,12 @@ def read_header(path: PathLike) -> SequenceHeader:
                 frames[int(match[1])][match[2]] = value
             elif isinstance(value, str):
                 fields[name] = value
-        if 0 not in frames and sizes[order[-1]] in frames:  # of a writer that counts from 1
+        count = sizes[frame_axes[0]] if frame_axes else 1
+        if 0 not in frames and count in frames:  # of a writer that counts from 1
             frames = {number - 1: frame for number, frame in frames.items()}
         others = (sizes[i] for i in range(len(sizes)) if i not in order)
-        channels = math.prod(others) * words.get("channels", 1)
-        is_volume = len(sizes) == 3 and {*kinds} <= {"domain", "space"} and len(frames) < sizes[order[2]]
+        channels = math.prod(others) * words["channels"]
+        is_volume = len(sizes) == 3 and {*kinds} <= {"domain", "space"} and len(frames) < count
         if (encoding := _key(_ENCODINGS, words["encoding"].lower())) is None:
             raise InvalidInputError(f"encoding: expected raw, gzip, bzip2 or text, got {words['encoding']!r}")
         start, skip = stream.tell(), words.get("byte skip", 0)
@@ -310,7 +312,7 @@ def _nrrd_words(stream: BinaryIO) -> dict[str, Any]:
         # Without a sign: names of files below "data file: LIST".
         lines += [f"{NRRD_NAMES.get(name, name)}{sign}{value}"] if sign else []
     with reading(stream.name, Exception):  # whatever pynrrd stumbles over
-        return {"sizes": (), "type": "", "encoding": "", **nrrd.read_header(lines)}
+        return {"sizes": (), "type": "", "encoding": "", **nrrd.read_header(lines), "channels": 1}
 
 
 def _meta_words(stream: BinaryIO) -> dict[str, Any]:

@@ -57,8 +57,9 @@ def own_values(path: str, fields: Mapping[str, str]) -> dict[str, Any]:
     texts = {name.removeprefix(_PREFIX): text for name, text in fields.items() if name.startswith(_PREFIX)}
     values: dict[str, Any] = {}
     for name, text in texts.items():
-        parts = (text,) if name == "probe" else numbers(text, None, f"{path}: {_PREFIX}{name}")
-        values[name] = parts if len(parts) > 1 else parts[0]
+        count = 2 if name == "bandwidth_hz" else 1
+        parts = (text,) if name == "probe" else numbers(text, count, f"{path}: {_PREFIX}{name}")
+        values[name] = parts if count > 1 else parts[0]
     return values
 
 
