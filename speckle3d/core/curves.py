@@ -203,11 +203,12 @@ class DecorrelationCurves:
 
     def __post_init__(self) -> None:
         rho, shape = self.correlation, (self.depth_mm.size, self.distance_mm.size)
-        even = np.linspace(0.0, self.distance_mm[-1], shape[1])
+        longest_mm = self.distance_mm.max(initial=0.0)
+        even = np.linspace(0.0, longest_mm, shape[1])
         parts = [vars(part) for part in (self.speckle, self.tilt) if part is not None]
         by_depth = [self.cells, *(values for part in parts for values in part.values())]
         requirements = {
-            "distance_mm: expected equal steps from zero": even[-1] > 0
+            "distance_mm: expected equal steps from zero": longest_mm > 0
             and np.allclose(self.distance_mm, even),
             "correlation: expected values in (0, 1] that fall with distance": rho.shape == shape
             and (rho > 0).all()

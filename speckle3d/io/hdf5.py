@@ -37,6 +37,7 @@ _DAMAGE: tuple[type[BaseException], ...] = (
     EOFError,
     KeyError,
     MemoryError,
+    OverflowError,
     RuntimeError,
     ValueError,
 )
