@@ -72,7 +72,7 @@ def curve_errors(error: FloatArray, has_reading: BoolArray) -> FloatArray:
     runs = [correlated_readings(column) for column in error.T]
     white = np.mean((error[2:] - 2.0 * error[1:-1] + error[:-2]) ** 2, axis=0) / 6.0
     excess = 2.0 * np.maximum(error.var(axis=0) - white, 0.0)
-    scatter = error.var(axis=0) * len(error) / (len(error) - order.size)
+    scatter = error.var(axis=0) * len(error) / max(len(error) - order.size, 1)
     variance = against_first[:, None] * scatter * runs
     variance[1:] += excess
     return np.asarray(variance[:, :, None] * np.eye(6))
