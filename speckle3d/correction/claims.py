@@ -4,8 +4,6 @@ All covariances are of (x, y, z, tilt, yaw, roll) of every frame about the image
 frame and along its axes, mm and rad.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.polynomial import legendre
 from scipy.spatial.transform import RigidTransform

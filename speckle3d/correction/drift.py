@@ -4,8 +4,6 @@ The image-based poses have good fine detail and slow drift; the sensor has no dr
 Smooth curves, too stiff to follow the jitter, bend the one onto the other.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

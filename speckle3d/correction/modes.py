@@ -1,7 +1,5 @@
 """Drift modes by name: what each needs of a sweep, and the sweep's poses corrected."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

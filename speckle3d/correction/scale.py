@@ -1,7 +1,5 @@
 """Poses whose length comes from other sources than the images, and a crossing sweep's evidence for it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import NamedTuple
 

@@ -54,8 +54,6 @@ class SensorReadings:
     wander : ndarray, shape (3,)
         Standard deviation along the world's axes of an error that changes in `wander_s`: of an orientation
         sensor's turns, rad, as its settings have it, or of a tracker's places, mm.
-    noise_mm : float
-        White noise of a place, mm: the jitter but for what the path does not resolve.
     """
 
     name: str
@@ -68,7 +66,6 @@ class SensorReadings:
     settings: FusedSettings
     jitter: FloatArray
     wander: FloatArray
-    noise_mm: float = 0.0
 
     @classmethod
     def of(
@@ -117,9 +114,10 @@ class SensorReadings:
         interval_s = np.ptp(frame_time_s) / knot_intervals(frame_time_s.size)
         unresolved = HAND_TURN_RAD * np.sqrt(interval_s / 6.0)
         lever_mm = np.linalg.norm(readings.centre_from_sensor.translation)
-        wander, noise_mm = np.full(3, jitter[1]) if places else readings.wander, jitter[1]
-        jitter = np.hypot(jitter, unresolved * np.array([1.0, lever_mm]))
-        return replace(readings, jitter=jitter, wander=wander, noise_mm=noise_mm)
+        wander = np.full(3, jitter[1]) if places else readings.wander
+        return replace(
+            readings, jitter=np.hypot(jitter, unresolved * np.array([1.0, lever_mm])), wander=wander
+        )
 
     @property
     def knots_s(self) -> FloatArray:
@@ -129,8 +127,7 @@ class SensorReadings:
     def with_wander(self, unknowns: FloatArray, covariance: FloatArray) -> SensorReadings:
         """A tracker's readings with the likeliest size of its wander; an orientation sensor's is known.
 
-        By the fixed point of MacKay 1992. White noise hides a wander of its own size, which counts as one
-        observation more: so the size is never zero.
+        By the fixed point of MacKay 1992: squares of the knots over how many of them the readings determine.
 
         Parameters
         ----------
@@ -146,9 +143,8 @@ class SensorReadings:
             return self
         residual, root = self.prior(unknowns)
         unobserved = ((root @ covariance) * root).sum(axis=1)[RIGID:]
-        square = (self.wander**2).mean() * (residual[RIGID:] ** 2).sum() + self.noise_mm**2
-        size = np.sqrt(square / (1.0 + np.maximum(1.0 - unobserved, 0.0).sum()))
-        return replace(self, wander=np.full(3, size))
+        ratio = (residual[RIGID:] ** 2).sum() / max((1.0 - unobserved).sum(), TICK)
+        return replace(self, wander=np.maximum(self.wander * np.sqrt(ratio), LEAST_JITTER[1]))
 
     @property
     def size(self) -> int:

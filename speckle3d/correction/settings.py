@@ -1,7 +1,5 @@
 """Settings of the sensors' systematic errors: mounting, clock, scale, slow drift."""
 
-from __future__ import annotations
-
 from pydantic import BaseModel, ConfigDict, Field
 
 

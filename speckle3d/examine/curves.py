@@ -5,8 +5,6 @@ seen as far apart, and everything below fits as well as before. What can be told
 another factor at each depth, since all depths of one image move together.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import replace
 

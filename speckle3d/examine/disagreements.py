@@ -1,7 +1,5 @@
 """Disagreements of images and sensors: both numbers, without a verdict."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from itertools import combinations
 

@@ -5,8 +5,6 @@ the same echoes in the same place, frames that resemble the one before less than
 that are equally alike and not equally far apart, and a length that the images leave open.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.optimize import isotonic_regression
 from scipy.spatial.transform import RigidTransform

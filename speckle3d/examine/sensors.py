@@ -3,8 +3,6 @@
 What images and sensors say differently is in `speckle3d.examine.disagreements`: either may be wrong.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from functools import partial

@@ -1,7 +1,5 @@
 """Copying arrays in kernels."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Correlation of matching patches of two images, or of their complex echoes, at neighbouring lags."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Looking up points in images that follow a bent path."""
 
-from __future__ import annotations
-
 import math
 
 from numba import njit

@@ -4,8 +4,6 @@ Each line starts at a point of the world and takes equal steps, so that what an 
 stretch.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Field of a lens over elevation, as a line source sends it, at evenly spaced wavenumbers."""
 
-from __future__ import annotations
-
 from math import factorial
 
 import numpy as np

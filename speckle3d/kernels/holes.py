@@ -1,7 +1,5 @@
 """Filling empty voxels from measured ones nearby."""
 
-from __future__ import annotations
-
 import numpy as np
 import numpy.typing as npt
 from numba import njit

@@ -1,7 +1,5 @@
 """In-plane motion of a frame pair from the correlation of its patches at neighbouring lags."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

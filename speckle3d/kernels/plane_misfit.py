@@ -1,7 +1,5 @@
 """Misfit of a plane to the correlations of a pair's patches, and its minimisation."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

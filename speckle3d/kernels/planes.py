@@ -1,7 +1,5 @@
 """Fitting the planes of frame pairs to the correlations of their patches."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

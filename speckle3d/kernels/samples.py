@@ -1,7 +1,5 @@
 """Samples of images on their way to voxels."""
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy.typing as npt

@@ -1,7 +1,5 @@
 """Summing the echoes of point scatterers into the baseband of each vector."""
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Following the likeliest paths of position and slope through frames whose pairs have no sign."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np
@@ -21,6 +19,7 @@ class PathRules(NamedTuple):
     trend_mm: float
     same_mm: float
     apart_mm: float
+    apart_slope: float
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
@@ -137,8 +136,9 @@ def follow_paths(
             if (candidates[n, 0] - paths[h, earlier[latest], 0]) * trend[h] < 0.0:
                 total[n] += rules.turning_cost
             for stranger in unlike[unlike_start[f] : unlike_start[f + 1]]:
-                # Such a pair disagrees altogether.
-                if abs(candidates[n, 0] - paths[h, stranger, 0]) < rules.apart_mm:
+                off = abs(candidates[n, 0] - paths[h, stranger, 0])
+                turn = abs(candidates[n, 1] - paths[h, stranger, 1])
+                if off < rules.apart_mm and turn < rules.apart_slope:
                     total[n] += rules.cap
             if not moving and candidates[n, 0] < 0.0:
                 # The overall sign is open: of two mirror images one is enough.

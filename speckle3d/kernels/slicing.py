@@ -5,8 +5,6 @@ A patch is a rectangle of grid points on one sweep's image; it and what the othe
 compared by their correlation, so that neither brightness nor contrast counts.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

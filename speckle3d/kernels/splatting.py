@@ -4,8 +4,6 @@ Positions are whole numbers of 2^-40 voxel, so that stepping along a line adds n
 voxels gets exactly what it gets as part of all. Lines are cut to the voxels wanted before they are walked.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import numpy.typing as npt
 from numba import njit

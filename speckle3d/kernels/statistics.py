@@ -1,7 +1,5 @@
 """Sampling statistics of speckle's correlation; the same arithmetic for arrays and inside kernels."""
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 from speckle3d.core.arrays import FloatArray

@@ -5,8 +5,6 @@ bits: up to 255 pixels and 255/256. Positions are those of `speckle3d.kernels.sp
 14 bits behind the point are used that IGSIO has; so are shares of a pixel.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import numpy.typing as npt
 from numba import njit

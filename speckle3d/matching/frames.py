@@ -1,7 +1,5 @@
 """Match the frames of a sweep, one after the other, with earlier ones of a schedule."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 

@@ -6,8 +6,6 @@ from the frequency domain to the coarsest rate that still holds the intensity's 
 I/Q, may have been sampled more coarsely than that, and then the rate rises.
 """
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import replace
 from typing import Any, NamedTuple

@@ -4,8 +4,6 @@ The in-plane shift comes from all patches together, and the correlation is read 
 patch's own maximum over lags biases the correlation upward and distances short.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Literal, NamedTuple

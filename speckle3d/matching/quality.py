@@ -12,8 +12,6 @@ References
    1983.
 """
 
-from __future__ import annotations
-
 import enum
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Schedule of the frame pairs measured as a sweep is read."""
 
-from __future__ import annotations
-
 from pydantic import BaseModel, ConfigDict, Field
 
 from speckle3d.core.arrays import IntArray

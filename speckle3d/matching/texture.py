@@ -4,8 +4,6 @@ The size of speckle along the vectors is the pulse's, across them the aperture's
 on what is scanned as long as it scatters as a phantom does; patches whose contrast denies that do not count.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 

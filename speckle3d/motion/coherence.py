@@ -14,8 +14,6 @@ What a patch says of s is therefore its likelihood averaged over all shares and 
 for all patches together: no patch is judged to hold structure or not.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

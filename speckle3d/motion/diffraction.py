@@ -19,8 +19,6 @@ References
    1983: the correlation of speckle is the autocorrelation of the point spread function.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from scipy import fft
 from scipy.interpolate import CubicSpline

@@ -30,7 +30,7 @@ from speckle3d.motion.uncertainty import SlopeWeights, claimed_covariance, weigh
 
 ROUNDS = 2
 """Rounds in which shares and scale, and the path that they are read from, are estimated in turn; a third
-moves lengths by less than 0.2 %, one alone moves two of eight lengths by 0.4 % and tilts by 0.3 degrees."""
+moves lengths by less than 0.2 %."""
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,5 @@
 """Stretch decorrelation curves by depth, for another lens."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import lru_cache
 

@@ -5,8 +5,6 @@ a patch size; off the elevational focus it is the wavefront's curvature rather t
 sets them, so they are measured at each depth and not derived from a beam width.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass
 

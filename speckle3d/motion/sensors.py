@@ -1,7 +1,5 @@
 """Use of sensors by the image-based motion: its sign and the orientation-consistent patches."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable
 from typing import NamedTuple

@@ -5,8 +5,6 @@ agrees with all the offsets and slopes. Where a pause or a turn leaves more than
 are followed until the frames that come later tell them apart.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np
@@ -30,6 +28,9 @@ TURNING_COST = 2.0
 steps of those wobbles get the wrong sign."""
 SAME_MM = 0.05
 """Paths that end this close to each other at all frames still of use are one."""
+APART_SLOPE = 0.01
+"""Frames that turn more than this against each other may differ although their centres meet. Such as turn
+less and do not resemble each other are a pair that disagrees altogether."""
 
 
 class Strangers(NamedTuple):
@@ -82,6 +83,7 @@ def likeliest_path(
         TREND_MM,
         SAME_MM,
         strangers.apart_mm,
+        APART_SLOPE,
     )
     path, every = np.zeros((frames, 2)), np.arange(frames + 1)
     start = path[:1] if start is None else start

@@ -9,8 +9,6 @@ Filters leave structure and take speckle away. Decibels of speckle have a long t
 they are even about their median; where bright ones have the long tail, it is structure that is seen.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """Poses of all frames by robust least squares on the graph of relative poses."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

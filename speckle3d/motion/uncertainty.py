@@ -1,7 +1,5 @@
 """Covariance of poses from the pairs' scatter and the errors common to all pairs."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

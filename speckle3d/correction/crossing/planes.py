@@ -5,8 +5,6 @@ within their own planes, which they know exactly, onto the smooth path; tremor, 
 leave no trace, and a place is found by its neighbouring planes alone.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

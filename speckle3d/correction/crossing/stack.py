@@ -1,7 +1,5 @@
 """Reduced images of a sweep: small enough to keep all, fine enough to find places again."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from speckle3d.core.arrays import Float16Array, Float32Array

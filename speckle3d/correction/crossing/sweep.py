@@ -1,7 +1,5 @@
 """Inputs and settings of the comparison of two crossing sweeps."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Local contrast of a sweep's images: what two sweeps have in common."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
