@@ -138,7 +138,7 @@ def open_sequence(path: Path, settings: ImportSettings) -> Facts:
             yield f"image {name.lower()}", word if is_said else f"{word} (assumed)", ""
     yield "transforms", ", ".join(names) or "none", ""
     chosen = settings.tracker_transform, settings.reference_transform
-    poses = tracked_poses(header, *chosen, device.image, [*device.transforms])
+    poses = tracked_poses(header, *chosen, device.image, device.probe, [*device.transforms])
     times, rate_hz, remarks = _times(header), settings.frame_rate_hz, list[str]()
     clock, tracker = times if rate_hz is None else np.arange(header.frame_count) / rate_hz, None
     if poses is not None and clock is not None:

@@ -63,6 +63,7 @@ def tracked_poses(
     tool_pose: str | None,
     reference: str | None,
     image: str = IMAGE,
+    probe: str = PROBE,
     fixed: Sequence[Pair] = (),
 ) -> Poses | None:
     """Read the poses of a tool, seen from the reference if there is one.
@@ -75,8 +76,8 @@ def tracked_poses(
         Names of transforms, or ``"none"``; by default the probe's, in the tracker or in the only frame that
         it is tracked in, else that of what the image is on, else the image's; and that of ``Reference`` where
         a chain leads there.
-    image : str
-        Name of the image's frame.
+    image, probe : str
+        Names of the image's and the probe's frame.
     fixed : sequence of pair
         Transforms of a device set, which may say what the image is on.
 
@@ -92,7 +93,8 @@ def tracked_poses(
     """
     transforms = names_of(header)
     pairs = [ends(name) for name in transforms]
-    name = _usual_pose(pairs, fixed, image) if tool_pose is None else tool_pose.removesuffix("Transform")
+    usual = _usual_pose(pairs, fixed, image, probe) if tool_pose is None else tool_pose
+    name = usual and usual.removesuffix("Transform")
     if name is None or name == "none":
         return None
     tool, world = ends(name)
@@ -222,15 +224,15 @@ def _joined(pair: tuple[str, str]) -> str:
     return "To".join(filter(None, pair))
 
 
-def _usual_pose(pairs: Sequence[Pair], fixed: Sequence[Pair], image: str) -> str | None:
+def _usual_pose(pairs: Sequence[Pair], fixed: Sequence[Pair], image: str, probe: str) -> str | None:
     """Choose the pose of the probe, of what the image is on, or of the image, in the usual or only world."""
 
     def partners(tool: str, pairs: Sequence[Pair]) -> set[str]:
         frames = {b if a == tool else a for a, b in pairs if tool in (a, b)}
-        return frames - {PROBE, image, "TransducerOrigin", "TransducerOriginPixel", ""}
+        return frames - {probe, image, "TransducerOrigin", "TransducerOriginPixel", ""}
 
     carriers = sorted(partners(image, [*pairs, *fixed]) - {*_WORLDS})
-    for tool in (PROBE, *carriers, image):
+    for tool in (probe, *carriers, image):
         worlds = partners(tool, pairs)
         for world in (*_WORLDS, *(worlds if len(worlds) == 1 else ())):
             if world in worlds:

@@ -21,6 +21,7 @@ from speckle3d.core.progress import Progress
 from speckle3d.core.sweep import RFSettings, Sweep, stored_dtype
 from speckle3d.io.hdf5 import atomic_path, require_suffix
 from speckle3d.io.images.headers import NRRD_NAMES, write_image
+from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.plus.transforms import IMAGE, ORIENTATION, pixel_matrix
 from speckle3d.io.text import number_text, numbers
 
@@ -54,12 +55,12 @@ def own_values(path: str, fields: Mapping[str, str]) -> dict[str, Any]:
     InvalidInputError
         Naming the field that does not make sense.
     """
-    texts = {name.removeprefix(_PREFIX): text for name, text in fields.items() if name.startswith(_PREFIX)}
     values: dict[str, Any] = {}
-    for name, text in texts.items():
-        count = 2 if name == "bandwidth_hz" else 1
-        parts = (text,) if name == "probe" else numbers(text, count, f"{path}: {_PREFIX}{name}")
-        values[name] = parts if count > 1 else parts[0]
+    for name in (*ImportSettings.model_fields, "full_scale"):
+        if (text := fields.get(_PREFIX + name)) is not None:
+            count = 2 if name == "bandwidth_hz" else 1
+            parts = (text,) if name == "probe" else numbers(text, count, f"{path}: {_PREFIX}{name}")
+            values[name] = parts if count > 1 else parts[0]
     return values
 
 

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from speckle3d.core.grid import ImageGrid, Region, ScanConversion
 from speckle3d.io.import_settings import ImportSettings, MissingSettingsError
-from speckle3d.io.load import load_sweep
+from speckle3d.io.load import load_sweep, open_recording
 from speckle3d.io.plus.device_set import read_device_set
 
 TURN = Rotation.from_euler("xyz", [0.1, -0.2, 0.3]).as_matrix()
@@ -68,11 +68,11 @@ def test_the_image_on_the_probe_in_either_direction(tmp_path, sequence, transfor
     np.testing.assert_allclose(mounting.rotation.as_matrix(), TURN, atol=1e-9)
 
 
-def test_the_machine_orientation_counts_where_the_header_has_none(tmp_path):
-    config = write_set(tmp_path / "set.xml", ("Image", "Probe", matrix()),
-                     more='<DataSource PortUsImageOrientation="UN"/>')  # fmt: skip
-    path = write_mha(tmp_path / "a.mha", grey(), frames=frame_fields(3)[2])
-    np.testing.assert_array_equal(load_sweep(path, settings(config)).frames[0], grey()[0, ::-1, ::-1].T)
+def test_the_machine_names_orientation_and_tool_where_the_header_does_not(tmp_path, sequence):
+    config = write_set(tmp_path / "set.xml", ("Image", "Reference", matrix()),
+                     more='<Set PortUsImageOrientation="UN" ProbeCoordinateFrame="Reference"/>')  # fmt: skip
+    np.testing.assert_array_equal(load_sweep(sequence, settings(config)).frames[0], grey()[0, ::-1, ::-1].T)
+    assert open_recording(sequence, settings(config)).chain == "ImageToReference * ReferenceToTracker"
     path = write_mha(tmp_path / "a.mha", grey(), {"UltrasoundImageOrientation": "MF"}, frame_fields(3)[2])
     np.testing.assert_array_equal(load_sweep(path, settings(config)).frames[0], grey()[0].T)
 
