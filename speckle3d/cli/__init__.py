@@ -72,6 +72,7 @@ def main() -> None:
     A wrong input is one line on stderr and exit code 2, a full disk one and exit code 1. Signals that ask for
     the end stop the command as Ctrl-C does, with exit code 128 and their number.
     """
+    sys.stdout, sys.stderr = (stream or io.StringIO() for stream in (sys.stdout, sys.stderr))  # if closed
     for stream in (sys.stdout, sys.stderr):  # a terminal of another encoding shows what it can
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
