@@ -90,4 +90,4 @@ class Doubt:
 
     def __str__(self) -> str:
         cause = f" (suspect: {self.suspect})" if self.suspect else ""
-        return f"{self.about}: {self.evidence}{cause}" + "; refused" * self.refuted
+        return f"{self.about}: {self.evidence}{cause}{'; refused' if self.refuted else ''}"
