@@ -28,6 +28,7 @@ from speckle3d.motion.estimate import estimate_motion, frame_pairs
 from speckle3d.motion.planes import MotionProblem
 from speckle3d.motion.sensors import consistent_poses, settle_direction
 from speckle3d.motion.tissue import averaging_loss, grey_error, tissue_curves
+from speckle3d.motion.trajectory import loose_frames
 from speckle3d.tracked import Tracked
 
 PairSink = Callable[[FramePairs], None]
@@ -57,7 +58,7 @@ def track(
         tissue.curves, matcher.patches, matcher.centre_mm, len(sweep), settings.planes, settings.trajectory
     )
     motion = estimate_motion(problem, matches.table.where(matches.sound))
-    flags = placed_flags(matches.flags, motion.unplaced)
+    flags = placed_flags(matches.flags, loose_frames(motion.pairs.second, matches.flags.size))
 
     credible, sensor_doubts = examine_sensors(sweep, motion.poses, settings.sensors.examine)
     direction, source = settle_direction(credible, motion.poses, settings.sensors, sensor_doubts)

@@ -1,7 +1,5 @@
 """Recordings of a calibration phantom: images, and sensor readings from the same or another file."""
 
-from __future__ import annotations
-
 import warnings
 from pathlib import Path
 

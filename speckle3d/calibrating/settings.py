@@ -1,7 +1,5 @@
 """Settings of a calibration with a phantom: each field is an option of the command of the same name."""
 
-from __future__ import annotations
-
 import shlex
 from collections.abc import Callable, Mapping
 from pathlib import Path

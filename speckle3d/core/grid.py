@@ -243,8 +243,9 @@ class ScanConversion:
         ----------
         image : ndarray, shape (vector, sample)
         """
-        levels = np.asarray(image, dtype=np.float32)
-        return map_coordinates(levels, self._sample, np.float32, order=1, cval=np.nan, prefilter=False)
+        return map_coordinates(
+            np.asarray(image, np.float32), self._sample, np.float32, order=1, cval=np.nan, prefilter=False
+        )
 
 
 def require_positive(settings: object, names: tuple[str, ...]) -> None:
@@ -300,7 +301,8 @@ class Region:
         return inside
 
     def _inside(self, grid: ImageGrid) -> BoolArray:
-        places, inside = grid.places_mm, np.ones((grid.vectors, grid.samples), dtype=bool)
+        places = grid.places_mm
+        inside = np.full(places.shape[:2], True)
         for part in self.text.split(" and "):
             try:
                 kind, *words = part.split()

@@ -111,9 +111,8 @@ def estimate_attenuation(curves: DecorrelationCurves, spectra: EchoSpectra | Non
     phantom = curves.spectrum.at(spectra.depth_mm, 1e6 * frequency_mhz)
     fall, sigma = _fit_rows(frequency_mhz, spectra.power[:, inside], phantom)
     middle = float(frequency_mhz.mean())
-    exponent, sigma = middle * fall, np.hypot(middle * sigma, ROW_SIGMA)
-    per_unit = middle * _loss(spectra.depth_mm)
-    beta, error, shift, gain = _difference(exponent, sigma, per_unit)
+    rows = middle * fall, np.hypot(middle * sigma, ROW_SIGMA), middle * _loss(spectra.depth_mm)
+    beta, error, shift, gain = _difference(*rows)
     if gain > OTHER_BAND:
         return replace(unknown, doubts=(_other_band(shift, middle),))
     of_tissue = _attenuate(phantom, spectra.depth_mm, frequency_mhz, beta)

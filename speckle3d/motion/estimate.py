@@ -25,7 +25,7 @@ from speckle3d.motion.planes import (
     patch_distances,
 )
 from speckle3d.motion.signs import Strangers, likeliest_path, on_path
-from speckle3d.motion.trajectory import Trajectory, edges_of, loose_frames, solve_trajectory
+from speckle3d.motion.trajectory import Trajectory, edges_of, solve_trajectory
 from speckle3d.motion.uncertainty import SlopeWeights, claimed_covariance, weigh_slopes
 
 ROUNDS = 2
@@ -70,11 +70,6 @@ class Motion:
     def path(self) -> FloatArray:
         """Elevational position of the image's centre and its slopes along x and y, shape (n, 3)."""
         return elevation_of(self.poses, self.problem.centre_mm)
-
-    @property
-    def unplaced(self) -> BoolArray:
-        """Frames that no pair joins to earlier ones, shape (n,)."""
-        return loose_frames(self.pairs.second, self.problem.frames)
 
     def claims(self, curves_sigma: float) -> tuple[SharedErrors, FloatArray]:
         """Errors that all frames share, and the covariance of every pose; see `claimed_covariance`.

@@ -3,8 +3,6 @@
 Drawn without pyplot: no window system, no global state. Only this module of the room needs matplotlib.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import NamedTuple
 

@@ -12,8 +12,6 @@ Angles are in degrees. The columns may be in any order and separated by commas, 
 and ``until_s`` when it left. Without a header the columns are tilt, yaw and, if there is a third, roll.
 """
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass
 

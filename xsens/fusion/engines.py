@@ -3,8 +3,6 @@
 Inclination has no part of the magnetometer, so iron cannot tilt the orientation; `heading` turns it to north.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

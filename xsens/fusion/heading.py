@@ -25,8 +25,6 @@ References
 .. [4] V. H. de la Pena, T. L. Lai, Q.-M. Shao, "Self-normalized processes", Springer, 2009.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

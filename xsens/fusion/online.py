@@ -1,7 +1,5 @@
 """`OnlineFilter`: orientation while samples arrive, one by one or in pieces."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """`orient`: orientation of a log from gyroscope, accelerometer and, for heading alone, magnetometer."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """Engines that find an orientation, and settings of the filter: properties of sensors, hands and rooms."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from enum import StrEnum

@@ -5,8 +5,6 @@ samples are brought to an even clock, fields between those that came are interpo
 own engine claims, and how far VQF is from it, become VQF's deviation.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

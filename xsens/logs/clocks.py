@@ -4,8 +4,6 @@ Counter and clock wrap round; both are unwrapped. A sensor that was unplugged st
 both anew: the length of that pause is known only from the computer's clock, if the recording holds it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any

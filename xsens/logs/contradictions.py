@@ -6,8 +6,6 @@ over a quarter of a second in axes that the gyroscope carries along, and compare
 Over shorter times a hand's acceleration, which averages to nothing over its swings, shows turns of its own.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 

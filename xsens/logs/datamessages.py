@@ -1,7 +1,5 @@
 """Samples from the sensor's data messages: legacy MTData by its configuration, MTData2 by its own items."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from contextlib import suppress
 from typing import Any

@@ -4,8 +4,6 @@ A sensor that stops, a link that stutters or a chip at the end of its range goes
 become NaN, as if they had not come, so that whatever uses the log grows less certain across them.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any, NamedTuple
 

@@ -1,7 +1,5 @@
 """Samples as sent, from all readers of logs, and their assembly to an `ImuLog`."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any

@@ -1,7 +1,5 @@
 """Read logs of the sensor; the kind of a log is told by its content, never by its name."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from io import TextIOWrapper
 

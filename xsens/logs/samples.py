@@ -4,8 +4,6 @@ The world of an orientation is x magnetic north, y west, z up (the MT9-B's own, 
 sensor was set to.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from functools import cached_property
 

@@ -5,8 +5,6 @@ perhaps temperature; or the 9 elements of a matrix. All other files name their c
 with their units. Plain files are written here too.
 """
 
-from __future__ import annotations
-
 import os
 import re
 from collections.abc import Iterable

@@ -3,8 +3,6 @@
 Cells without a number are NaN, lines of another length are left out.
 """
 
-from __future__ import annotations
-
 import csv
 import math
 import re

@@ -5,8 +5,6 @@ horizontal part whether north is y (ENU) or x (NWU, NED). Both are medians, so t
 may disturb some samples. The dip of the field has no part in it: it points up in the south.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import NamedTuple

@@ -6,8 +6,6 @@ bits of an identifier give the format of its real numbers and their world, ENU, 
 measurement or a time stamp, or of another length than they should have, are passed over.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from enum import IntFlag
 from functools import cached_property
