@@ -81,8 +81,10 @@ class Motion:
         """
         scale_sigma = float(np.hypot(self.coherence.scale_sigma, self.slopes.length_sigma))
         shared = SharedErrors(scale_sigma, curves_sigma, self.slopes.deviation_per_mm)
-        centre_mm, structure = self.problem.centre_mm, float(self.coherence.share.mean())
-        return shared, claimed_covariance(self.poses, self.covariance, centre_mm, shared, structure)
+        structure = float(self.coherence.share.mean())
+        return shared, claimed_covariance(
+            self.poses, self.covariance, self.problem.centre_mm, shared, structure
+        )
 
     def mirrored(self) -> Motion:
         """The motion with the opposite elevational sign."""
@@ -125,8 +127,8 @@ def _alternate(problem: MotionProblem, table: CorrelationTable) -> Motion:
     All that iterates does so here. Distances and their scale need the path, the path needs distances: both
     are repeated `ROUNDS` times.
     """
-    rows, models = alike_pairs(problem, table, table.median), fully_developed(table.correlation.shape[1])
-    _, path = _signed_planes(problem, table, rows, models)
+    rows = alike_pairs(problem, table, table.median)
+    _, path = _signed_planes(problem, table, rows, fully_developed(table.correlation.shape[1]))
     coherence = estimate_coherence(problem, table, path)
     for _ in range(ROUNDS):
         apart_mm = coherence.scale * np.abs(path[table.second, 0] - path[table.first, 0])
@@ -146,8 +148,8 @@ def solve_planes(
     problem: MotionProblem, table: CorrelationTable, pairs: PairPlanes
 ) -> tuple[RelativePoses, Trajectory]:
     """Trajectory of some pairs, and the edges that it is solved from."""
-    edges, huber = edges_of(table, pairs), problem.trajectory.huber
-    return edges, solve_trajectory(edges, problem.frames, problem.centre_mm, huber)
+    edges = edges_of(table, pairs)
+    return edges, solve_trajectory(edges, problem.frames, problem.centre_mm, problem.trajectory.huber)
 
 
 def alike_pairs(problem: MotionProblem, table: CorrelationTable, correlation: FloatArray) -> IntArray:
