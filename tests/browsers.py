@@ -72,7 +72,7 @@ def viewing(*arguments):
         drain.start()
         yield output[-1].strip()
         server.terminate()
-        server.wait(20)
+        server.wait(LIMIT_S)
         drain.join(5)
         assert not [line for line in output if "Traceback" in line], "".join(output)
 

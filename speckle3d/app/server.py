@@ -54,7 +54,7 @@ class AppServer:
     """
 
     def __init__(self, pages: Sequence[Page], title: str, port: int = 0, unseen_s: float = UNSEEN_S) -> None:
-        self._unseen_s, self._seen_s = unseen_s, time.monotonic()
+        self.unseen_s, self._seen_s = unseen_s, time.monotonic()
         self._sessions: set[str] = set()
         try:
             sockets = bind_sockets(port, LOOPBACK)
@@ -114,7 +114,7 @@ class AppServer:
         # A page that was sent a moment ago has no connection yet.
         if self._sessions - before or any(session.connection_count for session in sessions):
             self._seen_s = now_s
-        elif now_s - self._seen_s > self._unseen_s:
+        elif now_s - self._seen_s > self.unseen_s:
             self._server.io_loop.stop()
 
 

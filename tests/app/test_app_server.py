@@ -8,7 +8,7 @@ import urllib.request
 
 import pytest
 from bokeh.util.token import generate_session_id
-from browsers import needs_browser, open_page, running, viewing
+from browsers import LIMIT_S, needs_browser, open_page, running, viewing
 
 pytestmark = needs_browser
 
@@ -22,7 +22,7 @@ def address(data_folder):
 def status(address, **headers):
     request = urllib.request.Request(address, headers=headers)
     try:
-        with urllib.request.urlopen(request, timeout=20) as answer:
+        with urllib.request.urlopen(request, timeout=LIMIT_S) as answer:
             assert "Set-Cookie" not in answer.headers
             return answer.status
     except urllib.error.HTTPError as refusal:
@@ -55,22 +55,26 @@ def test_without_its_signature_an_address_is_refused(address):
 def test_the_address_that_a_browser_is_started_with_opens_once(browser, data_folder):
     """Other users see the arguments that programs are started with."""
     code = (
-        "import sys; from pathlib import Path; from speckle3d.app.opened import pages_of; "
-        "from speckle3d.app.server import AppServer; path = Path(sys.argv[1]); "
-        "server = AppServer(pages_of(path), path.name, unseen_s=3.0); "
+        "import sys; from pathlib import Path; from threading import Thread; "
+        "from speckle3d.app.opened import pages_of; from speckle3d.app.server import AppServer; "
+        "path = Path(sys.argv[1]); server = AppServer(pages_of(path), path.name); "
+        "limit_s = lambda: float(sys.stdin.readline()); "
+        "Thread(target=lambda: setattr(server, 'unseen_s', limit_s()), daemon=True).start(); "
         "print(server.address_for_once(), flush=True); server.run()"
     )
     command = [sys.executable, "-c", code, data_folder / "phantom.h5"]
-    with running(command, stdout=subprocess.PIPE) as server:
+    with running(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as server:
         once = server.stdout.readline().strip()
         page = open_page(browser, once)
         page.wait_for_selector("canvas")
         assert "bokeh-session-id" in page.url
         assert status(once) == 403
+        server.stdin.write("2\n")
+        server.stdin.flush()
         page.wait_for_timeout(5000)
         assert server.poll() is None  # while someone looks
         page.close()
-        assert server.wait(30) == 0  # and ends when nobody does
+        assert server.wait(LIMIT_S) == 0  # and ends when nobody does
 
 
 def test_a_page_of_another_server_cannot_ask_it(browser, address, tmp_path):
