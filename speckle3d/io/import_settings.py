@@ -21,6 +21,7 @@ SPEED_OF_SOUND_M_S = 1540.0
 _FOLDER_FILE = "import.toml"
 
 Size = Annotated[StrictFloat, Field(gt=0)]
+NotNegative = Annotated[StrictFloat, Field(ge=0)]
 LEAST_HZ = 1e4
 """Of ultrasound or of its sampling: less is a number in MHz or kHz."""
 Hertz = Annotated[StrictFloat, Field(ge=LEAST_HZ)]
@@ -32,77 +33,51 @@ class ImportSettings(BaseModel):
     Attributes are named as the options of ``speckle3d convert``, and as they are in TOML.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
 
-    sampling_rate_hz: Hertz | None = Field(
-        None, description="samples per second along a line, in the scanner's export settings or log"
-    )
-    vector_pitch_mm: Size | None = Field(
-        None,
-        description="distance between lines; a linear probe's element pitch, in its data sheet, where each "
-        "element has one line; of lines that spread: array_radius_mm and line_angles_deg",
-    )
-    element_pitch_mm: Size | None = Field(
-        None,
-        description="distance between elements of the array, in the probe's data sheet, where the file "
-        "places its lines in elements",
-    )
-    array_radius_mm: StrictFloat | None = Field(
-        None, ge=0, description="radius of a curved array's face, in the probe's data sheet; 0: phased array"
-    )
-    line_angles_deg: tuple[StrictFloat, StrictFloat] | None = Field(
-        None,
-        description="angles of the first and the last line of a curved or phased array, from straight down",
-    )
-    speed_of_sound_m_s: Size | None = Field(
-        None, description="assumed by the scanner; 1540 unless its manual says otherwise"
-    )
-    centre_frequency_hz: Hertz | None = Field(
-        None, description="transmit frequency, on the scanner's screen or in the probe's data sheet"
-    )
-    bandwidth_hz: tuple[Hertz, Hertz] | None = Field(
-        None, description="lowest and highest frequency of the echoes, at -6 dB in the probe's data sheet"
-    )
-    demodulation_frequency_hz: StrictFloat | None = Field(
-        None, ge=0, description="frequency that I/Q were shifted down by, usually the transmit frequency"
-    )
-    first_sample_depth_mm: StrictFloat | None = Field(
-        None, description="depth of a line's first sample; 0 unless the scanner records later"
-    )
-    column_pitch_mm: Size | None = Field(
-        None,
-        description="distance between columns, from the scanner's depth ruler or --plus-config",
-    )
-    row_spacing_mm: Size | None = Field(
-        None, description="distance between rows, from the scanner's depth ruler or --plus-config"
-    )
-    dynamic_range_db: Size | None = Field(
-        None, description="decibels from black to white, beside the image on the scanner's screen"
-    )
-    frame_rate_hz: Size | None = Field(None, description="frames per second, on the scanner's screen")
-    probe: str | None = Field(
-        None,
-        description="model of the probe, printed on it, for its element pitch; or --element-pitch-mm",
-    )
-    tracker_transform: str | None = Field(
-        None,
-        description="poses to use, by their name in the file, as ToolToTracker; none for none",
-    )
-    reference_transform: str | None = Field(
-        None, description="poses of the reference, as ReferenceToTracker; none for none"
-    )
-    plus_config: str | None = Field(
-        None,
-        description="device set of PLUS, with the place of the image on the probe and the size of its "
-        "pixels; in TOML, from the folder of that file",
-    )
-    image_to_probe: tuple[tuple[StrictFloat, ...], ...] | None = Field(
-        None, description="image calibration of PLUS, pixels to mm, four rows of four numbers"
-    )
-    arrays: dict[str, str] = Field(
-        default_factory=dict,
-        description="arrays of a MATLAB file by what they are, as rf = 'RcvData'; of others, data = which",
-    )
+    sampling_rate_hz: Hertz | None = None
+    """samples per second along a line, in the scanner's export settings or log"""
+    vector_pitch_mm: Size | None = None
+    """distance between lines; a linear probe's element pitch, in its data sheet, where each element has \
+one line; of lines that spread: array_radius_mm and line_angles_deg"""
+    element_pitch_mm: Size | None = None
+    """distance between elements of the array, in the probe's data sheet, where the file places its lines \
+in elements"""
+    array_radius_mm: NotNegative | None = None
+    """radius of a curved array's face, in the probe's data sheet; 0: phased array"""
+    line_angles_deg: tuple[StrictFloat, StrictFloat] | None = None
+    """angles of the first and the last line of a curved or phased array, from straight down"""
+    speed_of_sound_m_s: Size | None = None
+    """assumed by the scanner; 1540 unless its manual says otherwise"""
+    centre_frequency_hz: Hertz | None = None
+    """transmit frequency, on the scanner's screen or in the probe's data sheet"""
+    bandwidth_hz: tuple[Hertz, Hertz] | None = None
+    """lowest and highest frequency of the echoes, at -6 dB in the probe's data sheet"""
+    demodulation_frequency_hz: NotNegative | None = None
+    """frequency that I/Q were shifted down by, usually the transmit frequency"""
+    first_sample_depth_mm: StrictFloat | None = None
+    """depth of a line's first sample; 0 unless the scanner records later"""
+    column_pitch_mm: Size | None = None
+    """distance between columns, from the scanner's depth ruler or --plus-config"""
+    row_spacing_mm: Size | None = None
+    """distance between rows, from the scanner's depth ruler or --plus-config"""
+    dynamic_range_db: Size | None = None
+    """decibels from black to white, beside the image on the scanner's screen"""
+    frame_rate_hz: Size | None = None
+    """frames per second, on the scanner's screen"""
+    probe: str | None = None
+    """model of the probe, printed on it, for its element pitch; or --element-pitch-mm"""
+    tracker_transform: str | None = None
+    """poses to use, by their name in the file, as ToolToTracker; none for none"""
+    reference_transform: str | None = None
+    """poses of the reference, as ReferenceToTracker; none for none"""
+    plus_config: str | None = None
+    """device set of PLUS, with the place of the image on the probe and the size of its pixels; in TOML, \
+from the folder of that file"""
+    image_to_probe: tuple[tuple[StrictFloat, ...], ...] | None = None
+    """image calibration of PLUS, pixels to mm, four rows of four numbers"""
+    arrays: dict[str, str] = {}
+    """arrays of a MATLAB file by what they are, as rf = 'RcvData'; of others, data = which"""
 
     @field_validator("demodulation_frequency_hz")
     @classmethod
