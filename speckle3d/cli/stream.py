@@ -35,7 +35,7 @@ from speckle3d.core.extras import require_extra
 if TYPE_CHECKING:
     from types import FrameType
 
-    from speckle3d.io.igtl.link import Connection, LinkState
+    from speckle3d.io.igtl.link import Connection, End
     from speckle3d.live.progress import Progress
     from speckle3d.live.session import Session
 
@@ -163,7 +163,7 @@ def live(
         session, ends = Session(connection, outlets, curves, settings, first), list[str]()
         if view:
             address, address_for_once = pages.enter_context(
-                watch(session, lambda: ends[-1] if ends else _trouble(connection.state, server))
+                watch(session, lambda: ends[-1] if ends else _trouble(connection, server))
             )
             note(address)
             webbrowser.open(address_for_once)
@@ -171,7 +171,7 @@ def live(
         totals = session.progress
         ends.append(f"the sweep has ended; reconstructing it into {out} ...")
         if not totals.frames:
-            reasons = filter(None, (totals.missing, _trouble(connection.state, server)))
+            reasons = filter(None, (totals.missing, _trouble(connection, server)))
             raise InvalidInputError(f"{server}: no images came: {'; '.join(reasons) or 'none was sent'}")
         links.close()
         note(f"{totals.frames} frames in {recording}, {totals.poses} placed as they came")
@@ -194,16 +194,16 @@ def live(
         raise session.failure
 
 
-def _trouble(state: LinkState, name: str) -> str:
+def _trouble(server: End, name: str) -> str:
     """Trouble of a server in words; empty if there is none."""
     words = []
-    if not state.peers:
-        why = f" ({state.last_failure})" if state.last_failure else ""
+    if not server.peers:
+        why = f" ({server.last_failure})" if server.last_failure else ""
         words.append(f"waiting for {name}{why}")
-    elif state.silent_s > _SILENT_S:
+    elif server.silent_s > _SILENT_S:
         words.append(f"nothing comes from {name}")
-    if state.refused:
-        words.append(f"{state.refused} messages refused ({state.last_refused})")
+    if server.refused:
+        words.append(f"{server.refused} messages refused ({server.last_refused})")
     return ", ".join(words)
 
 
@@ -217,14 +217,13 @@ def _run(session: Session, duration_s: float | None, connection: Connection, nam
 
     def show(progress: Progress) -> None:
         nonlocal last_note
-        state = connection.state
-        trouble = _trouble(state, name)
+        trouble = _trouble(connection, name)
         text = " | ".join(filter(None, (progress.line, trouble)))
         show_line(text)
         if not sys.stderr.isatty() and (words := f"{progress.words}{trouble}") != last_note:
             note(text)
             last_note = words
-        if progress.frames and not state.peers and state.silent_s > _LEFT_S:
+        if progress.frames and not connection.peers and connection.silent_s > _LEFT_S:
             note(f"{trouble}: taken for the end of the sweep")
             session.end()
 
@@ -292,7 +291,7 @@ def play(
         note(f"times in the messages are the sweep's and {shift_s:g} s")
     with Server(port) as server, s3.progress_bar(f"playing {read.name}") as progress:
         note(f"127.0.0.1:{server.port}: {len(read)} frames of {read.name}; waiting for a client")
-        while not server.state.peers:
+        while not server.peers:
             server.receive(0.02)
         count, start_s = 0, time.monotonic()
         for at_s, message, is_frame in send(shift_s):
@@ -302,6 +301,6 @@ def play(
             count += is_frame
             progress(count, len(read))
         server.drain(_LAST_S)
-        losses = server.state.dropped
+        losses = server.dropped
         slow = f", {losses} messages dropped: a client is too slow" if losses else ""
         note(f"{count} frames sent{slow}")

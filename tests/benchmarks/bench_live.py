@@ -30,7 +30,7 @@ def play(path, seconds, answers):
     send_time_s, delays, over = {}, [], threading.Event()
     with Server(0) as server:
         answers.put(server.port)
-        while not server.state.peers:
+        while not server.peers:
             time.sleep(0.005)
 
         def listen():

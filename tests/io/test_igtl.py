@@ -105,14 +105,14 @@ def test_every_message_comes_in_order_to_every_client_and_back():
         Connection("127.0.0.1", server.port) as first,
         Connection("127.0.0.1", server.port) as second,
     ):
-        until(lambda: server.state.peers == 2)
+        until(lambda: server.peers == 2)
         for message in images:
             server.send(message)
         for client in (first, second):
             messages = take(client, 50)
             assert [message.time_s for message in messages] == list(range(50))
             assert all((message.pixels == k).all() for k, message in enumerate(messages))
-            assert (client.state.refused, client.state.dropped) == (0, 0)
+            assert (client.refused, client.dropped) == (0, 0)
         assert server.drain(WAIT_S)
         first.send(packed_transform("Pose", 1.0, np.eye(4)))
         assert [message.device for message in take(server, 1)] == ["Pose"]
@@ -122,28 +122,28 @@ def test_a_peer_that_is_too_slow_is_left_out_and_costs_others_nothing():
     message = packed_image("I", 1.0, np.zeros((1000, 1000), np.uint8), np.eye(4))
     with Server(0) as server, Connection("127.0.0.1", server.port) as quick:
         with socket.create_connection(("127.0.0.1", server.port)):
-            until(lambda: server.state.peers == 2)
+            until(lambda: server.peers == 2)
             for _ in range(40):
                 server.send(message)
                 assert len(take(quick, 1)) == 1
-            assert server.state.dropped > 0
+            assert server.dropped > 0
             assert not server.drain(0.1)
-        until(lambda: server.state.peers == 1)
+        until(lambda: server.peers == 1)
 
 
 def test_a_connection_waits_for_its_server_and_reconnects():
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
     with Connection("127.0.0.1", port) as connection:
-        until(lambda: "Connect call failed" in connection.state.last_failure)
-        assert not connection.state.peers
+        until(lambda: "Connect call failed" in connection.last_failure)
+        assert not connection.peers
         for _ in range(2):
             with Server(port) as server:
-                until(lambda: connection.state.peers)
-                until(lambda: server.state.peers)
+                until(lambda: connection.peers)
+                until(lambda: server.peers)
                 server.send(LAST)
                 assert [message.device for message in take(connection, 1)] == ["Last"]
-            until(lambda: not connection.state.peers)
+            until(lambda: not connection.peers)
 
 
 def test_a_damaged_body_is_refused_alone_and_a_damaged_header_ends_the_connection(listening):
@@ -152,12 +152,11 @@ def test_a_damaged_body_is_refused_alone_and_a_damaged_header_ends_the_connectio
         peer, _ = server.accept()
         peer.sendall(LAST + IMAGE[:-1] + bytes([IMAGE[-1] ^ 1]) + LAST)
         assert len(take(connection, 2)) == 2
-        state = connection.state
-        assert (state.peers, state.refused) == (1, 1)
-        assert "check sum" in state.last_refused
+        assert (connection.peers, connection.refused) == (1, 1)
+        assert "check sum" in connection.last_refused
         peer.sendall(b"\0\1no header" + bytes(100) + LAST)
         again, _ = server.accept()
-        assert "header" in connection.state.last_failure
+        assert "header" in connection.last_failure
         again.sendall(LAST)
         assert len(take(connection, 1)) == 1
         peer.close()
@@ -172,13 +171,13 @@ def test_a_peer_that_dies_or_stalls_within_a_message_costs_that_message(listenin
         peer, _ = server.accept()
         peer.sendall(LAST)
         assert len(take(connection, 1)) == 1
-        until(lambda: connection.state.silent_s > 0.5)  # silence between messages is no stall
-        assert connection.state.peers
+        until(lambda: connection.silent_s > 0.5)  # silence between messages is no stall
+        assert connection.peers
         peer.sendall(LAST + LAST[:70])
         if dies:
             peer.close()
         again, _ = server.accept()
-        assert ("expected bytes" if dies else "0.3 s") in connection.state.last_failure
+        assert ("expected bytes" if dies else "0.3 s") in connection.last_failure
         again.sendall(LAST)
         assert len(take(connection, 2)) == 2
         peer.close()
@@ -190,7 +189,7 @@ def test_pyigtl_connects_to_our_server():
     with Server(0) as server:
         try:
             client = pyigtl.OpenIGTLinkClient("127.0.0.1", server.port)
-            until(lambda: server.state.peers)
+            until(lambda: server.peers)
             server.send(packed_image("Volume", 1.5, np.ones((3, 4, 5), np.uint8), np.eye(4)))
             assert client.wait_for_message("Volume", WAIT_S).image.shape == (5, 4, 3)
             client.send_message(pyigtl.TransformMessage(np.eye(4), 2.0, "Back"), wait=False)

@@ -9,7 +9,6 @@ import socket
 import threading
 import time
 from contextlib import suppress
-from dataclasses import dataclass, field
 from typing import Self
 
 from speckle3d.core.errors import FileError
@@ -28,9 +27,11 @@ a dozen frames of 1 MB, half a second."""
 _PIECE_BYTES = 2**20
 
 
-@dataclass
-class LinkState:
-    """Counts and last failure of the connections of an end.
+class End:
+    """One end of connections: a queue of received messages, counts, and the last failure.
+
+    A message whose body makes no sense is refused alone. Where there is no header of a message, or the peer
+    stalls within one, the connection is given up.
 
     Attributes
     ----------
@@ -40,38 +41,24 @@ class LinkState:
         Messages that made no sense; `last_refused` says why the last one did not.
     dropped : int
         Messages to a peer that it was too slow for.
-    heard_s : float
-        When the last message came.
     last_failure : str
         Why a connection was lost, or there is none.
     """
 
-    peers: int = 0
-    refused: int = 0
-    last_refused: str = ""
-    dropped: int = 0
-    heard_s: float = field(default_factory=time.monotonic)
-    last_failure: str = ""
-
-    @property
-    def silent_s(self) -> float:
-        """Time since the last message came."""
-        return time.monotonic() - self.heard_s
-
-
-class End:
-    """One end of connections: a queue of received messages, and counts.
-
-    A message whose body makes no sense is refused alone. Where there is no header of a message, or the peer
-    stalls within one, the connection is given up.
-    """
+    peers = refused = dropped = 0
+    last_refused = last_failure = ""
 
     def __init__(self) -> None:
-        self.state = LinkState()
+        self._heard_s = time.monotonic()
         self._inbox: queue.Queue[Received] = queue.Queue(_MOST_MESSAGES)
         self._writers: list[asyncio.StreamWriter] = []
         self._loop, self._over = asyncio.new_event_loop(), asyncio.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
+
+    @property
+    def silent_s(self) -> float:
+        """Time since the last message came."""
+        return time.monotonic() - self._heard_s
 
     def __enter__(self) -> Self:
         self._thread.start()
@@ -110,7 +97,7 @@ class End:
     def _write(self, message: bytes) -> None:
         for writer in self._writers:
             if writer.transport.get_write_buffer_size() > _MOST_UNSENT_BYTES:
-                self.state.dropped += 1
+                self.dropped += 1
             else:
                 writer.write(message)
 
@@ -132,14 +119,14 @@ class End:
         writer.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
         writer.transport.set_write_buffer_limits(0)  # so that `drain` waits until all is sent
         self._writers.append(writer)
-        self.state.peers += 1
+        self.peers += 1
         try:
             await self._read(reader)
         except (OSError, EOFError, MessageError) as error:
-            self.state.last_failure = str(error) or f"expected a whole message within {STALL_S:g} s"
+            self.last_failure = str(error) or f"expected a whole message within {STALL_S:g} s"
         finally:
             self._writers.remove(writer)
-            self.state.peers -= 1
+            self.peers -= 1
             writer.transport.abort()
 
     async def _read(self, reader: asyncio.StreamReader) -> None:
@@ -147,11 +134,11 @@ class End:
             async with asyncio.timeout(STALL_S):
                 start += await reader.readexactly(HEADER.size - 1)
                 body = await reader.readexactly(body_bytes(start))
-            self.state.heard_s = time.monotonic()
+            self._heard_s = time.monotonic()
             try:
                 message = decode(start, body)
             except MessageError as error:
-                self.state.refused, self.state.last_refused = self.state.refused + 1, str(error)
+                self.refused, self.last_refused = self.refused + 1, str(error)
                 continue
             if message is None:
                 continue
@@ -174,7 +161,7 @@ class Connection(End):
     >>> from speckle3d.io.igtl.messages import packed_transform
     >>> import numpy as np
     >>> with Server(0) as server, Connection("127.0.0.1", server.port) as connection:
-    ...     while not server.state.peers:
+    ...     while not server.peers:
     ...         time.sleep(0.01)
     ...     server.send(packed_transform("ProbeToTracker", 12.5, np.eye(4)))
     ...     received = connection.receive(5.0)
@@ -193,7 +180,7 @@ class Connection(End):
                     streams = await asyncio.open_connection(*self._address, limit=_PIECE_BYTES)
                 await self._talk(*streams)
             except (OSError, UnicodeError) as error:  # Unicode: a host that cannot be a name
-                self.state.last_failure = str(error)
+                self.last_failure = str(error)
             await asyncio.sleep(_PAUSE_S)
 
 
