@@ -53,7 +53,9 @@ def write_images(folder):
 def write_shapes(folder):
     from old_files import POSES
 
+    from speckle3d.core.surface import Surface
     from speckle3d.core.volume import STATE_SEGMENTS, LabelMap
+    from speckle3d.io import shapes
     from speckle3d.io.points import PickedPoints, write_points
     from speckle3d.io.tum import write_tum
     from speckle3d.io.voxels.volumes import SUFFIXES, write_volume
@@ -61,6 +63,9 @@ def write_shapes(folder):
     place = np.arange(120, dtype=np.uint8).reshape(4, 5, 6) % 3, (0.5, 0.25, 1.0), POSES[1], {"a": "b"}
     for suffix in (".seg.nrrd", *SUFFIXES):
         write_volume(folder / f"v{suffix}", LabelMap(*place, STATE_SEGMENTS))
+    for suffix in shapes.SUFFIXES:
+        surface = Surface(np.eye(4)[:, :3], np.array([[0, 1, 2], [0, 2, 3]]))
+        shapes.write_surface(folder / f"s{suffix}", surface)
     write_tum(folder / "t.tum", np.arange(4) / 10, POSES)
     write_points(folder / "p.csv", PickedPoints(np.arange(3), np.arange(6.0).reshape(3, 2)))
 
@@ -86,9 +91,10 @@ def read(path):
     from speckle3d.io.describe import describe
     from speckle3d.io.load import load_sweep
     from speckle3d.io.points import read_points
+    from speckle3d.io.shapes import SUFFIXES, read_surface
     from speckle3d.io.tum import read_tum
 
-    readers = {".tum": read_tum, ".csv": read_points}
+    readers = {".tum": read_tum, ".csv": read_points, **dict.fromkeys(SUFFIXES, read_surface)}
     readers.get(path.suffix, describe)(path)
     if path.parent.name != "shapes" and not RECORDS & {path.stem.split("_")[0]}:
         sweep = load_sweep(path)

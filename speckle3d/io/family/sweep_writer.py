@@ -14,7 +14,7 @@ from typing import Any, Literal, Self
 import h5py
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import Rotation
 
 from speckle3d.core.arrays import AnyArray, FloatArray
 from speckle3d.core.errors import FileError, InvalidInputError, Speckle3DError, naming
@@ -210,18 +210,14 @@ def _put_sensor(file: h5py.File, name: str, sensor: OrientationSensor | Tracker 
     if sensor is None:
         return
     readings, mounting, _, _ = SENSORS[name]
-    values = {
-        key: value for key, value in vars(sensor).items() if key not in ("readings", "sensor_from_image")
-    }
-    world_from_sensor = _numbers(sensor.readings.world_from_sensor)
-    put(file, name, {**values, "time_s": sensor.readings.time_s, readings: world_from_sensor})
-    if sensor.sensor_from_image is not None:
-        file[name].attrs[mounting] = _numbers(sensor.sensor_from_image)
-
-
-def _numbers(pose: Rotation | RigidTransform) -> FloatArray:
-    """Quaternions, scalar first, or matrices."""
-    return pose.as_quat(scalar_first=True) if isinstance(pose, Rotation) else pose.as_matrix()
+    values = dict(vars(sensor))
+    stream, place = values.pop("readings"), values.pop("sensor_from_image")
+    # Of rotations, `put` says that they are quaternions, scalar first.
+    poses = {readings.removesuffix("_wxyz"): stream.world_from_sensor}
+    put(file, name, {**values, "time_s": stream.time_s, **poses})
+    if place is not None:
+        numbers = place.as_quat(scalar_first=True) if isinstance(place, Rotation) else place.as_matrix()
+        file[name].attrs[mounting] = numbers
 
 
 _STREAMS: dict[str, dict[str, tuple[int, ...]]] = {

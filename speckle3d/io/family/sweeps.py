@@ -169,16 +169,13 @@ def _read_sensor(file: h5py.File, name: str) -> Any:
     if mounting in group.attrs:
         numbers = read_vector_attribute(group, mounting, math.prod(shape))
         place = check(numbers.reshape(1, *shape), f"{locate(group)} attribute {mounting}")[0]
-    offset_s, skew_rad = (read_attribute(group, key, 0.0) for key in ("time_offset_s", "image_skew_rad"))
+    stream, kind = (TimedPoses, Tracker) if name == "tracker" else (TimedRotations, OrientationSensor)
     with naming(locate(group)):
-        if name == "tracker":
-            return Tracker(TimedPoses(times_s[valid], world_from_sensor), place, offset_s, skew_rad)
         vectors = {key: _rows(group, key, count, 3)[valid] for key in INERTIAL if key in group}
         for key, rows in vectors.items():
             require_finite(rows, key)
-        return OrientationSensor(
-            TimedRotations(times_s[valid], world_from_sensor), place, offset_s, **vectors
-        )
+        samples = stream(times_s[valid], world_from_sensor)
+    return read_record(group, kind, readings=samples, sensor_from_image=place, **vectors)
 
 
 READER = Reader(
