@@ -147,7 +147,8 @@ def reading(where: PathLike, *more: type[BaseException]) -> Iterator[None]:
     except Speckle3DError:
         raise
     except (*_DAMAGE, *more) as error:
-        raise FileError(f"{where}: cannot be read: {one_line(error)}") from error
+        claim = "it claims more than memory holds: " if isinstance(error, MemoryError) else ""
+        raise FileError(f"{where}: cannot be read: {claim}{one_line(error)}") from error
 
 
 @contextmanager
@@ -262,8 +263,9 @@ def read_texts(group: h5py.Group, name: str, shape: tuple[int, ...]) -> Any:
 
 
 def _attribute(node: Node, name: str) -> Any:
-    with reading(f"{locate(node)} attribute {name}", TypeError):
+    with reading(f"{locate(node)} attribute {name}"), suppress(TypeError):  # of a type that NumPy lacks
         return node.attrs.get(name)
+    return None
 
 
 def read_attribute(node: Node, name: str, default: float | None = None) -> float:
@@ -284,9 +286,10 @@ def read_vector_attribute(node: Node, name: str, size: int) -> FloatArray:
 
 
 def read_text(node: Node, name: str, default: str | None = None) -> str:
-    """Read a text attribute; `default` stands in for what is none unless it is None."""
+    """Read a text, or the first of several; `default` stands in for what is none unless it is None."""
     raw = _attribute(node, name)
-    text = raw.decode("utf-8", errors="replace") if isinstance(raw, bytes) else raw
+    first = next(iter(np.ravel(raw)), None)
+    text = first.decode("utf-8", errors="replace") if isinstance(first, bytes) else first
     if not isinstance(text, str) and (text := default) is None:
         raise InvalidInputError(f"{locate(node)} attribute {name}: expected a text, got {raw!r:.60}")
     return str(text)

@@ -21,6 +21,7 @@ from speckle3d.core.grid import ImageGrid
 from speckle3d.core.images import USUAL_PIXEL_MM, estimate_dynamic_range
 from speckle3d.core.sweep import BModeSettings, OrientationSensor, RFSettings, Sweep, Tracker
 from speckle3d.core.text import printable
+from speckle3d.io.hdf5 import reading
 from speckle3d.io.import_settings import (
     SPEED_OF_SOUND_M_S,
     ImportSettings,
@@ -250,7 +251,8 @@ class Recording:
             rows, notes = usable("images", self.time_s, self.faults)
             times = self.time_s[rows] if rows.size >= min(2, count) else None
         if times is None or rate_hz is not None:
-            rows, notes = usable("images", np.arange(count) / (rate_hz or 1.0), self.faults)
+            with reading(f"{self.path}: {count} frames"):
+                rows, notes = usable("images", np.arange(count) / (rate_hz or 1.0), self.faults)
         return times, rows, notes
 
     @cached_property

@@ -43,6 +43,7 @@ _NAME = re.compile(
     r"(?!\.)(?:(?P<name>.*)_)?(?P<kind>rf|iq|env|imu)\.(?P<content>raw|ya?ml|tgc)(?:(?<=raw)\.lzo)?"
 )
 HEADER = struct.Struct("<5I")
+_LZOP = b"\x89LZO\0\r\n\x1a\n"
 SAMPLES = {"RF": ("<i2", 1, np.int16), "IQ": ("<i2", 2, np.complex64), "envelope": ("u1", 1, np.uint8)}
 """By kind: type of the numbers in the file, how many make a sample, and type of the samples."""
 
@@ -292,6 +293,8 @@ def _content(member: Member) -> Any:
 def _unpack(member: Member, _: int) -> bytes:
     lzo = extra_module("lzallright", "clarius", "a file packed by lzop (.lzo)").LZOCompressor
     content, parts = member.read(), list[bytes]()
+    if not content.startswith(_LZOP):
+        raise InvalidInputError(f"{member.where}: expected a file packed by lzop, got another")
     # Behind mark, versions, method and level: flags, a filter, mode, time, the name and a check sum.
     (flags,) = struct.unpack_from(">I", content, 17)
     at = 37 if flags & 0x800 else 33

@@ -12,7 +12,6 @@ import numpy as np
 from speckle3d.core.arrays import AnyArray, ComplexArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import Frames
-from speckle3d.core.text import printable
 from speckle3d.io.frames import FileFrames, HDF5Slices
 from speckle3d.io.hdf5 import has_member, locate, read_array
 from speckle3d.io.import_settings import ImportSettings
@@ -174,12 +173,6 @@ def pixel_values(place: ComplexArray, where: str, source: str) -> dict[str, Valu
         numbers["first_sample_depth_mm"] = float(z_mm[0]) - array_mm
     numbers["row_spacing_mm"] = step_of(z_mm, f"{where}, depths")
     return {name: Value(value, source) for name, value in numbers.items()}
-
-
-def text_of(value: Any) -> str:
-    """Convert a value of HDF5, or the first of several, to text."""
-    first = next(iter(np.ravel(value)), "")
-    return printable(first.decode("utf-8", "replace") if isinstance(first, bytes) else str(first)).strip("\0")
 
 
 def frame_of(*parts: AnyArray, shape: tuple[int, ...], across: bool = False, pairs: bool = False) -> AnyArray:

@@ -29,9 +29,9 @@ import numpy as np
 
 from speckle3d.core.arrays import AnyArray, FloatArray
 from speckle3d.core.errors import InvalidInputError, naming
-from speckle3d.io.formats.hdf5_values import Turn, frame_of, text_of
+from speckle3d.io.formats.hdf5_values import Turn, frame_of
 from speckle3d.io.frames import FileFrames, HDF5Slices, ReadFrame
-from speckle3d.io.hdf5 import SIGNATURE, find_member, open_hdf5, reading
+from speckle3d.io.hdf5 import SIGNATURE, find_member, open_hdf5, read_text, reading
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.readers import Reader, first_bytes
 from speckle3d.io.recordings import Facts, Recording, Value, step_of
@@ -151,7 +151,7 @@ def _numeric(node: Any) -> Any:
     if not isinstance(node, h5py.Dataset) or not node.size or "MATLAB_empty" in node.attrs:
         return None
     is_number = node.dtype.kind in "fiu" or node.dtype.names == ("real", "imag")
-    return node if is_number and text_of(node.attrs.get("MATLAB_class", "")) != "char" else None
+    return node if is_number and read_text(node, "MATLAB_class", "") != "char" else None
 
 
 def _greys(*parts: AnyArray, turn: Turn) -> AnyArray:

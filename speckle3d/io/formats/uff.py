@@ -28,7 +28,6 @@ from speckle3d.io.formats.hdf5_values import (
     grey_frames,
     pixel_values,
     single,
-    text_of,
     values_of,
 )
 from speckle3d.io.frames import FileFrames, HDF5Slices
@@ -36,6 +35,7 @@ from speckle3d.io.hdf5 import (
     find_member,
     locate,
     read_array,
+    read_text,
     require_dataset,
     require_group,
 )
@@ -57,7 +57,7 @@ def is_uff(file: h5py.File) -> bool:
 def _objects(file: h5py.File) -> dict[str, str]:
     """Classes of the root's groups, by their names."""
     nodes = {str(name): find_member(file, name) for name in file}
-    kinds = {name: text_of(node.attrs.get("class", "")) for name, node in nodes.items() if node is not None}
+    kinds = {name: read_text(node, "class", "") for name, node in nodes.items() if node is not None}
     return {name: kind for name, kind in kinds.items() if kind}
 
 
@@ -107,7 +107,7 @@ def open_uff(file: h5py.File, settings: ImportSettings) -> Facts:
 def _scan(group: h5py.Group, source: str) -> tuple[int, int, dict[str, Value]]:
     """Lines and samples of a scan, and where they lie."""
     scan, where = require_group(group, "scan"), locate(group, "scan")
-    kind = text_of(scan.attrs.get("class", ""))
+    kind = read_text(scan, "class", "")
 
     def axis(name: str) -> FloatArray:
         return read_array(scan, name, None).ravel()

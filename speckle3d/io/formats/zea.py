@@ -33,7 +33,6 @@ from speckle3d.io.formats.hdf5_values import (
     grey_frames,
     pixel_values,
     single,
-    text_of,
     values_of,
 )
 from speckle3d.io.frames import FileFrames, HDF5Slices
@@ -42,6 +41,8 @@ from speckle3d.io.hdf5 import (
     has_member,
     locate,
     read_array,
+    read_text,
+    read_texts,
     require_dataset,
 )
 from speckle3d.io.import_settings import ImportSettings
@@ -136,7 +137,7 @@ def open_zea(file: h5py.File, settings: ImportSettings) -> Facts:
         time_s=_times(file, group, scan if is_alone else "", shape[0]),
         tracker=tracker,
         chain=_POSES,
-        probe=settings.probe or text_of(file.attrs.get("probe_name", file.attrs.get("probe", ""))),
+        probe=settings.probe or read_text(file, "probe_name", read_text(file, "probe", "")),
         assumptions=() if has_places else ("parallel lines",),
         remarks=tuple(remarks),
     )
@@ -196,10 +197,10 @@ def _tracker(file: h5py.File, left_mm: float | None) -> tuple[Tracker | None, li
     """The probe's poses, with the image on the probe where the file says where its lines lie."""
     if (node := find_member(file, _POSES)) is None:
         return None, []
-    word = find_member(node, "rotation_representation")
-    kind = text_of(word[()]) if isinstance(word, h5py.Dataset) else ""
+    word = "rotation_representation"
+    kind = read_texts(node, word, ()) if has_member(node, word) else ""
     if kind not in _ROTATIONS:
-        return None, [f"{_POSES}: not read: expected a rotation_representation among {', '.join(_ROTATIONS)}"]
+        return None, [f"{_POSES}: not read: expected a {word} among {', '.join(_ROTATIONS)}"]
     is_euler, places_m = kind == "euler_xyz", read_array(node, "translation", ("pose", 3))
     rate, count = single(node, "sampling_frequency"), len(places_m)
     turns = read_array(node, "rotation", (count, 3 if is_euler else 4))

@@ -12,6 +12,7 @@ References
 
 import bz2
 import math
+import os
 import re
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -276,6 +277,8 @@ def read_header(path: PathLike) -> SequenceHeader:
         start, skip = stream.tell(), words.get("byte skip", 0)
         if file := words.get("data file"):
             data, start = data.parent / file, 0
+            if os.path.relpath(data, Path(path).parent).startswith(".."):
+                raise InvalidInputError(f"expected pixels in the header's folder or below it, got {file}")
         if lines := words.get("line skip", 0):
             with open_regular(data) as pixels:
                 pixels.seek(start)

@@ -137,6 +137,8 @@ def open_sequence(path: Path, settings: ImportSettings) -> Facts:
             is_said = f"UltrasoundImage{name}" in header.fields
             yield f"image {name.lower()}", word if is_said else f"{word} (assumed)", ""
     yield "transforms", ", ".join(names) or "none", ""
+    if header.has_images and header.encoding == "raw":  # of packed ones the number shows when unpacked
+        header.numbers()
     chosen = settings.tracker_transform, settings.reference_transform
     poses = tracked_poses(header, *chosen, device.image, device.probe, [*device.transforms])
     times, rate_hz, remarks = _times(header), settings.frame_rate_hz, list[str]()
@@ -149,8 +151,6 @@ def open_sequence(path: Path, settings: ImportSettings) -> Facts:
     if fault := _fault(header, layout, settings):
         error = InvalidInputError(f"{path}: {fault}")
         return Recording(path, settings, tracker=tracker, remarks=tuple(remarks), fault=error)
-    if header.encoding == "raw":  # of packed ones the number shows when they are unpacked
-        header.numbers()
     own, place = own_values(header.path, header.fields), _calibration(header, settings, device, layout, poses)
     chain, substitutes = "", dict[str, str]()
     if poses is not None:

@@ -214,9 +214,10 @@ def ends(name: str) -> tuple[str, str]:
 
 
 def names_of(header: SequenceHeader) -> list[str]:
-    """Names of the transforms of any frame, as ``ProbeToTracker``."""
-    names = {name for frame in header.frames.values() for name in frame if name.endswith("Transform")}
-    return sorted(name.removesuffix("Transform") for name in names)
+    """Names of the transforms of any frame, as ``ProbeToTracker``; one of a frame to itself says nothing."""
+    fields = {name for frame in header.frames.values() for name in frame if name.endswith("Transform")}
+    names = sorted(name.removesuffix("Transform") for name in fields)
+    return [name for name in names if len({*ends(name)}) > 1]
 
 
 def _joined(pair: tuple[str, str]) -> str:

@@ -104,7 +104,7 @@ def read_volume(path: PathLike) -> Volume:
         voxels, matrix, fields, is_labels = _read_nifti(Path(path))
     elif is_image(start):
         voxels, matrix, fields = _read_image(path)
-        is_labels = any(map(_SEGMENT.fullmatch, fields))
+        is_labels = voxels.dtype.kind != "f" and any(map(_SEGMENT.fullmatch, fields))
     else:
         raise InvalidInputError(
             f"{path}: expected NRRD, MetaImage or NIfTI (.nii.gz, .nii, .hdr), got something else"
