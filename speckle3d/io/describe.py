@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from speckle3d.core.arrays import FloatArray
-from speckle3d.core.errors import FileError, InvalidInputError
+from speckle3d.core.errors import Speckle3DError
 from speckle3d.core.files import PathLike
 from speckle3d.core.sweep import BModeSettings, RFSettings, Sweep
 from speckle3d.core.volume import LabelMap
@@ -47,7 +47,7 @@ def _rows(path: PathLike) -> Iterator[Row]:
     yield from facts
     try:
         sweep = recording.sweep
-    except (InvalidInputError, FileError) as error:
+    except Speckle3DError as error:
         if not facts:
             raise
         yield "sweep", f"none: {error}", ""

@@ -55,8 +55,6 @@ class FileSet:
         # A link to a folder, or the working directory as ".", stays what it is.
         place, folder = folder, folder.resolve()
         is_old = folder.is_dir()
-        if folder.exists() and not is_old:
-            raise FileError(f"{place}: expected a folder or a new name, got a file")
         for name in self.names if is_old else ():
             require_target(folder / name)
         base, name = (folder, self.primary) if is_old else (folder.parent, folder.name)
@@ -72,10 +70,6 @@ class FileSet:
                         os.rename(part, folder)
                 finally:
                     shutil.rmtree(part, ignore_errors=True)
-        except BlockingIOError as error:
-            raise FileError(
-                f"{place}: expected a place that no other run is at work in, got one that is taken"
-            ) from error
         except Speckle3DError as error:
             raise type(error)(str(error).replace(str(part), str(place))) from error
         except OSError as error:
@@ -95,7 +89,7 @@ def _lock(folder: Path) -> Iterator[None]:
 
     Raises
     ------
-    BlockingIOError
+    FileError
         If another process holds it.
     """
     folder.mkdir(exist_ok=True)
@@ -104,9 +98,11 @@ def _lock(folder: Path) -> Iterator[None]:
         if fcntl is not None:
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError as error:
-                if isinstance(error, BlockingIOError):
-                    raise  # else a file system without locks
+            except BlockingIOError as error:
+                words = "expected a place that no other run is at work in, got one that is taken"
+                raise FileError(f"{folder}: {words}") from error
+            except OSError:
+                pass  # a file system without locks
         for left in folder.iterdir():  # of a killed run
             shutil.rmtree(left) if left.is_dir() else left.unlink()
         yield

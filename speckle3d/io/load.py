@@ -7,7 +7,7 @@ from pathlib import Path
 
 import h5py
 
-from speckle3d.core.errors import FileError, InvalidInputError, naming
+from speckle3d.core.errors import InvalidInputError, Speckle3DError, naming
 from speckle3d.core.files import PathLike
 from speckle3d.core.reconstruction import ImportRecord
 from speckle3d.core.sweep import Sweep
@@ -92,11 +92,11 @@ def open_recording(path: PathLike, settings: ImportSettings | None = None) -> Re
                 while isinstance(result, Generator):
                     rows.append(next(result))
             except StopIteration as end:
-                result = replace(end.value, rows=tuple(rows))
-            except (InvalidInputError, FileError) as error:
+                result = replace(end.value, rows=rows)
+            except Speckle3DError as error:
                 if not rows:
                     raise
-                result = Recording(place, settings, fault=error, rows=tuple(rows))
+                result = Recording(place, settings, fault=error, rows=rows)
     return result if isinstance(result, Recording) else Recording(place, settings, ready=result)
 
 

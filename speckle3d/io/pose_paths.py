@@ -11,7 +11,7 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.geometry import nearest_rotation
 from speckle3d.core.streams import TimedPoses
-from speckle3d.core.sweep import Sweep
+from speckle3d.core.sweep import Sweep, Tracker
 
 ROUNDING_TOLERANCE = 1e-3
 """How far a rotation's numbers may be from the nearest rotation's before it is made rigid. An electromagnetic
@@ -84,13 +84,15 @@ def usable(noun: str, time_s: FloatArray, faults: Sequence[str] | None = None) -
     return rows, _loss(noun, time_s.size, Counter(filter(None, reasons)), time_s[rows])
 
 
-def timed_poses(time_s: FloatArray, matrices: FloatArray) -> tuple[TimedPoses | None, list[str]]:
-    """Usable poses among matrices, shape (n, 4, 4), in mm, NaN where there is none; and a line of the others.
+def tracker_of(
+    time_s: FloatArray, matrices: FloatArray, mounting: RigidTransform | None = None
+) -> tuple[Tracker | None, list[str]]:
+    """Tracker of usable poses, shape (n, 4, 4), mm, NaN where there is none; and a line of the others.
 
     Rotations that are rounded are made exact.
     """
     is_near = (np.abs(matrices) < _FARTHEST_MM).all(axis=(1, 2))
-    exact = np.tile(np.eye(4), (len(matrices), 1, 1))
+    exact = RigidTransform.identity(len(matrices)).as_matrix()
     exact[is_near, :3, 3] = matrices[is_near, :3, 3]
     exact[is_near, :3, :3] = nearest_rotation(matrices[is_near, :3, :3])
     is_rigid = (np.abs(exact - matrices) < ROUNDING_TOLERANCE).all(axis=(1, 2))
@@ -101,7 +103,8 @@ def timed_poses(time_s: FloatArray, matrices: FloatArray) -> tuple[TimedPoses | 
     rows, notes = usable("poses", time_s, faults.tolist())
     if not rows.size:
         return None, notes
-    return TimedPoses(time_s[rows], RigidTransform.from_matrix(exact[rows])), notes
+    poses = TimedPoses(time_s[rows], RigidTransform.from_matrix(exact[rows]))
+    return Tracker(poses, mounting), notes
 
 
 def _loss(noun: str, total: int, reasons: Mapping[str, int], time_s: FloatArray) -> list[str]:

@@ -16,7 +16,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from speckle3d.core.arrays import FloatArray, IntArray
-from speckle3d.core.errors import FileError, InvalidInputError, naming
+from speckle3d.core.errors import InvalidInputError, Speckle3DError, naming
 from speckle3d.core.grid import ImageGrid
 from speckle3d.core.images import USUAL_PIXEL_MM, estimate_dynamic_range
 from speckle3d.core.sweep import BModeSettings, OrientationSensor, RFSettings, Sweep, Tracker
@@ -44,15 +44,8 @@ CONTRADICTION = 0.01
 _SPREADING = ("array_radius_mm", "line_angles_deg")
 """What places lines that are not parallel."""
 _RATES = ("sampling_rate_hz", "centre_frequency_hz", "bandwidth_hz")
-_UNITS = {
-    "hz": (1e6, "MHz"),
-    "frame": (1.0, "Hz"),
-    "mm": (1.0, "mm"),
-    "db": (1.0, "dB"),
-    "deg": (1.0, "deg"),
-    "s": (1.0, "m/s"),
-}
-"""What numbers are divided by where they are shown, and the unit then."""
+_UNITS = {"hz": "MHz", "frame": "Hz", "mm": "mm", "db": "dB", "deg": "deg", "s": "m/s"}
+"""Of numbers as they are shown."""
 _ASSUMPTION = "assumed"
 
 
@@ -103,13 +96,13 @@ class Recording:
         Transforms that the tracker's poses were made of.
     substitutes : mapping of str to str
         Settings to ask for in place of others, as the probe's model for a distance.
-    assumptions : tuple of str
+    assumptions : sequence of str
         What no file says and is taken for granted.
-    rows : tuple of Row
+    rows : sequence of Row
         Facts of the file that are no numbers of a sweep.
-    remarks : tuple of str
+    remarks : sequence of str
         What is to be told when the recording is used: rows left out, contradictions of its own.
-    fault : InvalidInputError or FileError, optional
+    fault : Speckle3DError, optional
         Why there is no sweep in it.
     ready : Sweep, optional
         The sweep itself, of formats that say all.
@@ -128,10 +121,10 @@ class Recording:
     name: str = ""
     full_scale: float = 255.0
     substitutes: Mapping[str, str] = field(default_factory=dict)
-    assumptions: tuple[str, ...] = ()
-    rows: tuple[Row, ...] = ()
-    remarks: tuple[str, ...] = ()
-    fault: InvalidInputError | FileError | None = None
+    assumptions: Sequence[str] = ()
+    rows: Sequence[Row] = ()
+    remarks: Sequence[str] = ()
+    fault: Speckle3DError | None = None
     ready: Sweep | None = None
 
     @property
@@ -173,7 +166,7 @@ class Recording:
     def _oddities(self) -> list[str]:
         """Notes on oddities of frames, file and path."""
         remarks = [*self._frame_times[2], *self.remarks]
-        with suppress(InvalidInputError, FileError):  # which is told by who asks for the sweep
+        with suppress(Speckle3DError):  # which is told by who asks for the sweep
             remarks += self._sweep_and_notes[1]
         return remarks
 
@@ -219,7 +212,7 @@ class Recording:
     @cached_property
     def _options(self) -> dict[str, Any]:
         """Settings that are given."""
-        return {name: value for name, value in self.settings if value is not None}
+        return self.settings.model_dump(exclude_none=True)
 
     @cached_property
     def _file_values(self) -> defaultdict[str, Value]:
@@ -358,9 +351,9 @@ def step_of(axis: FloatArray, where: str) -> float:
 def number_row(name: str, value: Any) -> Row:
     """A number, or a low and a high one, by the name of its setting, in words and the unit that is shown."""
     *words, unit = name.split("_")
-    scale, scale_unit = _UNITS[unit if words[0] != "frame" else "frame"]
-    numbers = " to ".join(f"{number / scale:.7g}" for number in np.ravel(value))
-    return " ".join(words[:-1] if unit == "s" else words), numbers, scale_unit
+    text = _UNITS[unit if words[0] != "frame" else "frame"]
+    numbers = " to ".join(f"{number / 1e6 if text == 'MHz' else number:.7g}" for number in np.ravel(value))
+    return " ".join(words[:-1] if unit == "s" else words), numbers, text
 
 
 _BOUNDS = {

@@ -30,7 +30,7 @@ import numpy as np
 from scipy.integrate import cumulative_trapezoid
 
 from speckle3d.core.arrays import FloatArray
-from speckle3d.core.errors import FileError, InvalidInputError
+from speckle3d.core.errors import InvalidInputError, Speckle3DError
 from speckle3d.io.clarius.imu import SensorSamples, read_samples
 from speckle3d.io.clarius.package import SAMPLES, Description, find_files, is_package, open_frames, open_raw
 from speckle3d.io.clarius.spectrum import band_hz
@@ -67,7 +67,7 @@ def open_package(path: Path, settings: ImportSettings) -> Facts:
             sensor = read_samples(sidecars["imu"])
             yield from sensor.rows
             remarks += sensor.remarks
-        except (InvalidInputError, FileError) as error:
+        except Speckle3DError as error:
             remarks.append(f"the sensor is left out: {error}")
     ymls = {kind: Description.of(file) for kind, file in sidecars.items() if kind != "imu"}
     for kind, yml in ymls.items():
@@ -93,7 +93,8 @@ def open_package(path: Path, settings: ImportSettings) -> Facts:
     rate_hz = settings.sampling_rate_hz or yml_rate_hz
     speed_m_s = yml.number("vsound") or yml.number("speed of sound")
     spacing_mm = 1e3 * (settings.speed_of_sound_m_s or speed_m_s or SPEED_OF_SOUND_M_S) / (2.0 * rate_hz)
-    first, model = Value(), _model(settings.probe or yml.model)
+    probe = settings.probe or yml.model
+    first, model = Value(), re.sub(r"[^A-Z0-9]", "", probe.upper()).removeprefix("CLARIUS")
     if (delay := yml.number("delay samples")) is not None:
         first = Value(
             (delay - BEFORE_DEPTH_S * rate_hz) * spacing_mm,
@@ -147,13 +148,13 @@ def open_package(path: Path, settings: ImportSettings) -> Facts:
         time_s=records["time"] / 1e9,
         orientation=None if sensor is None else sensor.orientation,
         # In one spelling, so that curves and calibrations of a probe are found to be of it.
-        probe=f"Clarius {model}" if model in ELEMENT_PITCH_MM else settings.probe or yml.model,
+        probe=f"Clarius {model}" if model in ELEMENT_PITCH_MM else probe,
         name=name or path.stem,
         substitutes=dict.fromkeys(
             ("vector_pitch_mm", "column_pitch_mm"), "element_pitch_mm" if model else "probe"
         ),
         assumptions=() if "array_radius_mm" in values else ("parallel lines of a linear array",),
-        remarks=tuple(remarks),
+        remarks=remarks,
     )
 
 
@@ -232,10 +233,6 @@ def _line_values(
         degrees = np.rad2deg(ends * pitch.value / per_line / radius_mm)
         values["line_angles_deg"] = Value(tuple(degrees.tolist()), f"of lines {pitch.source}")
     return values
-
-
-def _model(probe: str) -> str:
-    return re.sub(r"[^A-Z0-9]", "", probe.upper()).removeprefix("CLARIUS")
 
 
 READER = Reader(FORMAT, is_package, open_package, companions=package_files)

@@ -26,7 +26,6 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.geometry import transforms_from_matrices
-from speckle3d.core.sweep import Tracker
 from speckle3d.io.frames import FileFrames, HDF5Slices
 from speckle3d.io.hdf5 import (
     PathLike,
@@ -38,7 +37,7 @@ from speckle3d.io.hdf5 import (
     require_dataset,
 )
 from speckle3d.io.import_settings import ImportSettings
-from speckle3d.io.pose_paths import timed_poses
+from speckle3d.io.pose_paths import tracker_of
 from speckle3d.io.readers import Reader
 from speckle3d.io.recordings import Recording, Value
 from speckle3d.io.text import numbers, text_lines
@@ -95,9 +94,9 @@ def open_scan(file: h5py.File, _: ImportSettings) -> Recording:
     with open_hdf5(_transforms_file(scan) or scan) as transforms:
         if has_member(transforms, "tforms"):
             matrices = read_array(transforms, "tforms", ("pose", 4, 4))
-            readings, remarks = timed_poses(np.arange(len(matrices)) / FRAME_RATE_HZ, matrices)
+            times_s = np.arange(len(matrices)) / FRAME_RATE_HZ
+            tracker, remarks = tracker_of(times_s, matrices, tool_from_image)
             remarks += [] if len(matrices) == n else [f"tforms: {len(matrices)} poses for {n} frames"]
-            tracker = None if readings is None else Tracker(readings, tool_from_image)
     values = {
         "column_pitch_mm": Value(float(size_mm[0]), _CALIBRATION),
         "row_spacing_mm": Value(float(size_mm[1]), _CALIBRATION),
@@ -112,7 +111,7 @@ def open_scan(file: h5py.File, _: ImportSettings) -> Recording:
         tracker=tracker,
         chain="tforms",
         rows=(("landmarks", "none" if _landmark_file(scan) is None else "yes", ""),),
-        remarks=tuple(remarks),
+        remarks=remarks,
     )
 
 

@@ -25,10 +25,6 @@ from speckle3d.io.recordings import Facts, Recording, Value
 
 FORMAT = "Ultrasonix"
 
-_NAMES = (
-    "kind", "frames", "width", "height", "bits", *map(str, range(8)), "probe", "transmit_hz", "sampling_hz",
-    "rate_hz", "lines", "extra",
-)  # fmt: skip
 _HEADER = struct.Struct("<19i")
 _READ = {2: ("B-mode before scan conversion (.bpr)", 8), 4: ("B-mode (.b8)", 8), 16: ("RF (.rf)", 16)}
 """Name and bits of the types that are read; all are powers of two."""
@@ -42,21 +38,18 @@ def _open_frames(path: Path, record: np.dtype[Any], count: int, is_image: bool) 
     return lambda i: pixels[i].T if is_image else pixels[i]
 
 
-def _header(start: bytes) -> dict[str, int]:
-    return dict(zip(_NAMES, _HEADER.unpack_from(start), strict=True))
-
-
-def _tag_bytes(header: dict[str, int], size: int) -> int | None:
+def _tag_bytes(size: int, frames: int, width: int, height: int, bits: int) -> int | None:
     """Bytes of the number before each frame, by the file's size: 4 or none; None if it is neither's."""
-    frames, frame_bytes = header["frames"], header["width"] * header["height"] * header["bits"] // 8
-    sizes = {_HEADER.size + frames * (frame_bytes + tag): tag for tag in (0, 4)}
+    sizes = {_HEADER.size + frames * (width * height * bits // 8 + tag): tag for tag in (0, 4)}
     return sizes.get(size) if frames > 0 else None
 
 
 def _claims(path: Path, start: bytes) -> bool:
-    if len(start) < _HEADER.size or (header := _header(start))["kind"].bit_count() != 1:
+    if len(start) < _HEADER.size:
         return False
-    return _tag_bytes(header, path.stat().st_size) is not None or path.suffix.lower() in _SUFFIXES
+    kind, *sizes = _HEADER.unpack_from(start)[:5]
+    is_whole = _tag_bytes(path.stat().st_size, *sizes) is not None
+    return kind.bit_count() == 1 and (is_whole or path.suffix.lower() in _SUFFIXES)
 
 
 def open_ultrasonix(path: Path, settings: ImportSettings) -> Facts:
@@ -64,29 +57,30 @@ def open_ultrasonix(path: Path, settings: ImportSettings) -> Facts:
 
     The header has no line pitch and no band; of B-mode no pixel size and no dynamic range.
     """
-    header, size = _header(first_bytes(path)), path.stat().st_size
-    name, bits = _READ.get(header["kind"], (f"type {header['kind']}", 0))
+    header = _HEADER.unpack_from(first_bytes(path))
+    kind, count, width, height, bits = header[:5]
+    probe, transmit_hz, sampling_hz, rate_hz, lines, _ = header[13:]
+    name, expected_bits = _READ.get(kind, (f"type {kind}", 0))
     yield "recorded", name, ""
-    yield "probe's number", str(header["probe"]), ""
-    yield "line density", str(header["lines"]), "lines"
+    yield "probe's number", str(probe), ""
+    yield "line density", str(lines), "lines"
     values = {
-        "sampling_rate_hz": Value(header["sampling_hz"] or None, "in the header"),
-        "centre_frequency_hz": Value(header["transmit_hz"] or None, "in the header: transmitted"),
-        "frame_rate_hz": Value(header["rate_hz"] or None, "in the header"),
+        "sampling_rate_hz": Value(sampling_hz or None, "in the header"),
+        "centre_frequency_hz": Value(transmit_hz or None, "in the header: transmitted"),
+        "frame_rate_hz": Value(rate_hz or None, "in the header"),
     }
-    count, width, height = header["frames"], header["width"], header["height"]
-    if header["bits"] != bits or not count:
+    if bits != expected_bits or min(count, width, height) < 1:
         raise InvalidInputError(
-            f"expected frames of RF, of 16 bits, or B-mode, of 8, got {count} of {name}, of "
-            f"{header['bits']} bits"
+            f"expected frames of RF, of 16 bits, or B-mode, of 8, got {count} of {name}, {width} x {height} "
+            f"of {bits} bits"
         )
-    if (tag := _tag_bytes(header, size)) is None:
+    size = path.stat().st_size
+    if (tag := _tag_bytes(size, count, width, height, bits)) is None:
         whole = 8 * (size - _HEADER.size) // (width * height * bits)
         raise FileError(f"{path}: ends early, or is longer than its frames: {whole} of {count} frames")
-    is_image, dtype = header["kind"] == _BMODE, np.dtype("<i2" if bits == 16 else "u1")
-    record = np.dtype(
-        [("tag", f"V{tag}"), ("pixels", dtype, (height, width) if is_image else (width, height))]
-    )
+    is_image, dtype = kind == _BMODE, np.dtype("<i2" if bits == 16 else "u1")
+    shape = (height, width) if is_image else (width, height)
+    record = np.dtype([("tag", f"V{tag}"), ("pixels", dtype, shape)])
     source = partial(_open_frames, path, record, count, is_image)
     frames = FileFrames(path, source, (count, width, height), dtype.newbyteorder("="))
     return Recording(path, settings, frames, values, assumptions=() if is_image else ("parallel lines",))

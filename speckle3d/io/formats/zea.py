@@ -24,7 +24,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import FloatArray
-from speckle3d.core.errors import FileError, InvalidInputError
+from speckle3d.core.errors import InvalidInputError, Speckle3DError
 from speckle3d.core.sweep import Tracker
 from speckle3d.io.formats.hdf5_values import (
     TOLERANCE_MM,
@@ -46,7 +46,7 @@ from speckle3d.io.hdf5 import (
     require_dataset,
 )
 from speckle3d.io.import_settings import ImportSettings
-from speckle3d.io.pose_paths import timed_poses
+from speckle3d.io.pose_paths import tracker_of
 from speckle3d.io.readers import Reader
 from speckle3d.io.recordings import Facts, Recording, Value
 
@@ -127,7 +127,7 @@ def open_zea(file: h5py.File, settings: ImportSettings) -> Facts:
         values["demodulation_frequency_hz"] = by_phase(frames, shift_hz, stated, values, settings)
     try:
         tracker, remarks = _tracker(file, left_mm)
-    except (InvalidInputError, FileError) as error:
+    except Speckle3DError as error:
         tracker, remarks = None, [f"the tracker is left out: {error}"]
     return Recording(
         path,
@@ -139,7 +139,7 @@ def open_zea(file: h5py.File, settings: ImportSettings) -> Facts:
         chain=_POSES,
         probe=settings.probe or read_text(file, "probe_name", read_text(file, "probe", "")),
         assumptions=() if has_places else ("parallel lines",),
-        remarks=tuple(remarks),
+        remarks=remarks,
     )
 
 
@@ -210,17 +210,16 @@ def _tracker(file: h5py.File, left_mm: float | None) -> tuple[Tracker | None, li
     else:
         turns[~turns.any(axis=1)] = np.nan
         rotations = Rotation.from_quat(turns, scalar_first=kind == "quaternion_wxyz")
-    matrices = np.tile(np.eye(4), (count, 1, 1))
+    matrices = RigidTransform.identity(count).as_matrix()
     matrices[:, :3, :3], matrices[:, :3, 3] = rotations.as_matrix(), 1e3 * places_m
-    readings, notes = timed_poses(stamps + (single(node, "start_time_offset") or 0.0), matrices)
-    if readings is None:
-        return None, notes
-    if is_euler:
-        notes.append(f"{_POSES}: euler_xyz is taken for radians about fixed axes x, y, z: zea does not say")
     mounting = None
     if left_mm is not None:
         mounting = RigidTransform.from_components([left_mm, 0.0, 0.0], Rotation.from_matrix(_TIP_FROM_IMAGE))
-    return Tracker(readings, mounting), notes
+    stamps += single(node, "start_time_offset") or 0.0
+    tracker, notes = tracker_of(stamps, matrices, mounting)
+    if is_euler:
+        notes.append(f"{_POSES}: euler_xyz is taken for radians about fixed axes x, y, z: zea does not say")
+    return tracker, notes
 
 
 READER = Reader(FORMAT, None, open_zea, claims_hdf5=is_zea)

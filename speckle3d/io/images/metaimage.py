@@ -18,7 +18,7 @@ import numpy as np
 from speckle3d.core.arrays import AnyArray, FloatArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.streams import TimedRotations
-from speckle3d.core.sweep import OrientationSensor, Tracker
+from speckle3d.core.sweep import OrientationSensor
 from speckle3d.io.frames import FileFrames, ReadFrame
 from speckle3d.io.images.headers import SequenceHeader, is_image, read_header
 from speckle3d.io.import_settings import ImportSettings
@@ -35,7 +35,7 @@ from speckle3d.io.plus.transforms import (
     tracked_poses,
 )
 from speckle3d.io.plus.write import own_values
-from speckle3d.io.pose_paths import timed_poses
+from speckle3d.io.pose_paths import tracker_of
 from speckle3d.io.readers import Reader
 from speckle3d.io.recordings import Facts, Recording, Value, differs
 
@@ -144,13 +144,12 @@ def open_sequence(path: Path, settings: ImportSettings) -> Facts:
     times, rate_hz, remarks = _times(header), settings.frame_rate_hz, list[str]()
     clock, tracker = times if rate_hz is None else np.arange(header.frame_count) / rate_hz, None
     if poses is not None and clock is not None:
-        readings, remarks = timed_poses(clock, poses.matrices)
-        tracker = None if readings is None else Tracker(readings)
+        tracker, remarks = tracker_of(clock, poses.matrices)
     elif poses is None and names and settings.tracker_transform is None:
         remarks.append(f"no tracker: of {', '.join(names)}, name the sensor's with --transform")
     if fault := _fault(header, layout, settings):
         error = InvalidInputError(f"{path}: {fault}")
-        return Recording(path, settings, tracker=tracker, remarks=tuple(remarks), fault=error)
+        return Recording(path, settings, tracker=tracker, remarks=remarks, fault=error)
     own, place = own_values(header.path, header.fields), _calibration(header, settings, device, layout, poses)
     chain, substitutes = "", dict[str, str]()
     if poses is not None:
@@ -199,7 +198,7 @@ def open_sequence(path: Path, settings: ImportSettings) -> Facts:
         full_scale=own.get("full_scale", 255.0),
         substitutes=substitutes,
         assumptions=("parallel lines",) if layout.is_rf and not own else (),
-        remarks=tuple(remarks),
+        remarks=remarks,
     )
 
 
@@ -271,11 +270,12 @@ def _orientation(header: SequenceHeader, clock: FloatArray | None) -> Orientatio
     poses = tracked_poses(header, name, "none") if name in names_of(header) else None
     if poses is None or clock is None:
         return None
-    if (readings := timed_poses(clock, poses.matrices)[0]) is None:
+    if (tracker := tracker_of(clock, poses.matrices)[0]) is None:
         return None
     matrix = fixed_transform(header, f"{IMAGE}To{ORIENTATION}")
     mounting = None if matrix is None else sensor_from_image(matrix, 0.0, header.path)[0].rotation
-    return OrientationSensor(TimedRotations(readings.time_s, readings.world_from_sensor.rotation), mounting)
+    time_s, turns = tracker.readings.time_s, tracker.readings.world_from_sensor.rotation
+    return OrientationSensor(TimedRotations(time_s, turns), mounting)
 
 
 def _frames(header: SequenceHeader, layout: Layout) -> FileFrames:

@@ -12,6 +12,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import AnyArray, BoolArray, FloatArray
 from speckle3d.core.errors import InvalidInputError
@@ -181,7 +182,7 @@ def _add_sensors(fields: dict[str, str], sweep: Sweep) -> Iterator[str]:
         if (sensor := getattr(sweep, name)) is None:
             continue
         at = times - sensor.time_offset_s
-        reach, matrices = sensor.readings.covers(at), np.tile(np.eye(4), (count, 1, 1))
+        reach, matrices = sensor.readings.covers(at), RigidTransform.identity(count).as_matrix()
         if reach.any():
             matrices[reach] = rigid(sensor.readings.at(at[reach])).as_matrix()
         fields |= _transform(f"{tool}To{world}", matrices, reach)

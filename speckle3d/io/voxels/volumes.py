@@ -12,7 +12,7 @@ References
 import json
 import re
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -40,8 +40,13 @@ _RAS_FROM_LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
 """World of NIfTI from that of the other formats."""
 _LABELS, _COMMENT = "label", "speckle3d"
 """NIfTI's intent of an image of labels, and the name of fields in its comment."""
-_REPRESENTATION = "Binary labelmap"
-"""Of labels, as Slicer calls them [3]_."""
+_SEGMENTATION = """\
+Segmentation_ContainedRepresentationNames=Binary labelmap|
+Segmentation_MasterRepresentation=Binary labelmap
+Segmentation_SourceRepresentation=Binary labelmap
+Segmentation_ReferenceImageExtentOffset=0 0 0
+"""
+"""Fields of labels as Slicer calls them [3]_; before its version 5.2 the source was called master."""
 _SIZES = {size.to_bytes(4, order) for size in (348, 540) for order in ("little", "big")}
 """First bytes of NIfTI-1 and NIfTI-2: the length of the header."""
 _SEGMENT = re.compile(r"Segment(?:ation|(\d{1,5}))_(\w+)")
@@ -99,16 +104,12 @@ def read_volume(path: PathLike) -> Volume:
     InvalidInputError
         If it is not a grey three-dimensional image.
     """
-    start = first_bytes(path)
-    if _is_nifti(Path(path), start):
-        voxels, matrix, fields, is_labels = _read_nifti(Path(path))
-    elif is_image(start):
-        voxels, matrix, fields = _read_image(path)
-        is_labels = voxels.dtype.kind != "f" and any(map(_SEGMENT.fullmatch, fields))
-    else:
+    start, file = first_bytes(path), Path(path)
+    if not (is_image(start) or _is_nifti(file, start)):
         raise InvalidInputError(
             f"{path}: expected NRRD, MetaImage or NIfTI (.nii.gz, .nii, .hdr), got something else"
         )
+    voxels, matrix, fields, is_labels = (_read_image if is_image(start) else _read_nifti)(file)
     if voxels.ndim != 3 or not voxels.size or voxels.dtype.kind not in "iuf":
         raise InvalidInputError(
             f"{path}: expected a grey image of three axes, got shape {voxels.shape} of {voxels.dtype}"
@@ -211,8 +212,8 @@ def _is_nifti(path: Path, start: bytes) -> bool:
     return start[:4] in _SIZES or (start.startswith(b"\x1f\x8b") and path.name.lower().endswith(".nii.gz"))
 
 
-def _read_image(path: PathLike) -> tuple[AnyArray, FloatArray, dict[str, str]]:
-    """Voxels of a MetaImage or NRRD image, their LPS world from index in mm, and fields."""
+def _read_image(path: Path) -> tuple[AnyArray, FloatArray, dict[str, str], bool]:
+    """Voxels of a MetaImage or NRRD image, their LPS world from index in mm, fields, and if labels."""
     header, matrix = read_header(path), np.eye(4)
     axes = np.eye(3) if header.axes_mm is None else header.axes_mm
     origin = np.zeros(3) if header.origin_mm is None else header.origin_mm
@@ -226,11 +227,12 @@ def _read_image(path: PathLike) -> tuple[AnyArray, FloatArray, dict[str, str]]:
     shape = (*header.size[::-1], *[header.channels] * (header.channels > 1))
     names = [name for name in header.fields if name.startswith(_PREFIX) or _SEGMENT.fullmatch(name)]
     fields = {name.removeprefix(_PREFIX): unescape(header.fields[name]) for name in names}
-    return np.array(header.numbers()).reshape(shape).T, matrix, fields
+    is_labels = header.dtype.kind != "f" and any(map(_SEGMENT.fullmatch, fields))
+    return np.array(header.numbers()).reshape(shape).T, matrix, fields, is_labels
 
 
 def _read_nifti(path: Path) -> tuple[AnyArray, FloatArray, dict[str, str], bool]:
-    """Voxels of NIfTI-1 or NIfTI-2, their LPS world from index in mm, this package's fields, if labels.
+    """Voxels of NIfTI-1 or NIfTI-2, their LPS world from index in mm, this package's fields, and if labels.
 
     The header's unit counts; a header without one means mm.
     """
@@ -292,29 +294,20 @@ def write_volume(path: PathLike, volume: Volume, compress: bool = True) -> None:
         write_image(part, volume.voxels.T, volume.shape, volume.voxels.dtype, axes, fields, compress)
 
 
-def _segment_fields(segments: Iterable[Segment], shape: Sequence[int]) -> dict[str, str]:
+def _segment_fields(segments: Sequence[Segment], shape: Sequence[int]) -> dict[str, str]:
     """Header fields of a label map and its segments, all in one layer of the whole grid."""
-    extent = " ".join(f"0 {length - 1}" for length in shape)
-    fields = {
-        "Segmentation_ContainedRepresentationNames": f"{_REPRESENTATION}|",
-        # Before Slicer 5.2 the same was called master.
-        "Segmentation_MasterRepresentation": _REPRESENTATION,
-        "Segmentation_SourceRepresentation": _REPRESENTATION,
-        "Segmentation_ReferenceImageExtentOffset": "0 0 0",
-    }
+    extent, text = " ".join(f"0 {length - 1}" for length in shape), _SEGMENTATION
     for i, segment in enumerate(segments):
-        row = {
-            "ID": f"Segment_{segment.value}",
-            "Name": segment.name,
-            "NameAutoGenerated": "0",
-            "Color": " ".join(f"{part:g}" for part in segment.colour),
-            "ColorAutoGenerated": "0",
-            "Extent": extent,
-            "LabelValue": str(segment.value),
-            "Layer": "0",
-        }
-        fields |= {f"Segment{i}_{name}": value for name, value in row.items()}
-    return fields
+        text += f"""Segment{i}_ID=Segment_{segment.value}
+Segment{i}_NameAutoGenerated=0
+Segment{i}_Color={number_text(segment.colour)}
+Segment{i}_ColorAutoGenerated=0
+Segment{i}_Extent={extent}
+Segment{i}_LabelValue={segment.value}
+Segment{i}_Layer=0
+"""
+    names = {f"Segment{i}_Name": segment.name for i, segment in enumerate(segments)}
+    return names | dict(line.split("=") for line in text.splitlines())
 
 
 def _write_nifti(path: Path, volume: Volume, fields: Mapping[str, str], is_labels: bool) -> None:
