@@ -8,8 +8,8 @@ import scipy.io
 from scipy.spatial.transform import Rotation
 
 from xsens.fusion.orient import orient
+from xsens.logs.assembly import WORLDS
 from xsens.logs.samples import ImuLog
-from xsens.logs.worlds import nwu_from
 
 vqf = pytest.importorskip("vqf")
 ONLINE = ("VQF on-line", "filter")
@@ -58,7 +58,7 @@ def by_vqf(log, method):
 
 def east_first(rotations):
     """In the world of BROAD and VQF, x east, instead of this package's; quaternions, scalar first."""
-    return (nwu_from("ENU").inv() * rotations).as_quat(scalar_first=True)
+    return (WORLDS["ENU"].inv() * rotations).as_quat(scalar_first=True)
 
 
 class Errors(NamedTuple):

@@ -7,7 +7,7 @@ import numpy as np
 
 from xsens.messages.control import MessageId
 from xsens.messages.framing import Message
-from xsens.messages.mtdata import kind_of
+from xsens.messages.mtdata import KINDS
 
 
 def bytes_from_numbers(values, form):
@@ -52,7 +52,7 @@ def items_payload(items):
 def _item(item):
     data = item.values
     if not isinstance(data, bytes):
-        whole = kind_of(item.identifier).whole
+        whole = KINDS[item.identifier].whole
         form = item.identifier & 3
         data = np.array(data).astype(whole).tobytes() if whole else bytes_from_numbers([data], form).tobytes()
     return struct.pack(">HB", item.identifier, len(data)) + data

@@ -18,7 +18,7 @@ from speckle3d.io.plus.write import write_sequence
 from speckle3d.io.voxels.volumes import write_volume
 from speckle3d.study.results import write_texts
 from xsens.live.recording import RawFile
-from xsens.logs.read import parse_stream
+from xsens.logs.datamessages import parse_stream
 from xsens.logs.textlogs import write_csv
 
 FULL = "File too large"

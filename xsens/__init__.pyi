@@ -1,5 +1,4 @@
 # The public names: read by type checkers, and by lazy_loader when the package is imported.
-from .accuracy.angles import AccuracyTable as AccuracyTable
 from .accuracy.angles import PairErrors as PairErrors
 from .accuracy.angles import common_readings as common_readings
 from .accuracy.angles import mounting_from_motion as mounting_from_motion
@@ -10,17 +9,16 @@ from .accuracy.mechanism import read_mechanism_csv as read_mechanism_csv
 from .accuracy.mechanism import readings_at as readings_at
 from .fusion.online import OnlineFilter as OnlineFilter
 from .fusion.online import OnlineState as OnlineState
+from .fusion.orient import Method as Method
 from .fusion.orient import Orientation as Orientation
 from .fusion.orient import orient as orient
-from .fusion.settings import FusionSettings as FusionSettings
-from .fusion.settings import Method as Method
 from .live.device import DeviceError as DeviceError
 from .live.device import DeviceSettings as DeviceSettings
 from .live.monitor import LiveState as LiveState
 from .live.recording import Recorder as Recorder
 from .live.recording import record as record
-from .logs.parts import Hints as Hints
-from .logs.read import parse_stream as parse_stream
+from .logs.assembly import Hints as Hints
+from .logs.datamessages import parse_stream as parse_stream
 from .logs.read import read_log as read_log
 from .logs.samples import Gap as Gap
 from .logs.samples import ImuLog as ImuLog

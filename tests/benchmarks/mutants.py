@@ -159,7 +159,7 @@ MUTANTS = {
         "calibration.robust:absolute_weights", on_return(np.ones_like), "calibration/test_plane.py"
     ),
     "worlds taken the other way": Mutant(
-        "xsens.logs.worlds:nwu_from", on_return(lambda turn: turn.inv()), "xsens/logs/test_worlds.py"
+        "xsens.logs.assembly:_north_deg", on_return(lambda degrees: -degrees), "xsens/logs/test_worlds.py"
     ),
 }
 

@@ -12,7 +12,6 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -57,56 +56,34 @@ class PairErrors:
         """Number of errors: pairs times calibrations."""
         return self.error_rad.size // 3
 
+    def statistics(self) -> dict[str, FloatArray]:
+        """Statistics over all pairs and calibrations: roll, yaw and tilt in radians, by name.
 
-@shown
-@dataclass(frozen=True)
-class AccuracyTable:
-    """Errors of each experiment over all pairs and calibrations, as in table 2 of Housden et al. (2008).
+        The mean is the error that grows from earlier frames to later ones: a pair taken the other way round
+        has the opposite error, so it depends on the order of the frames, and the RMS does not. The deviation
+        with the calibration is that of a pair's errors from their mean over the calibrations, zero if there
+        is only one.
+        """
+        errors = self.error_rad.reshape(-1, 3)
+        return {
+            "mean": errors.mean(axis=0),
+            "standard deviation": errors.std(axis=0),
+            "RMS": np.sqrt(np.square(errors).mean(axis=0)),
+            "largest": np.abs(errors).max(axis=0),
+            "standard deviation with the calibration": np.sqrt(self.error_rad.var(axis=0).mean(axis=0)),
+        }
 
-    Attributes
-    ----------
-    statistics : mapping of str to mapping of str to ndarray, shape (3,)
-        By experiment and statistic: roll, yaw and tilt in radians. The mean is the error that grows from
-        earlier frames to later ones: a pair taken the other way round has the opposite error, so it depends
-        on the order of the frames, and the RMS does not. The deviation with the calibration is that of a
-        pair's errors from their mean over the calibrations, zero if there is only one.
-
-    References
-    ----------
-    .. [1] Housden et al., BioMedical Engineering OnLine 7:5, 2008.
-    """
-
-    statistics: Mapping[str, Mapping[str, FloatArray]]
-
-    @classmethod
-    def of(cls, experiments: Mapping[str, PairErrors]) -> AccuracyTable:
-        """Summarise the errors of every experiment, by its name."""
-        statistics = {}
-        for name, errors in experiments.items():
-            by_calibration, all_errors = errors.error_rad, errors.error_rad.reshape(-1, 3)
-            statistics[name] = {
-                "mean": all_errors.mean(axis=0),
-                "standard deviation": all_errors.std(axis=0),
-                "RMS": np.sqrt(np.square(all_errors).mean(axis=0)),
-                "largest": np.abs(all_errors).max(axis=0),
-                "standard deviation with the calibration": np.sqrt(by_calibration.var(axis=0).mean(axis=0)),
-            }
-        return cls(statistics)
-
-    def text(self) -> str:
+    def text(self, name: str) -> str:
         """Mean and standard deviation in degrees as an aligned table."""
-        lines = [["degrees", *map(str.capitalize, ANGLES)]]
-        for name, statistics in self.statistics.items():
-            pairs = np.rad2deg([statistics["mean"], statistics["standard deviation"]]).T
-            lines.append([name, *(f"{mean:+.4f} ± {sd:.4f}" for mean, sd in pairs)])
-        return text_table(lines).rstrip("\n")
+        mean, deviation, *_ = np.rad2deg(list(self.statistics().values()))
+        cells = (f"{error:+.4f} ± {sd:.4f}" for error, sd in zip(mean, deviation, strict=True))
+        return text_table([["degrees", *map(str.capitalize, ANGLES)], [name, *cells]]).rstrip("\n")
 
-    def values(self) -> tuple[tuple[str, float, str], ...]:
+    def values(self, name: str) -> tuple[tuple[str, float, str], ...]:
         """All statistics as rows of description, value, unit."""
         return tuple(
             (f"{name}: {angle} error, {statistic}", float(value), "degrees")
-            for name, statistics in self.statistics.items()
-            for statistic, radians in statistics.items()
+            for statistic, radians in self.statistics().items()
             for angle, value in zip(ANGLES, np.rad2deg(radians), strict=True)
         )
 
@@ -237,9 +214,9 @@ def mounting_from_motion(measured: Rotation, reference: Rotation) -> Rotation:
 
 def _turns(measured: Rotation, reference: Rotation) -> tuple[FloatArray, FloatArray]:
     """Rotation vectors between the frames of all pairs by each, in the axes of the body, shape (p, 3)."""
-    n, n_reference = (0 if poses.single else len(poses) for poses in (measured, reference))
-    if n_reference != n:
-        raise MismatchError(f"expected one reference per reading, got {n_reference} and {n}")
+    n = len(measured)
+    if len(reference) != n:
+        raise MismatchError(f"expected one reference per reading, got {len(reference)} and {n}")
     if n < 2:
         raise InsufficientDataError(f"expected at least 2 orientations, got {n}")
     first, second = np.triu_indices(n, 1)

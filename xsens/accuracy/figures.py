@@ -3,7 +3,6 @@
 Drawn without pyplot: no window system, no global state. Only this module of the room needs matplotlib.
 """
 
-from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -26,37 +25,31 @@ FEWEST_FRAMES = 4
 _SHORTEST = 0.75
 """Shortest turn shown, as a fraction of the longest about its axis: short ones have the smallest errors."""
 
-_COLOURS = {"roll": "#009E73", "yaw": "#D55E00", "tilt": "#0072B2"}
-
 
 class Turn(NamedTuple):
     """Frames that differ in one angle only, in the order of that angle, with one calibration.
 
     The reference's angle from the first frame, shape (m,), starts at zero and grows; `error_rad` is that of
-    the angle measured, likewise, `drift_rad` the largest of them.
+    the angle measured, likewise.
     """
 
     name: str
     angle: str
     reference_rad: FloatArray
     error_rad: FloatArray
-    drift_rad: float
 
 
-def turns_about(angle: str, experiments: Mapping[str, PairErrors]) -> list[Turn]:
+def turns_about(angle: str, errors: PairErrors) -> list[Turn]:
     """Turns about one axis, of at least `FEWEST_FRAMES` frames and nearly as long as the longest."""
-    axis, turns = ANGLES.index(angle), list[Turn]()
-    for name, errors in experiments.items():
-        n = errors.frames
-        reference, error = _between(errors.reference_rad.T, n), _between(errors.error_rad[..., axis], n)
-        alone = (np.abs(np.delete(reference, axis, axis=0)) <= OFF_AXIS_RAD).all(axis=0)
-        for start, angles in enumerate(reference[axis]):
-            frames = np.flatnonzero(alone[start] & (angles >= 0))
-            frames = frames[np.argsort(angles[frames], kind="stable")]
-            if frames.size >= FEWEST_FRAMES and angles[frames[-1]] > 0:
-                for k, row in enumerate(error[:, start, frames]):
-                    label = f"{name}, calibration {k + 1}"
-                    turns.append(Turn(label, angle, angles[frames], row, float(np.abs(row).max())))
+    axis, turns, n = ANGLES.index(angle), list[Turn](), errors.frames
+    reference, error = _between(errors.reference_rad.T, n), _between(errors.error_rad[..., axis], n)
+    alone = (np.abs(np.delete(reference, axis, axis=0)) <= OFF_AXIS_RAD).all(axis=0)
+    for start, angles in enumerate(reference[axis]):
+        frames = np.flatnonzero(alone[start] & (angles >= 0))
+        frames = frames[np.argsort(angles[frames], kind="stable")]
+        if frames.size >= FEWEST_FRAMES and angles[frames[-1]] > 0:
+            for k, row in enumerate(error[:, start, frames]):
+                turns.append(Turn(f"calibration {k + 1}", angle, angles[frames], row))
     longest = max((turn.reference_rad[-1] for turn in turns), default=0.0)
     return [turn for turn in turns if turn.reference_rad[-1] >= _SHORTEST * longest]
 
@@ -69,13 +62,13 @@ def _between(values: FloatArray, n: int) -> FloatArray:
     return square - square.swapaxes(-1, -2)
 
 
-def figure_turns(experiments: Mapping[str, PairErrors], title: str = "") -> Figure:
+def figure_turns(errors: PairErrors, title: str = "") -> Figure:
     """Draw measured roll, yaw and tilt beside the reference's: worst examples left, best ones right.
 
     Parameters
     ----------
-    experiments : mapping of str to PairErrors
-        Errors by name; examples are chosen from all experiments and calibrations by their largest error.
+    errors : PairErrors
+        Examples are chosen from all calibrations by their largest error.
     title : str
         Over the figure.
 
@@ -92,7 +85,7 @@ def figure_turns(experiments: Mapping[str, PairErrors], title: str = "") -> Figu
     ----------
     .. [1] Housden et al., BioMedical Engineering OnLine 7:5, 2008, figure 5.
     """
-    panels_of_turns = [turns for angle in ANGLES if (turns := turns_about(angle, experiments))]
+    panels_of_turns = [turns for angle in ANGLES if (turns := turns_about(angle, errors))]
     if not panels_of_turns:
         raise InsufficientDataError(
             f"expected at least {FEWEST_FRAMES} frames that differ in one angle only, to within "
@@ -103,8 +96,8 @@ def figure_turns(experiments: Mapping[str, PairErrors], title: str = "") -> Figu
     panels = figure.subplots(len(panels_of_turns), 2, squeeze=False)
     for row, turns in zip(panels, panels_of_turns, strict=True):
         for axes, rank, choose in zip(row, ("worst", "best"), (max, min), strict=True):
-            _draw(axes, rank, choose(turns, key=lambda turn: turn.drift_rad))
-    panels[0, 0].legend(frameon=False, fontsize="small")
+            _draw(axes, rank, choose(turns, key=lambda turn: np.abs(turn.error_rad).max()))
+    panels[0, 0].legend()
     figure.suptitle(printable(title), parse_math=False)
     return figure
 
@@ -112,10 +105,9 @@ def figure_turns(experiments: Mapping[str, PairErrors], title: str = "") -> Figu
 def _draw(axes: Axes, rank: str, turn: Turn) -> None:
     reference = np.rad2deg(turn.reference_rad)
     sensed = reference + np.rad2deg(turn.error_rad)
-    axes.plot(reference, color="black", linewidth=2.2, alpha=0.55, label="reference")
-    axes.plot(sensed, "o--", color=_COLOURS[turn.angle], markersize=4, linewidth=1.3, label="sensor")
+    axes.plot(reference, color="black", label="reference")
+    axes.plot(sensed, "o--", label="sensor")
     axes.set_title(f"{rank} {turn.angle}: {turn.name}", fontsize="medium", parse_math=False)
     axes.set_xlabel("orientation in the turn")
     axes.set_ylabel(f"{turn.angle} / degrees")
-    axes.grid(visible=True, alpha=0.3)
-    axes.spines[["top", "right"]].set_visible(False)
+    axes.grid(visible=True)

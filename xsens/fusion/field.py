@@ -11,7 +11,6 @@ import numpy as np
 
 from speckle3d.core.arrays import FloatArray
 from xsens.fusion.orient import Orientation, orient
-from xsens.fusion.settings import FusionSettings
 from xsens.logs.samples import ImuLog, row_norms
 
 if TYPE_CHECKING:
@@ -78,7 +77,7 @@ class FieldFound:
             return Trust.UNKNOWN
         if self.heading_sd_rad > LOST_RAD or self.disbelieved > _MOST or self.stray > POOR:
             return Trust.NO
-        return Trust.CARE if any(self._doubts().values()) else Trust.YES
+        return Trust.CARE if self._doubts() else Trust.YES
 
     def sentence(self) -> str:
         """Whether the magnetometer can be trusted, why, and what to do if it cannot."""
@@ -88,7 +87,6 @@ class FieldFound:
         alone = ""
         if math.isfinite(drift):
             alone = f"; the gyroscope alone drifts by {drift:.1f}\N{DEGREE SIGN} in {self.duration_s:.0f} s"
-        doubts = [words for words, so in self._doubts().items() if so]
         advice = ""
         if drift < sd_deg:
             advice = " Within this recording the gyroscope alone does better (--no-magnetometer)."
@@ -98,12 +96,12 @@ class FieldFound:
             f"The magnetometer {self.trust} here: with it the heading is known to {sd_deg:.1f}\N{DEGREE SIGN}"
             f"{alone} (standard deviation). The field changes by {100.0 * self.stray:.1f} % from place to "
             f"place, and {100.0 * self.disbelieved:.1f} % of its readings are disbelieved."
-            + "".join(f" {words}." for words in doubts)
+            + "".join(f" {words}." for words in self._doubts())
             + advice
         )
 
-    def _doubts(self) -> dict[str, bool]:
-        return {
+    def _doubts(self) -> list[str]:
+        doubts = {
             "Part of it turns with the sensor, as by iron on the probe, and is taken off": self.iron > 0.5,
             "Such a field is rough: iron or motors are near": self.stray > ROUGH,
             "Something magnetic comes near at times": self.disbelieved > _LEAST_SHARE,
@@ -111,6 +109,7 @@ class FieldFound:
                 self.heading_sd_rad > HELD_RAD
             ),
         }
+        return [words for words, so in doubts.items() if so]
 
 
 def field_of(log: ImuLog, orientation: Orientation) -> FieldFound:
@@ -129,7 +128,7 @@ def field_of(log: ImuLog, orientation: Orientation) -> FieldFound:
     """
     if not orientation.magnetic or not np.isfinite(orientation.field_stray).any():
         return FieldFound(math.pi, 0.0, math.nan, math.nan, duration_s=log.duration_s)
-    alone = orient(log, FusionSettings(use_magnetometer=False))
+    alone = orient(log, magnetometer=False)
     heading = orientation.standard_deviation_rad[:, 2]
     return FieldFound(
         heading_sd_rad=float(np.percentile(heading, _WORST)),
@@ -144,8 +143,7 @@ def field_of(log: ImuLog, orientation: Orientation) -> FieldFound:
 def field_now(state: OnlineState, disbelieved: float) -> FieldFound:
     """What a filter finds of the field while samples arrive, with the share it disbelieved lately."""
     sd_rad = float(state.standard_deviation_rad[2])
-    stray = state.field_stray if state.started else math.nan
-    return FieldFound(sd_rad, disbelieved, stray, state.field_iron)
+    return FieldFound(sd_rad, disbelieved, state.field_stray, state.field_iron)
 
 
 def dip_rad(field_in_world: FloatArray) -> FloatArray:

@@ -33,8 +33,7 @@ from scipy.special import softmax
 
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.kernels.orientation import heading as kernel
-from speckle3d.kernels.orientation.inclination import STEP
-from xsens.fusion.settings import FusionSettings
+from speckle3d.kernels.orientation.inclination import BLOCK_S, STEP
 from xsens.logs.samples import finite_rows
 
 _FILTERS = 3
@@ -76,22 +75,28 @@ _STEADY = round(_STEADY_S / BIN_S)
 _FIRST_BINS = round(1.0 / BIN_S)
 """Readings whose mean is north where the sensor was at first."""
 
+STEPS_PER_BIN = round(BIN_S / BLOCK_S)
+"""Steps of the filter of inclination."""
 
-def steps_per_bin(settings: FusionSettings) -> int:
-    """Steps of the filter in a bin."""
-    return max(1, round(BIN_S / settings.block_s))
+_MOVING_BIAS_RAD_S = np.deg2rad(0.05)
+"""How far the bias in movement is from that at rest: an error of half the gyroscope's resolution at rest,
+acceleration and vibration."""
+
+_FIRST_PLACE = 0.01
+"""Standard deviation of what the first place adds to the room's field, where north is found: 1 % of its norm
+per component, a fifth of that of another place."""
 
 
-def averaged_bins(rows: Any, settings: FusionSettings) -> Any:
+def averaged_bins(rows: Any) -> Any:
     """Average steps, rows of `speckle3d.kernels.orientation.inclination.STEP`, to rows of `kernel.BIN`."""
-    firsts = np.arange(0, len(rows), steps_per_bin(settings))
+    firsts = np.arange(0, len(rows), STEPS_PER_BIN)
     ends = np.append(firsts[1:], len(rows))
     lasts, counts, bins = ends - 1, ends - firsts, np.zeros(len(firsts), kernel.BIN)
     bins["span_s"] = np.add.reduceat(rows["duration_s"], firsts)
     bins["resting"] = np.logical_and.reduceat(rows["resting"], firsts)
     bins["slip_rad2"] = np.add.reduceat(rows["noise"][:, 2], firsts)
     bins["bias"] = rows["bias"][lasts]
-    bins["bias_variance"] = (rows["sd"][lasts, 3:] ** 2).mean(axis=1) + settings.moving_bias_rad_s**2
+    bins["bias_variance"] = (rows["sd"][lasts, 3:] ** 2).mean(axis=1) + _MOVING_BIAS_RAD_S**2
     bins["tilt_rad2"] = np.add.reduceat((rows["sd"][:, :2] ** 2).mean(axis=1), firsts) / counts
     readable = finite_rows(rows["field"])
     readings = np.add.reduceat(readable.astype(float), firsts)[:, None]
@@ -114,15 +119,12 @@ to place, a fraction of its norm, per component; the weight of the filter that t
 class HeadingFilter:
     """The three filters, bin by bin; `online` if the readings so far are all there is."""
 
-    def __init__(self, settings: FusionSettings, online: bool = True) -> None:
-        self._settings = settings
-        first_place, place = settings.field_first_place, settings.field_place
-        noise, lag_s = settings.field_noise_sqrt_s, settings.magnetometer_lag_s
-        common = place, noise, lag_s, _FIRST_STRAY if online else 1.0
+    def __init__(self, online: bool = True) -> None:
+        stray = _FIRST_STRAY if online else 1.0
         models = [  # a calibration leaves 0.002 of iron
-            (0.002, 0.0, first_place, False, *common),
-            (0.002, 0.0, 0.3, True, *common),
-            (0.7, 0.15, first_place, False, *common),
+            (0.002, 0.0, _FIRST_PLACE, False, stray),
+            (0.002, 0.0, 0.3, True, stray),
+            (0.7, 0.15, _FIRST_PLACE, False, stray),
         ]
         self._models = np.array(models, kernel.MODEL)
         self._begin(_STRAY)
@@ -143,13 +145,13 @@ class HeadingFilter:
 
     def follow(self, rows: Any, to_end: bool = False) -> FloatArray:
         """Values as in `UNKNOWN` after each step by the last whole bin; `to_end` what is left is one."""
-        per_bin, before = steps_per_bin(self._settings), len(self._rows)
-        rows, north = np.concatenate([self._rows, rows]), self._north
-        bin_of_row = (np.arange(before, len(rows)) + 1) // per_bin + len(north) - 1
-        whole = len(rows) if to_end else len(rows) // per_bin * per_bin
+        before, north = len(self._rows), self._north
+        rows = np.concatenate([self._rows, rows])
+        bin_of_row = (np.arange(before, len(rows)) + 1) // STEPS_PER_BIN + len(north) - 1
+        whole = len(rows) if to_end else len(rows) // STEPS_PER_BIN * STEPS_PER_BIN
         self._rows = rows[whole:]
         if whole:
-            bins = averaged_bins(rows[:whole], self._settings)
+            bins = averaged_bins(rows[:whole])
             estimates = self._run(bins)
             weights, best = self._weights(estimates)
             # A walk at random: its variance grows with time, by the mean of the minutes so far. It is that of
@@ -169,7 +171,7 @@ class HeadingFilter:
         bins["bias"] = 0.0  # with a smoothed bias, there is no better one to come
         rows, moving = self._run(bins), ~bins["resting"]
         best = self._weights(rows)[1][-1]
-        self._begin(max(float(np.median(rows["stray"][moving, best])) if moving.any() else 0.0, _STRAY))
+        self._begin(max(np.median(rows["stray"][moving, best]) if moving.any() else 0.0, _STRAY))
         arrays = _empty_arrays(_FILTERS, len(bins))
         rows = self._run(bins, arrays)
         weights, best = (values[-1] for values in self._weights(rows))

@@ -5,15 +5,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError, MismatchError
 from speckle3d.core.text import shown
-from xsens.fusion.engines import Filter
-from xsens.fusion.readings import PAUSE_S, Samples, lost_variance
-from xsens.fusion.settings import LOST, FusionSettings
+from xsens.fusion.engines import BLOCK_S, Filter
+from xsens.fusion.readings import LOST, PAUSE_S, Samples, lost_variance
 from xsens.logs.contradictions import FASTEST_RAD_S, not_in_metres
 from xsens.logs.faults import LIMITS
 from xsens.logs.samples import VECTORS, row_norms
@@ -57,12 +56,8 @@ class OnlineState:
 class OnlineFilter:
     """The filter of `xsens.orient` for samples as they arrive.
 
-    Samples are gathered to increments of `FusionSettings.block_s`; between two of them the gyroscope alone
+    Samples are gathered to increments of 1/32 s; between two of them the gyroscope alone
     carries the orientation, so that `state` is always that of the last sample.
-
-    Parameters
-    ----------
-    settings : FusionSettings, optional
 
     Examples
     --------
@@ -74,9 +69,8 @@ class OnlineFilter:
     (True, False)
     """
 
-    def __init__(self, settings: FusionSettings | None = None) -> None:
-        self._settings = settings or FusionSettings()
-        self._filter = Filter(self._settings)
+    def __init__(self) -> None:
+        self._filter = Filter()
         self._state: OnlineState | None = None
         self._pending: list[tuple[Any, ...]] = []  # since the filter ran: once in an increment is enough
         self._rate: FloatArray | None = None
@@ -86,10 +80,10 @@ class OnlineFilter:
 
     def push(
         self,
-        step_s: npt.ArrayLike,
-        gyroscope_rad_s: npt.ArrayLike,
-        accelerometer_m_s2: npt.ArrayLike,
-        magnetometer_au: npt.ArrayLike | None = None,
+        step_s: ArrayLike,
+        gyroscope_rad_s: ArrayLike,
+        accelerometer_m_s2: ArrayLike,
+        magnetometer_au: ArrayLike | None = None,
     ) -> None:
         """Add samples.
 
@@ -123,12 +117,12 @@ class OnlineFilter:
             if np.isfinite(rate).all() and self._forceless_s <= PAUSE_S:
                 self._add(self._skipped_s, rate, field)
                 self._skipped_s = 0.0
-        if sum(step_s for step_s, *_ in self._pending) >= self._settings.block_s:
+        if sum(step_s for step_s, *_ in self._pending) >= BLOCK_S:
             self._run()
 
     def _add(self, step_s: float, rate: FloatArray, field: FloatArray) -> None:
         """Add a sample, so long after the last one, with the last force."""
-        lost_rad2, first = 0.0, self._rate is None
+        lost_rad2 = 0.0
         if self._rate is None:
             self._usual_s = min(step_s, PAUSE_S)
         elif step_s > LOST * self._usual_s:
@@ -138,8 +132,8 @@ class OnlineFilter:
         if step_s > PAUSE_S:
             self._run()
             # The turn in a pause is not known, nor is the first sample's own step.
-            self._filter.begin(0.0 if first else step_s)
-            step_s = self._settings.block_s
+            self._filter.begin(step_s)
+            step_s = BLOCK_S
         self._rate = rate
         self._pending.append((step_s, rate, self._force, field, lost_rad2))
 
@@ -163,7 +157,7 @@ class OnlineFilter:
         return self._state
 
 
-def _require_readings(step_s: npt.ArrayLike, *vectors: npt.ArrayLike | None) -> list[FloatArray]:
+def _require_readings(step_s: ArrayLike, *vectors: ArrayLike | None) -> list[FloatArray]:
     """Steps and readings; what is no measurement, zeros or out of range, is NaN."""
     step = np.atleast_1d(np.asarray(step_s, dtype=float))
     if not (np.isfinite(step) & (step > 0.0)).all():

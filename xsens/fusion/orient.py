@@ -1,8 +1,9 @@
 """`orient`: orientation of a log from gyroscope, accelerometer and, for heading alone, magnetometer."""
 
-import math
 from dataclasses import dataclass, replace
+from enum import StrEnum
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -11,18 +12,33 @@ from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.streams import TimedRotations
 from speckle3d.core.text import shown
-from xsens.fusion.readings import PAUSE_S, Estimate, Samples, usable_samples
-from xsens.fusion.settings import FusionSettings, Method
+from xsens.fusion.readings import BIAS_SD_RAD_S, PAUSE_S, Estimate, Samples, usable_samples
 from xsens.logs.samples import ImuLog, finite_rows
 
 _FORESEEN = 3
 """Standard deviations of the gyroscope's bias that are foreseen; a larger one widens them."""
 
-_SWING_SQRT_S = math.sqrt(2.0 * 0.25)
-"""Of a swing over which an error of scale persists, as `FusionSettings` has it."""
-
 _SHORTEST_S = 3.0
 """Shorter stretches are filtered, not smoothed: most of their time is the filter's start."""
+
+
+class Method(StrEnum):
+    """Engine of an orientation; `smoother` and `vqf` use the readings after each sample as well."""
+
+    smoother = "smoother"
+    filter = "filter"
+    vqf = "vqf"
+    vqf_online = "vqf-online"
+
+    @property
+    def offline(self) -> bool:
+        """Whether readings after a sample tell of its orientation."""
+        return self in (Method.smoother, Method.vqf)
+
+    @property
+    def is_vqf(self) -> bool:
+        """Whether VQF finds the orientation, not this package's filter."""
+        return self in (Method.vqf, Method.vqf_online)
 
 
 @shown
@@ -70,17 +86,15 @@ class Orientation:
         return len(self.rotations)
 
 
-def orient(
-    log: ImuLog, settings: FusionSettings | None = None, method: Method | str = Method.smoother
-) -> Orientation:
+def orient(log: ImuLog, magnetometer: bool = True, method: Method | str = Method.smoother) -> Orientation:
     """Estimate the orientation of a log.
 
     Parameters
     ----------
     log : ImuLog
-        With gyroscope and accelerometer. Without a magnetometer, the heading is relative to the start.
-    settings : FusionSettings, optional
-        VQF takes `use_magnetometer` alone of them.
+        With gyroscope and accelerometer.
+    magnetometer : bool
+        Let it tell the heading; without it, the heading is relative to the start.
     method : Method or str
         smoother, or vqf: use the readings after each sample as well as those before; filter, or vqf-online:
         as live.
@@ -95,8 +109,10 @@ def orient(
     InsufficientDataError
         If the log lacks a gyroscope or an accelerometer, or has fewer than two samples of them.
     InvalidInputError
-        If the times cannot be in s, the accelerometer in m/s^2 or the gyroscope in rad/s, if there is no such
-        method, or if VQF is asked for and not installed.
+        If the times cannot be in s, the accelerometer in m/s^2 or the gyroscope in rad/s, or if VQF is asked
+        for and not installed.
+    ValueError
+        If there is no such method.
 
     Notes
     -----
@@ -123,45 +139,45 @@ def orient(
     """
     if not isinstance(log, ImuLog):
         raise InvalidInputError(f"expected an ImuLog, as read_log(path) gives, got {type(log).__name__}")
-    settings, method = settings or FusionSettings(), Method(method)
-    used = log if settings.use_magnetometer else replace(log, magnetometer_au=None)
+    method, used = Method(method), log if magnetometer else replace(log, magnetometer_au=None)
     rows, samples, notes, scale_error = usable_samples(used)
-    scale_noise = max(settings.gyro_scale_noise_sqrt_s, _SWING_SQRT_S * scale_error)
-    settings = replace(settings, gyro_scale_noise_sqrt_s=scale_noise)
-    if settings.use_magnetometer and not finite_rows(samples.field_au).any():
+    magnetic = bool(finite_rows(samples.field_au).any())
+    if magnetometer and not magnetic:
         notes.append("no magnetometer: the heading is relative to the start")
-        settings = replace(settings, use_magnetometer=False)
     breaks = np.flatnonzero(samples.step_s > PAUSE_S)
     if breaks.size:
         notes.append(f"{breaks.size} pauses over {PAUSE_S:g} s: orientation found anew after each")
-    estimate = _estimate(samples, breaks, settings, method)
-    bias = float(np.abs(estimate.gyro_bias_rad_s).max())
-    if bias > _FORESEEN * settings.bias_sd_rad_s:
+    estimate = _estimate(samples, breaks, method, magnetic, scale_error)
+    bias = np.abs(estimate.gyro_bias_rad_s).max()
+    if bias > _FORESEEN * BIAS_SD_RAD_S:
         notes.append(f"a gyroscope bias of {np.rad2deg(bias):.1f} deg/s: found again, foreseen so large")
-        estimate = _estimate(samples, breaks, replace(settings, bias_sd_rad_s=bias), method)
+        estimate = _estimate(samples, breaks, method, magnetic, scale_error, bias)
     columns = vars(estimate).copy()
     rotations = TimedRotations(log.time_s[rows], Rotation.from_quat(columns.pop("xyzw")))
-    magnetic = settings.use_magnetometer
     return Orientation(rotations, **columns, method=method, notes=tuple(notes), magnetic=magnetic)
 
 
-def _estimate(samples: Samples, breaks: IntArray, settings: FusionSettings, method: Method) -> Estimate:
-    """Each stretch by the method asked for, or by its on-line twin if it is short."""
-    from xsens.fusion.engines import Filter, smooth  # which loads numba
-    from xsens.fusion.vqf_engine import by_vqf
+def _estimate(
+    samples: Samples, breaks: IntArray, method: Method, magnetic: bool, *gyroscope: Any
+) -> Estimate:
+    """Each stretch by the method asked for, or by its on-line twin if it is short.
+
+    `gyroscope` is what `xsens.fusion.engines.Filter` takes for granted of it.
+    """
+    from xsens.fusion.engines import Filter, by_vqf, smooth  # which loads numba
 
     estimates: list[Estimate] = []
-    online = Filter(settings)
-    step_s = float(np.median(samples.step_s))
+    online = Filter(magnetic, *gyroscope)
+    step_s = np.median(samples.step_s)
     for first, last in pairwise([0, *breaks.tolist(), len(samples)]):
         stretch = samples[first:last]
         if first:
-            online.begin(float(stretch.step_s[0]))
+            online.begin(stretch.step_s[0])
             stretch = replace(stretch, step_s=np.append(step_s, stretch.step_s[1:]))
-        offline = method.offline and float(stretch.step_s.sum()) > _SHORTEST_S
-        estimate = smooth(stretch, settings) if offline else online.run(stretch, to_end=True)
-        estimates.append(
-            by_vqf(stretch, estimate, offline, settings.use_magnetometer) if method.is_vqf else estimate
+        offline = method.offline and stretch.step_s.sum() > _SHORTEST_S
+        estimate = (
+            smooth(stretch, Filter(magnetic, *gyroscope)) if offline else online.run(stretch, to_end=True)
         )
+        estimates.append(by_vqf(stretch, estimate, offline, magnetic) if method.is_vqf else estimate)
     columns = zip(*(vars(estimate).values() for estimate in estimates), strict=True)
     return Estimate(*map(np.concatenate, columns))

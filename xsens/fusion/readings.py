@@ -8,11 +8,19 @@ import numpy as np
 
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
-from xsens.fusion.settings import BRIDGED_S, LOST
 from xsens.logs.clocks import SHORTEST_S
 from xsens.logs.contradictions import contradictions
 from xsens.logs.faults import without_faults
 from xsens.logs.samples import ImuLog, finite_rows, row_norms
+
+BRIDGED_S = 0.1
+"""The longest pause that is integrated over: a hand's rate changes little in it (tremor: below 12 Hz)."""
+
+LOST = 1.5
+"""A step longer than so many usual ones holds lost samples."""
+
+BIAS_SD_RAD_S = np.deg2rad(1.0)
+"""Standard deviation of a gyroscope's bias at switching on."""
 
 PAUSE_S = 1.25 * BRIDGED_S
 """A longer step is a pause. Steps of a clock of 10 Hz vary by rounding, and by jitter."""
@@ -100,7 +108,7 @@ def usable_samples(log: ImuLog) -> tuple[IntArray, Samples, list[str], float]:
     notes, rate, force = list(log.notes[before:]), log.gyroscope_rad_s, log.accelerometer_m_s2
     turns, pulls = (np.zeros(len(log), bool) if part is None else finite_rows(part) for part in (rate, force))
     rows = _near(log.time_s, turns) & _near(log.time_s, pulls)
-    count = int(min((rows & turns).sum(), (rows & pulls).sum()))
+    count = min((rows & turns).sum(), (rows & pulls).sum())
     if rate is None or force is None or count < 2:
         problems = ["no gyroscope"] * (rate is None) + ["no accelerometer"] * (force is None) or [str(count)]
         problems += [note for note in log.notes if note.startswith(("columns", "gyro", "accel"))]
@@ -128,16 +136,16 @@ def usable_samples(log: ImuLog) -> tuple[IntArray, Samples, list[str], float]:
     if against.get("magnetometer") or against.get("magnetometer's axis"):
         field = None
         notes.append("the magnetometer is left out")
-    if left_out := int((~rows).sum()):
+    if left_out := (~rows).sum():
         notes.append(f"{left_out} samples without gyroscope or accelerometer left out")
-    time_s, usual_s = log.time_s[rows], float(np.median(np.diff(log.time_s[rows])))
+    time_s, usual_s = log.time_s[rows], np.median(np.diff(log.time_s[rows]))
     step_s, lost_rad2 = np.diff(time_s, prepend=time_s[0] - usual_s), np.zeros_like(time_s)
     means = list[FloatArray]()
     for name, readings, valid in (
         ("gyroscope", rate[rows], turns[rows]),
         ("accelerometer", force[rows], pulls[rows]),
     ):
-        if count := int((~valid).sum()):
+        if count := (~valid).sum():
             notes.append(f"{count} {name} readings missing: interpolated")
         means.append(_interpolated_means(time_s, step_s, usual_s, readings, valid))
     valid = turns[rows]

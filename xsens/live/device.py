@@ -204,7 +204,7 @@ def prepare(device: Device, settings: DeviceSettings) -> DeviceInfo:
     if outputs is None:
         configuration = device.ask(MessageId.REQ_CONFIGURATION)
         units = () if configuration is None else Configuration.from_message(configuration).units
-        mt9 = not units or units[0].output_mode & OutputMode.MT9  # which sends raw counts always
+        mt9 = not units or units[0][0] & OutputMode.MT9  # which sends raw counts always
         if not mt9 and settings.content != "as set":
             device.request(MessageId.OUTPUT_MODE, mode.to_bytes(2, "big"))
             device.request(MessageId.OUTPUT_SETTINGS, OutputSettings.COUNTER.to_bytes(4, "big"))

@@ -15,21 +15,15 @@ from scipy.spatial.transform import Rotation
 from speckle3d.core.errors import InvalidInputError, Speckle3DError
 from speckle3d.core.text import shown
 from xsens.fusion.field import ROUGH, dip_rad
-from xsens.logs.parts import Hints
-from xsens.logs.read import parse_stream
+from xsens.logs.assembly import Hints
+from xsens.logs.datamessages import parse_stream
 from xsens.logs.samples import ImuLog
-from xsens.messages.control import MessageId
+from xsens.messages.control import DATA
 from xsens.messages.framing import Framer, Message, encode
 
 if TYPE_CHECKING:
     from speckle3d.core.arrays import FloatArray
     from xsens.fusion.online import OnlineFilter, OnlineState
-
-_MOST_PENDING = 1 << 12
-"""Pieces kept until the state is asked for: a minute or more."""
-
-_NAN = float("nan")
-_DATA = (MessageId.MT_DATA, MessageId.MT_DATA2)
 
 
 @shown
@@ -106,13 +100,14 @@ class Monitor:
 
     def __init__(self) -> None:
         self._lock, self._since_s, self._events = Lock(), time.monotonic(), deque[Any]()
-        self._now = LiveState(False, 0.0, 0, 0, 0, 0.0, None, _NAN, _NAN, "")
+        self._now = LiveState(False, 0.0, 0, 0, 0, 0.0, None, np.nan, np.nan, "")
 
     def take(self, event: bytes | tuple[Message, ...] | str) -> None:
-        """Take in bytes as received, the header of a sensor that begins to measure, or why it is lost."""
+        """Keep bytes as received, the header of a sensor that begins to measure, or why it is lost.
+
+        An hour of them, for which nobody may ask, is some ten megabytes.
+        """
         self._events.append(event)
-        if len(self._events) > _MOST_PENDING:  # nobody has asked for a while
-            self.state()
 
     def state(self) -> LiveState:
         """The state now."""
@@ -141,7 +136,7 @@ class Monitor:
 
     def _digest(self, data: bytes) -> None:
         """Decode bytes, of which a message's end may follow later."""
-        messages = [message for message in self._framer.feed(data) if message.mid in _DATA]
+        messages = [message for message in self._framer.feed(data) if message.mid in DATA]
         if not messages:
             return
         self._set(samples=self._now.samples + len(messages))
@@ -163,7 +158,7 @@ class Monitor:
             world_from_sensor = log.world_from_sensor[log.oriented][-1]
         rates, field = log.gyroscope_rad_s, log.magnetometer_au
         if field is not None and np.isfinite(field[-1]).all():
-            dip = _NAN if world_from_sensor is None else dip_rad(world_from_sensor.apply(field[-1:]))[0]
+            dip = np.nan if world_from_sensor is None else dip_rad(world_from_sensor.apply(field[-1:]))[0]
             self._set(field=float(np.linalg.norm(field[-1])), dip_rad=float(dip))
         self._set(
             lost=self._now.lost + log.lost + missing,
@@ -192,5 +187,5 @@ def warm_up() -> None:
     """Load the filter, or compile it, which would keep a recording from reading its port for too long."""
     from xsens.fusion.online import OnlineFilter
 
-    still = (np.tile(vector, (150, 1)) for vector in ([0.0, 0.0, 0.0], [0.0, 0.0, 9.8], [0.4, 0.0, -0.9]))
-    OnlineFilter().push(np.full(150, 0.01), *still)
+    readings = np.full((150, 3), 5.7)  # as long as gravity
+    OnlineFilter().push(np.full(150, 0.01), readings, readings, readings)

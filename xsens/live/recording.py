@@ -8,20 +8,22 @@ which a reader can tell how long the sensor was disconnected.
 
 from __future__ import annotations
 
+import math
 import os
 import threading
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, closing, suppress
 
-from speckle3d.core.errors import FileError, InvalidInputError, Speckle3DError, naming
-from speckle3d.core.files import cannot_write
+from speckle3d.core.errors import FileError, InvalidInputError, naming
+from speckle3d.core.files import PathLike, cannot_write
 from xsens.live.device import Device, DeviceError, DeviceInfo, DeviceSettings, connect, prepare
 from xsens.live.monitor import LiveState, Monitor, warm_up
 from xsens.messages.control import MessageId, utc_message
 from xsens.messages.framing import encode
 
-PathLike = str | os.PathLike[str]
+_INTERVAL_S = 0.25
+"""Time between two states that `record` yields."""
 
 SILENCE_S = 2.0
 """A sensor silent for so long is taken for disconnected and asked to answer; its slowest rate is 1 Hz."""
@@ -96,7 +98,7 @@ class Recorder:
             device.close()
             raise
         self._monitor = Monitor()
-        self._failure: Speckle3DError | None = None
+        self._failure: Exception | None = None
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._record, args=(device,), daemon=True)
         self._thread.start()
@@ -114,11 +116,9 @@ class Recorder:
         self._file.close()
 
     def state(self) -> LiveState:
-        """State, after writing all to the disk; raises `FileError` once the file cannot be written."""
+        """State, after writing all to the disk; raises what has ended the recording, as a full disk does."""
         if self._failure is not None:
             raise self._failure
-        if not (self._thread.is_alive() or self._stop.is_set()):
-            raise DeviceError(f"{self._port}: the recording has ended by an error of the program")
         self._file.sync()
         return self._monitor.state()
 
@@ -145,7 +145,7 @@ class Recorder:
                     self._monitor.take(str(error))
                     device = None
                     self._stop.wait(RETRY_S)
-        except Speckle3DError as error:
+        except Exception as error:  # noqa: BLE001 (raised by `state`)
             self._failure = error
 
     def _measure(self, device: Device) -> None:
@@ -176,8 +176,7 @@ def record(
     path: PathLike,
     settings: DeviceSettings | None = None,
     append: bool = False,
-    interval_s: float = 0.25,
-    duration_s: float = float("inf"),
+    duration_s: float = math.inf,
 ) -> Iterator[LiveState]:
     """Record a sensor and yield its state, until the time is over or the iteration is left.
 
@@ -185,8 +184,6 @@ def record(
     ----------
     port, path, settings, append
         As for `Recorder`.
-    interval_s : float
-        Time between two states.
     duration_s : float
         Length of the recording.
 
@@ -198,6 +195,6 @@ def record(
     with Recorder(port, path, settings, append) as recorder:
         end = time.monotonic() + duration_s
         while (left := end - time.monotonic()) > 0:
-            time.sleep(min(interval_s, left))
+            time.sleep(min(_INTERVAL_S, left))
             yield recorder.state()
     yield recorder.state()

@@ -54,17 +54,14 @@ class Stamps:
         Sampling period as configured or stated; NaN if not known.
     extras : ndarray of int, shape (m,), optional
         Number of messages before each sample that the sensor counted, but that were no samples.
-    starts : ndarray of bool, shape (m,), optional
-        True for samples before which the sensor was started anew.
     computer_s : ndarray, shape (m,), optional
-        The computer's clock at those starts; NaN elsewhere.
+        The computer's clock where it was recorded before a sample, as at each new start; NaN elsewhere.
     """
 
     counter: IntArray | None = None
     time_s: FloatArray | None = None
-    period_s: float = float("nan")
+    period_s: float = np.nan
     extras: IntArray | None = None
-    starts: BoolArray | None = None
     computer_s: FloatArray | None = None
 
 
@@ -84,11 +81,7 @@ class Timeline:
 
 def unwrap(values: Any, span: int) -> Any:
     """Unwrap a counter or clock that wraps round at a span; one that never falls stays as it is."""
-    steps = np.diff(values)
-    if (steps >= 0).all():
-        return values
-    steps = (steps + span // 2) % span - span // 2
-    return values[0] + _running_sums(steps)
+    return values if (np.diff(values) >= 0).all() else np.unwrap(values, period=span)
 
 
 def timeline(stamps: Stamps, readings: Sequence[FloatArray] = ()) -> Timeline:
@@ -114,12 +107,12 @@ def timeline(stamps: Stamps, readings: Sequence[FloatArray] = ()) -> Timeline:
             )
         if numbers is None:
             notes.append("samples have no counter: losses cannot be found")
-            numbers = np.arange(len(next(part for part in (stamps.starts, *readings) if part is not None)))
+            numbers = np.arange(len(readings[0] if stamps.computer_s is None else stamps.computer_s))
         values = (numbers - numbers[0]) * stamps.period_s
     elif (stamps_s := _spread(values, readings)) is not values:
         notes.append(f"several samples to a stamp, {len(values)} in all: spread evenly between stamps")
         values = stamps_s
-    anew = _new_starts(values, stamps)
+    anew = _new_starts(values, stamps.computer_s)
     if anew.any():
         steps = np.where(anew[1:], 0.0, np.diff(values))
         clock_s = np.full(len(values), np.nan) if stamps.computer_s is None else stamps.computer_s
@@ -134,10 +127,10 @@ def timeline(stamps: Stamps, readings: Sequence[FloatArray] = ()) -> Timeline:
         )
     rows: Any = np.argsort(values, kind="stable")
     rank = np.argsort(rows)
-    if late := int((rank < np.maximum.accumulate(rank)).sum()):
+    if late := (rank < np.maximum.accumulate(rank)).sum():
         notes.append(f"{late} samples came out of order and were sorted")
     distinct = np.append(True, np.diff(values[rows]) > 0.0)
-    if left_out := int((~distinct).sum()):
+    if left_out := (~distinct).sum():
         notes.append(f"{left_out} samples at the time of another were left out")
     rows = rows[distinct] if late or left_out else slice(None)
     time_s, anew = values[rows], np.diff(np.cumsum(anew)[rows]) > 0
@@ -216,7 +209,7 @@ def _sample_numbers(counter: IntArray, extras: IntArray | None) -> FloatArray:
     return numbers / stride
 
 
-def _new_starts(values: FloatArray, stamps: Stamps) -> BoolArray:
+def _new_starts(values: FloatArray, computer_s: FloatArray | None) -> BoolArray:
     """Mark the samples before which the sensor was started anew.
 
     A step far back shows it, unless those overtaken were followed by a jump forward to where it was.
@@ -229,9 +222,7 @@ def _new_starts(values: FloatArray, stamps: Stamps) -> BoolArray:
     for i in back[:_OVERTAKINGS].tolist():
         later = values[i + 1 :] > values[i]
         anew[i + 1] = not later.any() or steps[i + int(np.argmax(later))] < _LONGER * usual
-    if stamps.time_s is None and stamps.starts is not None:
-        anew |= stamps.starts
-    elif stamps.computer_s is not None:
-        anew |= np.isfinite(stamps.computer_s)
+    if computer_s is not None:
+        anew |= np.isfinite(computer_s)
     anew[0] = False
     return anew

@@ -99,7 +99,7 @@ def contradictions(log: ImuLog) -> Consistency:
     directions = {"accelerometer": force, "magnetometer": field, "own orientation": log.own_direction}
     sentences: dict[str, str | None] = {"gyroscope": ""}
     scale_errors = list[float]()
-    if rate is not None and (fast := float(np.nanpercentile(row_norms(rate), 99.0))) > FASTEST_RAD_S:
+    if rate is not None and (fast := np.nanpercentile(row_norms(rate), 99.0)) > FASTEST_RAD_S:
         sentences["gyroscope"] = (
             f"expected a gyroscope in rad/s, got one in a hundred over {fast:.3g}: in deg/s?"
         )
@@ -188,7 +188,7 @@ def _without(columns: FloatArray, parts: Sequence[FloatArray]) -> FloatArray:
     """Parts, shape (k, n, 3), less the combinations of columns, shape (j, n, 3), that are nearest to them."""
     basis, stack = (np.reshape(rows, (len(rows), -1)).T for rows in (columns, parts))
     rest = stack - basis @ np.linalg.lstsq(basis, stack)[0]
-    return np.asarray(rest.T.reshape(len(parts), -1, 3))
+    return rest.T.reshape(len(parts), -1, 3)
 
 
 def _dead_axis(rate: FloatArray, direction: FloatArray) -> str:
@@ -228,7 +228,7 @@ def _against_gyroscope(name: str, turns: _Turns) -> tuple[str | None, float]:
         square = max((turn**2).sum(), 1e-12)
         off = (turn * turns.missed).sum() / square
         scatter = (turn * (turns.missed - off * turn)).sum(axis=1)
-        error, share = _ERRORS * float(np.sqrt((scatter**2).sum())) / square, 1.0 + off
+        error, share = _ERRORS * np.sqrt((scatter**2).sum()) / square, 1.0 + off
         rate = _rms(turn) / _WINDOW_S
         if rate * max(share, 1.0) < max(_MOVING_RAD_S, _VISIBLE * turns.rate_rad_s):
             continue

@@ -2,30 +2,72 @@
 
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from speckle3d.core.arrays import BoolArray, IntArray
-from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.arrays import BoolArray, ByteArray, IntArray
+from speckle3d.core.errors import InvalidInputError, naming
+from xsens.logs.assembly import Claim, Hints, Parts, assemble_log, quaternions_of, rotation_vectors
 from xsens.logs.clocks import COUNTS, TICK_S, TICKS, Stamps, unwrap
 from xsens.logs.faults import stuck_axes
-from xsens.logs.parts import Parts
-from xsens.logs.samples import VECTORS
-from xsens.logs.worlds import Claim, quaternions_of, rotation_vectors
+from xsens.logs.samples import VECTORS, ImuLog
 from xsens.messages.control import (
     BLOCK_SIZE,
     COMPENSATION_NOTE,
+    DATA,
     Configuration,
     MessageId,
     RawCalibration,
     utc_time_s,
 )
-from xsens.messages.framing import Frames, Message
+from xsens.messages.framing import Frames, Message, find_frames
 from xsens.messages.mtdata import DataLayout, OutputMode, Values, as_floats, read_items
 
-_STARTS = (MessageId.WAKE_UP, MessageId.GO_TO_MEASUREMENT_ACK, MessageId.UTC_TIME)
-"""Messages after which the sensor's counter may have begun anew."""
+
+def parse_stream(data: bytes | ByteArray, hints: Hints | None = None, source: str = "stream") -> ImuLog:
+    """Read the samples in a run of bytes from the sensor.
+
+    The bytes may start in the middle of a message and have losses; the notes tell what was skipped.
+
+    Parameters
+    ----------
+    data : bytes or ndarray of uint8
+    hints : Hints, optional
+    source : str
+        Name of the bytes in errors.
+
+    Returns
+    -------
+    ImuLog
+
+    Raises
+    ------
+    InvalidInputError
+        If they hold no data message, or lack what is needed to understand one.
+    """
+    with naming(source):
+        frames, notes = find_frames(data), list[str]()
+        data_mask = np.isin(frames.mid, DATA)
+        if not data_mask.any():
+            content = f"{len(frames)} others in {frames.data.size} bytes"
+            raise InvalidInputError(
+                f"expected messages with data, got {content if frames.data.any() else 'nothing but zeros'}"
+            )
+        kinds = frames.mid.astype(np.uint16) * 256 + frames.bid
+        indices = np.flatnonzero(data_mask & (kinds == np.bincount(kinds[data_mask]).argmax()))
+        if runs := frames.gaps():
+            size = sum(length for _, length in runs)
+            places = f"{len(runs)} places, first at byte {runs[0][0]}"
+            notes.append(f"{size} bytes in {places}, belong to no message")
+        if left_out := data_mask.sum() - indices.size:
+            notes.append(f"{left_out} data messages of another kind or unit were left out")
+        read = legacy_samples if frames.mid[indices[0]] == MessageId.MT_DATA else mtdata2_samples
+        parts = read(frames, indices)
+        parts = replace(parts, notes=(*notes, *parts.notes))
+        del data, frames, indices  # as large as the samples
+        return assemble_log(parts, hints or Hints(), source)
 
 
 _NOTATIONS = ("quaternion_wxyz", "matrix", "euler_deg")
@@ -40,18 +82,16 @@ def _parts(
         for name, span in (("counter", COUNTS), ("ticks", TICKS))
     )
     time_s = None if ticks is None else ticks * TICK_S
-    starts, computer_s = np.zeros(indices.size, dtype=bool), np.full(indices.size, np.nan)
-    for i in np.flatnonzero(np.isin(frames.mid, _STARTS)).tolist():
-        after = slice(place := int(np.searchsorted(indices, i)), place + 1)
-        starts[after] = True
-        if frames.mid[i] == MessageId.UTC_TIME:
-            computer_s[after] = utc_time_s(frames.message(i))
+    computer_s = np.full(indices.size, np.nan)
+    for i in np.flatnonzero(frames.mid == MessageId.UTC_TIME).tolist():
+        place = np.searchsorted(indices, i)
+        computer_s[place : place + 1] = utc_time_s(frames.message(i))
     notations = [quaternions_of(values[name]) for name in _NOTATIONS if name in values]
     increments = {VECTORS[0]: values["delta_v_m_s"]} if "delta_v_m_s" in values else {}
     if "delta_q_wxyz" in values:
         increments[VECTORS[1]] = rotation_vectors(values["delta_q_wxyz"])
     return Parts(
-        Stamps(counter, time_s, starts=starts, computer_s=computer_s, **stamps),
+        Stamps(counter, time_s, computer_s=computer_s, **stamps),
         {name: values[name] for name in VECTORS if name in values},
         {"": notations[0]} if notations else {},
         claim,
@@ -81,13 +121,12 @@ def legacy_samples(frames: Frames, indices: IntArray) -> Parts:
     if len(units) > 1:
         raise InvalidInputError(f"expected the log of one unit, got that of a master of {len(units)}")
     layout, notes = DataLayout(*units[0]), list[str]()
-    fits = frames.payload_size[indices] == layout.size
+    size = layout.dtype.itemsize
+    fits = frames.payload_size[indices] == size
     if not fits.any() or (configuration is None and 2 * fits.sum() <= fits.size):
-        whose = (
-            "as configured" if configuration else "as an MT9-B's raw counts, or a configuration before them"
-        )
         raise InvalidInputError(
-            f"expected data messages of {layout.size} bytes, {whose}, got {fits.sum()} of {fits.size}"
+            f"expected data messages of {size} bytes, as configured before them or else as an MT9-B's raw "
+            f"counts, got {fits.sum()} of {fits.size}"
         )
     if not fits.all():
         notes.append(f"{(~fits).sum()} data messages were not as long as configured: left out")
@@ -108,7 +147,7 @@ def legacy_samples(frames: Frames, indices: IntArray) -> Parts:
                 notes.append(
                     f"{name.split('_')[0]}: {ends.sum()} with an axis that stands still: taken as missing"
                 )
-    period_s = 1.0 / rates[0] if rates else float("nan")
+    period_s = 1.0 / rates[0] if rates else np.nan
     return _parts(frames, indices, values, Claim(layout.frame, "as configured"), notes, period_s=period_s)
 
 

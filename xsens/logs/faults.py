@@ -88,7 +88,7 @@ def without_faults(log: ImuLog) -> ImuLog:
     force, rate = (readings.get(name, nothing) for name in VECTORS[:2])
     for name, rows in readings.items():
         bad = _bad(name, rows, force, rate)
-        if counts := ", ".join(f"{int(mask.sum())} {why}" for why, mask in bad.items() if mask.any()):
+        if counts := ", ".join(f"{mask.sum()} {why}" for why, mask in bad.items() if mask.any()):
             notes.append(f"{name.split('_')[0]}: {counts}: taken as missing")
         wrong = np.logical_or.reduce(list(bad.values()))
         if name == _ORIENTATION:
@@ -113,7 +113,7 @@ def _bad(name: str, rows: FloatArray, force: FloatArray, rate: FloatArray) -> di
         zero &= ~(row_norms(force) > 0.0)
     valid = ~(np.isnan(size) | zero)
     if name == VECTORS[2] and valid.any():
-        unit = float(np.median(size[valid]))
+        unit = np.median(size[valid])
     beyond = size > limits.largest * unit
     if beyond.sum() > _FEW * (size >= 0.0).sum():  # another unit, which whoever uses the log refuses
         beyond = size >= _ABSURD

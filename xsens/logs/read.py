@@ -1,25 +1,18 @@
 """Read logs of the sensor; the kind of a log is told by its content, never by its name."""
 
-from dataclasses import replace
 from io import TextIOWrapper
 
-import numpy as np
-
-from speckle3d.core.arrays import ByteArray
-from speckle3d.core.errors import InvalidInputError, naming
+from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.files import PathLike, open_regular
-from xsens.logs.datamessages import legacy_samples, mtdata2_samples
-from xsens.logs.parts import Hints, assemble_log
+from xsens.logs.assembly import Hints
+from xsens.logs.datamessages import parse_stream
 from xsens.logs.samples import ImuLog
 from xsens.logs.textlogs import parse_text
-from xsens.messages.control import MessageId
 from xsens.messages.framing import find_frames
 
 _HEAD_BYTES = 1 << 16
 _WIDE = (b"\xff\xfe", b"\xfe\xff")
 """First bytes of text whose characters take two bytes."""
-
-_DATA = (MessageId.MT_DATA, MessageId.MT_DATA2)
 
 
 def read_log(path: PathLike, hints: Hints | None = None) -> ImuLog:
@@ -65,50 +58,3 @@ def read_log(path: PathLike, hints: Hints | None = None) -> ImuLog:
             with TextIOWrapper(file, encoding, errors="replace") as text:
                 return parse_text(text, hints, str(path))
         return parse_stream(file.read(), hints, str(path))  # which alone holds the bytes
-
-
-# -- the sensor's own bytes
-
-
-def parse_stream(data: bytes | ByteArray, hints: Hints | None = None, source: str = "stream") -> ImuLog:
-    """Read the samples in a run of bytes from the sensor.
-
-    The bytes may start in the middle of a message and have losses; the notes tell what was skipped.
-
-    Parameters
-    ----------
-    data : bytes or ndarray of uint8
-    hints : Hints, optional
-    source : str
-        Name of the bytes in errors.
-
-    Returns
-    -------
-    ImuLog
-
-    Raises
-    ------
-    InvalidInputError
-        If they hold no data message, or lack what is needed to understand one.
-    """
-    with naming(source):
-        frames, notes = find_frames(data), list[str]()
-        data_mask = np.isin(frames.mid, _DATA)
-        if not data_mask.any():
-            content = f"{len(frames)} others in {frames.data.size} bytes"
-            raise InvalidInputError(
-                f"expected messages with data, got {content if frames.data.any() else 'nothing but zeros'}"
-            )
-        kinds = frames.mid.astype(np.uint16) * 256 + frames.bid
-        indices = np.flatnonzero(data_mask & (kinds == np.bincount(kinds[data_mask]).argmax()))
-        if runs := frames.gaps():
-            size = sum(length for _, length in runs)
-            places = f"{len(runs)} places, first at byte {runs[0][0]}"
-            notes.append(f"{size} bytes in {places}, belong to no message")
-        if left_out := int(data_mask.sum()) - indices.size:
-            notes.append(f"{left_out} data messages of another kind or unit were left out")
-        read = legacy_samples if frames.mid[indices[0]] == MessageId.MT_DATA else mtdata2_samples
-        parts = read(frames, indices)
-        parts = replace(parts, notes=(*notes, *parts.notes))
-        del data, frames, indices  # as large as the samples
-        return assemble_log(parts, hints or Hints(), source)

@@ -37,7 +37,7 @@ def median_norm(rows: FloatArray) -> float:
     """Median length of the rows that have one; NaN if none has."""
     norms = row_norms(rows)
     norms = norms[np.isfinite(norms)]
-    return float(np.median(norms)) if norms.size else float("nan")
+    return float(np.median(norms)) if norms.size else np.nan
 
 
 @dataclass(frozen=True)
@@ -132,7 +132,7 @@ class ImuLog:
         """Samples per second, lost ones included, as the sensor took them; NaN for a single sample."""
         steps = np.diff(self.time_s)
         if not steps.size:
-            return float("nan")
+            return np.nan
         regular = steps < _PAUSE * np.median(steps)
         regular[[gap.after_index for gap in self.gaps]] = False
         return float(1.0 / (steps[regular].mean() if regular.any() else np.median(steps)))

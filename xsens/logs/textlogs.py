@@ -5,7 +5,6 @@ perhaps temperature; or the 9 elements of a matrix. All other files name their c
 with their units. Plain files are written here too.
 """
 
-import os
 import re
 from collections.abc import Iterable
 from io import StringIO
@@ -15,9 +14,17 @@ import numpy as np
 
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError, naming
-from speckle3d.core.files import whole_file
+from speckle3d.core.files import PathLike, whole_file
+from xsens.logs.assembly import (
+    Claim,
+    Hints,
+    Parts,
+    are_rotations,
+    assemble_log,
+    quaternions_of,
+    rotation_vectors,
+)
 from xsens.logs.clocks import SHORTEST_S, TICK_S, Stamps, usual_step
-from xsens.logs.parts import Hints, Parts, assemble_log
 from xsens.logs.samples import VECTORS, ImuLog, median_norm
 from xsens.logs.texttables import (
     STAMPS,
@@ -29,7 +36,6 @@ from xsens.logs.texttables import (
     read_table,
     unwrap_column,
 )
-from xsens.logs.worlds import Claim, are_rotations, quaternions_of, rotation_vectors
 
 _SENSOR_LIKE = re.compile("acc|gyr|mag|quat|euler|roll|pitch|yaw|time")
 _EQUALS = r"\s*[:=,;][,;\s]*"
@@ -157,7 +163,7 @@ def _stamps(
     columns = dict(table.columns)
     if rate_hz is None and (rate_line := _RATE.search("\n".join(table.header))):
         rate_hz = number(rate_line[1])
-    period_s = 1.0 / rate_hz if rate_hz and rate_hz > 0.0 else float("nan")
+    period_s = 1.0 / rate_hz if rate_hz and rate_hz > 0.0 else np.nan
     for key in STAMPS:
         if key in columns and columns[key].size > 1 and not (columns[key] != columns[key][0]).any():
             notes.append(f"{key}: the same in every line, left out")
@@ -241,7 +247,7 @@ def _unknown_columns(table: TextTable) -> tuple[str, ...]:
 # -- writing
 
 
-def write_csv(path: str | os.PathLike[str], log: ImuLog) -> None:
+def write_csv(path: PathLike, log: ImuLog) -> None:
     """Write samples as a plain comma-separated file, which `read_log` reads back exactly.
 
     Columns: ``time_s``, ``counter``, ``accelerometer_x_m_s2`` and so on, ``gyroscope_x_rad_s``,

@@ -217,7 +217,7 @@ def number(cell: str) -> float:
         with suppress(ValueError):
             moment = datetime.fromisoformat(text)
             return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
-    return float("nan")
+    return math.nan
 
 
 def _split(line: str, separator: str | None) -> list[str]:

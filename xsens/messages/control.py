@@ -10,7 +10,7 @@ import struct
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from enum import IntEnum
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -33,7 +33,6 @@ class MessageId(IntEnum):
     REQ_CONFIGURATION = 0x0C
     CONFIGURATION = 0x0D
     GO_TO_MEASUREMENT = 0x10
-    GO_TO_MEASUREMENT_ACK = 0x11
     GO_TO_CONFIG = 0x30
     MT_DATA = 0x32
     MT_DATA2 = 0x36
@@ -49,16 +48,12 @@ class MessageId(IntEnum):
     SKIP_FACTOR = 0xD4
 
 
+DATA = (MessageId.MT_DATA, MessageId.MT_DATA2)
+
+
 def rate_of(period: int) -> float:
     """Rate in Hz by a period in ticks; NaN if it is zero."""
     return BASE_RATE_HZ / period if period else float("nan")
-
-
-class UnitConfiguration(NamedTuple):
-    """Output mode and settings of a unit: see `xsens.messages.mtdata.DataLayout`."""
-
-    output_mode: int
-    output_settings: int
 
 
 _HEAD = struct.Struct(">4xHH88xH")
@@ -68,10 +63,13 @@ _UNIT = struct.Struct(">6xHI8x")
 
 
 class Configuration(NamedTuple):
-    """Messages per second (NaN if they are sent only on request), and units: several behind a master."""
+    """Messages per second (NaN if they are sent only on request), and units: several behind a master.
+
+    A unit is its output mode and settings, as `xsens.messages.mtdata.DataLayout` has them.
+    """
 
     rate_hz: float
-    units: tuple[UnitConfiguration, ...]
+    units: tuple[tuple[int, int], ...]
 
     @classmethod
     def from_message(cls, message: Message) -> Configuration:
@@ -83,8 +81,8 @@ class Configuration(NamedTuple):
                 f"configuration: expected {_HEAD.size} bytes and {_UNIT.size} for each of {count} units, "
                 f"got {len(payload)}"
             )
-        units = map(UnitConfiguration._make, _UNIT.iter_unpack(payload[_HEAD.size :]))
-        return cls(rate_of(0 if skip == _ON_REQUEST else period * (skip + 1)), tuple(units))
+        units: Any = tuple(_UNIT.iter_unpack(payload[_HEAD.size :]))
+        return cls(rate_of(0 if skip == _ON_REQUEST else period * (skip + 1)), units)
 
 
 _UTC = struct.Struct(">IH6B")

@@ -158,8 +158,7 @@ def rows_at(data: ByteArray, start: IntArray, size: int) -> ByteArray:
 
 def find_frames(data: bytes | ByteArray) -> Frames:
     """Find every message in `data`, which may hold other bytes before, between and after them."""
-    array = data if isinstance(data, np.ndarray) else np.frombuffer(data, dtype=np.uint8)
-    array = np.ascontiguousarray(array)
+    array = np.frombuffer(data, dtype=np.uint8)
     start, end, _ = _scan(array)
     return Frames(array, start, end)
 

@@ -12,7 +12,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
+from numpy.typing import NDArray
 
 from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.errors import InvalidInputError
@@ -28,7 +28,7 @@ The second is over 2**20; the third a 48-bit integer over 2**32, its fraction be
 """
 
 
-def as_floats(numbers: npt.NDArray[Any]) -> FloatArray:
+def as_floats(numbers: NDArray[Any]) -> FloatArray:
     """Float64 of numbers of one of the types in `REAL`, or of unsigned whole numbers."""
     if numbers.dtype == REAL[1]:
         return numbers / 2.0**20
@@ -39,32 +39,20 @@ def as_floats(numbers: npt.NDArray[Any]) -> FloatArray:
 
 
 class OutputMode(IntFlag):
-    """Parts that the sensor sends."""
+    """Parts that are asked for or told apart; all are in `_PARTS`."""
 
-    TEMPERATURE = 0x0001
     CALIBRATED = 0x0002
     ORIENTATION = 0x0004
-    AUXILIARY = 0x0008
-    POSITION = 0x0010
-    VELOCITY = 0x0020
-    STATUS = 0x0800
     RAW = 0x4000
     MT9 = 0x8000
     """The MT9-B's raw record, which begins with the counter."""
 
 
 class OutputSettings(IntFlag):
-    """Options of the parts; orientation and number format are fields of two bits, see `DataLayout`."""
+    """Options; orientation and number format are fields of two bits, see `DataLayout`."""
 
     COUNTER = 0x1
     UTC = 0x2
-    EULER = 0x4
-    MATRIX = 0x8
-    NO_ACCELEROMETER = 0x10
-    NO_GYROSCOPE = 0x20
-    NO_MAGNETOMETER = 0x40
-    NO_ANALOG_1 = 0x400
-    NO_ANALOG_2 = 0x800
     NED = 0x80000000
 
 
@@ -86,18 +74,18 @@ _RAW = (
 _COUNTER = Field("counter", 1, ">u2")
 _ORIENTATION = (Field("quaternion_wxyz", 4), Field("euler_deg", 3), Field("matrix", 9), None)
 _PARTS = (
-    (OutputMode.TEMPERATURE, 0, Field("temperature_c", 1)),
-    (OutputMode.CALIBRATED, OutputSettings.NO_ACCELEROMETER, Field("accelerometer_m_s2", 3)),
-    (OutputMode.CALIBRATED, OutputSettings.NO_GYROSCOPE, Field("gyroscope_rad_s", 3)),
-    (OutputMode.CALIBRATED, OutputSettings.NO_MAGNETOMETER, Field("magnetometer_au", 3)),
+    (0x0001, 0, Field("temperature_c", 1)),
+    (OutputMode.CALIBRATED, 0x10, Field("accelerometer_m_s2", 3)),
+    (OutputMode.CALIBRATED, 0x20, Field("gyroscope_rad_s", 3)),
+    (OutputMode.CALIBRATED, 0x40, Field("magnetometer_au", 3)),
     (OutputMode.ORIENTATION, 0, None),
-    (OutputMode.AUXILIARY, OutputSettings.NO_ANALOG_1, Field("analog_1", 1, ">u2")),
-    (OutputMode.AUXILIARY, OutputSettings.NO_ANALOG_2, Field("analog_2", 1, ">u2")),
-    (OutputMode.POSITION, 0, Field("position", 3)),
-    (OutputMode.VELOCITY, 0, Field("velocity_m_s", 3)),
-    (OutputMode.STATUS, 0, Field("status", 1, ">u1")),
+    (0x0008, 0x400, Field("analog_1", 1, ">u2")),
+    (0x0008, 0x800, Field("analog_2", 1, ">u2")),
+    (0x0010, 0, Field("position", 3)),
+    (0x0020, 0, Field("velocity_m_s", 3)),
+    (0x0800, 0, Field("status", 1, ">u1")),
 )
-"""Part, the setting that leaves the field out, and the field (None: by the settings), in order."""
+"""Bit of the mode, the setting that leaves the field out, and the field (None: by the settings), in order."""
 
 
 @dataclass(frozen=True)
@@ -152,12 +140,7 @@ class DataLayout:
         real = REAL[(self.settings >> 8) & 3]
         return np.dtype([(field.name, field.whole or real, (field.count,)) for field in self.fields])
 
-    @property
-    def size(self) -> int:
-        """Bytes of the payload."""
-        return self.dtype.itemsize
-
-    def decode(self, frames: Frames, name: str) -> npt.NDArray[Any]:
+    def decode(self, frames: Frames, name: str) -> NDArray[Any]:
         """Numbers of a field in messages of this layout, shape (n, count); for `as_floats`."""
         kind, offset = self.dtype.fields[name][:2]  # type: ignore[index]
         return rows_at(frames.data, frames.payload_start + offset, kind.itemsize).view(kind.base)
@@ -165,7 +148,7 @@ class DataLayout:
 
 # -- MTData2
 
-KINDS = {
+_ITEMS = {
     0x1020: Field("counter", 1, ">u2"),
     0x1060: Field("ticks", 1, ">u4"),
     0x2010: Field("quaternion_wxyz", 4),
@@ -177,15 +160,12 @@ KINDS = {
     0x8030: Field("delta_q_wxyz", 4),
     0xC020: Field("magnetometer_au", 3),
 }
-"""Identifiers of the vendor's list that are read, their last four bits zero for real numbers."""
+"""Identifiers of the vendor's list that are read."""
+
+KINDS = {first + k: kind for first, kind in _ITEMS.items() for k in range(1 if kind.whole else 12)}
+"""Those of all formats (two bits) and worlds (two above them) of real numbers as well."""
 
 _WORLDS = ("ENU", "NED", "NWU")
-
-
-def kind_of(identifier: int) -> Field | None:
-    """Meaning of `identifier` in any format and world; None if it is not read."""
-    general = KINDS.get(identifier & 0xFFF0)
-    return general if general and not general.whole and identifier & 0xC != 0xC else KINDS.get(identifier)
 
 
 def read_items(frames: Frames) -> tuple[Values, str, BoolArray, BoolArray]:
@@ -215,7 +195,7 @@ def read_items(frames: Frames) -> tuple[Values, str, BoolArray, BoolArray]:
         after = at + 3 + sizes
         damage[rows[after > end]] = True
         for identifier in np.unique(identifiers).tolist():
-            if (kind := kind_of(identifier)) is None:
+            if (kind := KINDS.get(identifier)) is None:
                 continue
             number = np.dtype(kind.whole or REAL[identifier & 3])
             size = kind.count * number.itemsize

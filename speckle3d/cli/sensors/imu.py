@@ -70,7 +70,7 @@ def orientation_of(
             )
         return log.rotations(), None
 
-    orientation = xsens.orient(log, xsens.FusionSettings(use_magnetometer=magnetometer), method)
+    orientation = xsens.orient(log, magnetometer, method)
     note(*orientation.notes)
     return orientation.rotations, orientation
 
@@ -278,11 +278,10 @@ def accuracy(
                 note("the target's mounting is found from the motion: constant errors do not show")
                 truth = truth * xsens.mounting_from_motion(readings * mountings.mean(), truth)
         errors = xsens.pair_errors(readings, truth, mountings)
-    table = xsens.AccuracyTable.of({log_file.stem: errors})
     if figure is not None:
-        save_figure(xsens.figure_turns({log_file.stem: errors}, log_file.name), figure)
+        save_figure(xsens.figure_turns(errors, log_file.name), figure)
     how = f"{len(errors)} errors: pairs of {errors.frames} orientations, {len(mountings)} calibrations"
-    return rows_of(table.values())[0], f"{table.text()}\n{how}"
+    return rows_of(errors.values(log_file.stem))[0], f"{errors.text(log_file.stem)}\n{how}"
 
 
 def _optical(path: Path) -> xsens.TimedRotations:

@@ -39,9 +39,6 @@ MODEL = np.dtype(
         ("iron_put_on", "f8"),  # of iron put on later, zero if none ever is
         ("first_place", "f8"),  # of what the first place adds
         ("beside_iron", "?"),  # whether that place is left at a reading that shows another
-        ("place", "f8"),  # of what any other place adds
-        ("white_sqrt_s", "f8"),  # of a reading's noise
-        ("lag_s", "f8"),
         ("first_stray", "f8"),  # of the first reading's stray, a fraction of the stray's
     ],
     align=True,
@@ -69,6 +66,17 @@ HEADING = np.dtype([(name, "f8") for name in ("turn_rad", "variance", "evidence"
 """Angle from the level axes to north at the end of a bin, and its variance; logarithm of the density of its
 reading in movement; of the odds that the first place was beside iron; the reading's weight, 0 to 1; the
 stray."""
+
+_LAG_S = 0.015
+"""Standard deviation of the magnetometer's delay behind the gyroscope: a chip that averages readings and
+sends them at a lower rate is 10 to 20 ms late."""
+
+_NOISE_SQRT_S = 0.002
+"""Noise of the magnetometer, as a fraction of the field's norm."""
+
+_PLACE = 0.05
+"""Standard deviation of what a place adds to the room's field, as a fraction of its norm, per component: 8
+degrees of heading where the field dips by 68 degrees."""
 
 _LEAST_STRAY, _MOST_STRAY = 0.005, 0.3
 
@@ -160,10 +168,10 @@ def _begin(s: Any, b: Any, m: Any) -> None:
     if not s.ran:
         s.norm = norm(b.field)
         _forget(s, IRON, 3, m.iron)
-        _forget(s, LAG, 1, m.lag_s)
+        _forget(s, LAG, 1, _LAG_S)
     _forget(s, ROOM, 3, 1.0)
     _forget(s, BIAS, 3, math.sqrt(b.bias_variance))
-    _forget(s, PLACE, 3, m.place if s.ran else m.first_place)
+    _forget(s, PLACE, 3, _PLACE if s.ran else m.first_place)
     _forget(s, STRAY, 3, m.first_stray * s.stray)
     s.x[ROOM : ROOM + 3] = b.field / s.norm - b.level @ s.x[IRON : IRON + 3]
     s.bias[:] = b.bias
@@ -186,7 +194,7 @@ def _predict(s: Any, b: Any, m: Any, f: FloatArray, q: FloatArray) -> None:
     moving, moves_on = 0.0 if b.resting else 1.0, b.resting != s.rested
     keep_bias, keep_stray = math.exp(-span / _BIAS_S), math.exp(-moving * span / _STRAY_S)
     leaves = m.beside_iron and s.changing_s > 0.0  # iron, and at last for a place as any other
-    place = m.first_place if leaves and s.changing_s > span else m.place
+    place = m.first_place if leaves and s.changing_s > span else _PLACE
     moves_on = moves_on or leaves
     s.rested = b.resting
     s.x[BIAS : BIAS + 3] -= b.bias - s.bias
@@ -257,7 +265,7 @@ def _foresee_change(s: Any, m: Any, f: FloatArray, q: FloatArray, off: FloatArra
             s.p[i, i] += m.iron_put_on**2
             q[i, i] += m.iron_put_on**2
         return True
-    wide, _ = inverse(total + m.place**2 * np.eye(3))
+    wide, _ = inverse(total + _PLACE**2 * np.eye(3))
     if not s.beside or off @ (wide @ off) <= _OUTLIER:
         return False
     s.beside, s.changing_s = False, _CHANGE_S
@@ -278,7 +286,7 @@ def _innovation(s: Any, b: Any, m: Any, rows: FloatArray) -> tuple[FloatArray, F
     total = rows @ cross
     across, up = s.x[ROOM] ** 2 + s.x[ROOM + 1] ** 2, s.x[ROOM + 2] ** 2
     for i in range(3):
-        total[i, i] += m.white_sqrt_s**2 / b.span_s + b.tilt_rad2 * (up if i < 2 else across)
+        total[i, i] += _NOISE_SQRT_S**2 / b.span_s + b.tilt_rad2 * (up if i < 2 else across)
     return b.field / s.norm - rows @ s.x, cross, total
 
 

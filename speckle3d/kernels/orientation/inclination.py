@@ -53,6 +53,7 @@ FILTER = np.dtype(
         ("speed", "f8", 3),
         ("p", "f8", (SIZE, SIZE)),
         ("fresh", "f8", SIZE),  # variances at a start
+        ("scale_noise_sqrt_s", "f8"),  # error of the gyroscope's scale and axes, a fraction of the turn
         ("rest_known", "?"),
         ("rest_rate", "f8", 3),  # means of lately
         ("rest_force", "f8", 3),
@@ -92,6 +93,31 @@ STEP = np.dtype(
 )
 """One increment, and the filter before and after it."""
 
+BLOCK_S = 1.0 / 32.0
+"""Length of the increments: short against hand movement (tremor is below 12 Hz)."""
+
+GRAVITY_M_S2 = 9.80665
+"""Standard gravity; local gravity differs by 0.3 % at most and an accelerometer by more."""
+
+_GYRO_NOISE_RAD_SQRT_S = math.radians(0.05)
+"""Angle random walk: an MT9-B's Allan deviation at 1 s. Newer sensors have a tenth."""
+
+_BIAS_WALK_RAD_S_SQRT_S = math.radians(0.002)
+"""Random walk of the bias: 0.05 deg/s in ten minutes."""
+
+SPEED_M_S, _SPEED_TIME_S = 0.5, 0.5
+"""Standard deviation of a hand's speed about its mean, zero, and how long a speed persists."""
+
+_FORCE_NOISE_M_S_SQRT_S = 0.01
+"""Velocity random walk of the accelerometer, misalignment in quick movement included."""
+
+_STILL_RAD_S, _STILL_M_S2, _STILL_S = math.radians(1.0), 0.3, 1.5
+"""A sensor rests if for the last of these neither reading is farther from its mean of half a second."""
+
+_STILL_BIAS_RAD_S = math.radians(0.2)
+"""A resting sensor's rate differs from the bias by no more (beyond 3 sd of the bias): slower, steady turning
+is taken for bias."""
+
 _SHOCK_M_S2 = 60.0
 """Mean force of an increment beyond which it is not believed: a board shaken by hand in BROAD reads 51."""
 
@@ -122,7 +148,6 @@ def run_filter(
     lost_rad2: FloatArray,
     to_end: bool,
     filters: Any,
-    limits: Any,
     partial: Any,
     steps: Any,
     covariance: FloatArray,
@@ -141,8 +166,6 @@ def run_filter(
         The last sample completes an increment, however short.
     filters : structured ndarray, shape (1,), of `FILTER`
         Changed in place.
-    limits : structured ndarray, shape (1,)
-        Numbers of `xsens.fusion.settings.FusionSettings` by name.
     unfinished : structured ndarray, shape (1,), of `STEP`
         The increment that is not complete, from one call to the next.
     steps : structured ndarray, shape (n,), of `STEP`
@@ -151,16 +174,16 @@ def run_filter(
     xyzw : ndarray, shape (m, 4)
         Level axes from the sensor's at every sample, by what came before it.
     """
-    s, r, step, f, n = filters[0], limits[0], partial[0], np.zeros((SIZE, SIZE)), 0
+    s, step, f, n = filters[0], partial[0], np.zeros((SIZE, SIZE)), 0
     for k in range(step_s.shape[0]):
         if s.pause_s >= 0.0:
-            _set_up(s, r, force_m_s2[k])
+            _set_up(s, force_m_s2[k])
             _open(s, step)
         _add(step, step_s[k], rate_rad_s[k], force_m_s2[k], field_au[k])
         step.lost_rad2 += lost_rad2[k]
-        whole = step.duration_s + 0.5 * step_s[k] >= r.block_s or (to_end and k == step_s.shape[0] - 1)
+        whole = step.duration_s + 0.5 * step_s[k] >= BLOCK_S or (to_end and k == step_s.shape[0] - 1)
         if whole:
-            _complete(s, r, step, f)
+            _complete(s, step, f)
             if covariance.shape[0] > 0:
                 covariance[n], transition[n] = s.p, f
             step.last = k + 1
@@ -198,15 +221,15 @@ def _add(step: Any, dt: float, rate: FloatArray, force: FloatArray, field: Float
 
 
 @compiled
-def _complete(s: Any, r: Any, step: Any, f: FloatArray) -> None:
+def _complete(s: Any, step: Any, f: FloatArray) -> None:
     """Predict over an increment, and correct; fill what it leaves behind, and its transition."""
     step.rate /= step.duration_s
     step.field /= step.fields if step.fields > 0.0 else math.nan
-    _predict(s, r, step, f)
+    _predict(s, step, f)
     if s.starting:
         _begin(s, step)
     else:
-        _correct_by_speed(s, r, step)
+        _correct_by_speed(s, step)
         if s.resting:
             off = step.rate - s.bias
             gain = _correct(s.p, BIAS, _REST_BIAS_RAD**2 / step.duration_s, _LEVEL)
@@ -231,12 +254,12 @@ def _upright(force: FloatArray) -> Quaternion:
 
 
 @compiled
-def _set_up(s: Any, r: Any, force: FloatArray) -> None:
+def _set_up(s: Any, force: FloatArray) -> None:
     """Begin before the first sample: anew, or after a pause with the bias found so far."""
     bias_variance = s.p[BIAS : BIAS + 3, BIAS : BIAS + 3].copy()
     s.p[:] = np.diag(s.fresh)
     if s.running:
-        walk = r.bias_walk_rad_s_sqrt_s**2 * s.pause_s
+        walk = _BIAS_WALK_RAD_S_SQRT_S**2 * s.pause_s
         s.p[BIAS : BIAS + 3, BIAS : BIAS + 3] = bias_variance + walk * np.eye(3)
     s.running = s.starting = True
     s.resting = s.rest_known = False
@@ -261,7 +284,7 @@ def _begin(s: Any, step: Any) -> None:
 
 
 @compiled
-def _rest(s: Any, r: Any, step: Any) -> None:
+def _rest(s: Any, step: Any) -> None:
     """Note whether the sensor rests."""
     force = step.force / step.duration_s
     if not s.rest_known:
@@ -272,18 +295,18 @@ def _rest(s: Any, r: Any, step: Any) -> None:
     s.rest_force[:] = s.rest_force + share * force_off
     bias_sd = math.sqrt(max(s.p[3, 3], s.p[4, 4], s.p[5, 5], 0.0))
     still = (
-        norm(rate_off) < r.rest_rate_rad_s
-        and norm(force_off) < r.rest_force_m_s2
-        and norm(s.rest_rate - s.bias) < r.rest_bias_rad_s + 3.0 * bias_sd
+        norm(rate_off) < _STILL_RAD_S
+        and norm(force_off) < _STILL_M_S2
+        and norm(s.rest_rate - s.bias) < _STILL_BIAS_RAD_S + 3.0 * bias_sd
     )
     s.still_s = s.still_s + step.duration_s if still else 0.0
-    s.resting = s.still_s > r.rest_after_s
+    s.resting = s.still_s > _STILL_S
 
 
 @compiled
-def _predict(s: Any, r: Any, step: Any, f: FloatArray) -> None:
+def _predict(s: Any, step: Any, f: FloatArray) -> None:
     """Predict over one increment; fill its transition."""
-    _rest(s, r, step)
+    _rest(s, step)
     level, duration = quaternion(s.level), step.duration_s
     f[:] = np.eye(SIZE)
     span = 0.0 if s.resting else duration
@@ -291,32 +314,32 @@ def _predict(s: Any, r: Any, step: Any, f: FloatArray) -> None:
         axis = np.array(rotate(level, three(_AXES[j])))
         f[:BIAS, BIAS + j] = -span * axis
         f[SPEED:, BIAS + j] = span * np.cross(axis, s.speed)
-    f[6, 1], f[7, 0] = r.gravity_m_s2 * duration, -r.gravity_m_s2 * duration
+    f[6, 1], f[7, 0] = GRAVITY_M_S2 * duration, -GRAVITY_M_S2 * duration
     shock = max(norm(step.force) - _SHOCK_M_S2 * duration, 0.0)  # a knock, whose reading may be cut off
-    noise = r.gyro_noise_rad_sqrt_s**2 + (r.gyro_scale_noise_sqrt_s * norm(step.rate - s.bias)) ** 2
+    noise = _GYRO_NOISE_RAD_SQRT_S**2 + (s.scale_noise_sqrt_s * norm(step.rate - s.bias)) ** 2
     if s.resting:
-        noise = (_REST_NOISE * r.gyro_noise_rad_sqrt_s) ** 2
+        noise = (_REST_NOISE * _GYRO_NOISE_RAD_SQRT_S) ** 2
     step.noise[:3] = noise * duration + step.lost_rad2
-    step.noise[3:6] = r.bias_walk_rad_s_sqrt_s**2 * duration
-    step.noise[6:] = r.force_noise_m_s_sqrt_s**2 * duration + shock**2
+    step.noise[3:6] = _BIAS_WALK_RAD_S_SQRT_S**2 * duration
+    step.noise[6:] = _FORCE_NOISE_M_S_SQRT_S**2 * duration + shock**2
     s.p[:] = f @ s.p @ f.T
     for i in range(SIZE):
         s.p[i, i] += step.noise[i]
     s.speed += np.array(rotate(level, three(step.force)))
-    s.speed[2] -= r.gravity_m_s2 * duration
+    s.speed[2] -= GRAVITY_M_S2 * duration
     if not s.resting:
         s.level[:] = product(level, quaternion(step.turn))
     step.predicted[:], step.predicted_speed[:] = s.level, s.speed
 
 
 @compiled
-def _correct_by_speed(s: Any, r: Any, step: Any) -> None:
+def _correct_by_speed(s: Any, step: Any) -> None:
     """Correct by a velocity of zero, whose error is a hand's, or smaller at rest, and persists.
 
     A velocity tells nothing of turning about up: its own direction turns as likely. So neither heading nor
     the bias about up is corrected by it, and their errors count as noise (Schmidt).
     """
-    speed, time_s = (_REST_SPEED_M_S, _REST_TIME_S) if s.resting else (r.speed_m_s, r.speed_time_s)
+    speed, time_s = (_REST_SPEED_M_S, _REST_TIME_S) if s.resting else (SPEED_M_S, _SPEED_TIME_S)
     up = np.array(rotate(invert(quaternion(s.level)), (0.0, 0.0, 1.0)))
     gain = _correct(s.p, SPEED, 2.0 * speed**2 * time_s / step.duration_s, up)
     _inject(s, -gain @ s.speed)

@@ -14,8 +14,7 @@ from calibration.images.solver import calibrate_from_sweeps
 from calibration.plane import calibrate_plane
 from calibration.settings import ImageFit
 from speed.rows import Row, time_runs
-from xsens.fusion.orient import orient
-from xsens.fusion.settings import Method
+from xsens.fusion.orient import Method, orient
 from xsens.logs.read import read_log
 from xsens.logs.samples import ImuLog
 

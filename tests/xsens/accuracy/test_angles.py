@@ -9,7 +9,6 @@ from scipy.spatial.transform import Rotation
 from speckle3d.core.geometry import rotation_from_fixed_angles
 from speckle3d.core.streams import TimedRotations
 from xsens.accuracy.angles import (
-    AccuracyTable,
     PairErrors,
     common_readings,
     mounting_from_motion,
@@ -55,8 +54,7 @@ class TestPairErrors:
 class TestTable:
     def test_mean_and_deviation_over_all_pairs_and_calibrations(self):
         error = np.deg2rad([[[1.0, 0.0, -2.0], [3.0, 0.0, -2.0]], [[1.0, 2.0, -2.0], [3.0, 2.0, -2.0]]])
-        table = AccuracyTable.of({"bench": PairErrors(2, np.zeros((2, 3)), error)}).statistics["bench"]
-        errors = np.rad2deg(list(table.values()))
+        errors = np.rad2deg(list(PairErrors(2, np.zeros((2, 3)), error).statistics().values()))
         right = [[2, 1, -2], [1, 1, 0], [5**0.5, 2**0.5, 2], [3, 2, 2], [0, 1, 0]]
         np.testing.assert_allclose(errors, right, atol=1e-12)
 

@@ -9,8 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from speckle3d.core.errors import InvalidInputError
 from xsens.fusion.online import OnlineFilter
-from xsens.fusion.orient import orient
-from xsens.fusion.settings import Method
+from xsens.fusion.orient import Method, orient
 from xsens.logs.samples import VECTORS, ImuLog
 
 RATE_HZ = 100.0

@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from speckle3d.core.errors import InvalidInputError, Speckle3DError
 from xsens.fusion.orient import orient
+from xsens.logs.datamessages import parse_stream
 from xsens.logs.faults import without_faults
-from xsens.logs.read import parse_stream
 from xsens.logs.samples import VECTORS, ImuLog
 from xsens.logs.textlogs import parse_text
 from xsens.messages.framing import encode

@@ -18,7 +18,8 @@ from imu_logs import (
 from imu_messages import Item, items_payload
 from scipy.spatial.transform import Rotation
 
-from xsens.logs.read import parse_stream, read_log
+from xsens.logs.datamessages import parse_stream
+from xsens.logs.read import read_log
 from xsens.logs.samples import Gap
 from xsens.logs.textlogs import write_csv
 from xsens.messages.control import MessageId, utc_message
@@ -65,11 +66,11 @@ def test_a_file_of_the_mt9_software(s, tmp_path):
 
 
 @pytest.mark.parametrize("form", range(4))
-@pytest.mark.parametrize("shape", [0, OutputSettings.EULER, OutputSettings.MATRIX])
+@pytest.mark.parametrize("shape", [0x0, 0x4, 0x8])
 @pytest.mark.parametrize("world", [0, OutputSettings.NED])
 def test_legacy_data_by_their_configuration(s, form, shape, world):
     layout = DataLayout(
-        EVERYTHING | OutputMode.TEMPERATURE | OutputMode.AUXILIARY | OutputMode.POSITION | OutputMode.STATUS,
+        EVERYTHING | 0x0819,  # temperature, analog inputs, position, status
         COUNTER_SETTING | OutputSettings.UTC | shape | form << 8 | world,
     )
     log = parse_stream(configuration(layout) + b"".join(legacy_messages(s, layout)))

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from speckle3d.core.errors import Speckle3DError
-from xsens.logs.read import parse_stream, read_log
+from xsens.logs.datamessages import parse_stream
+from xsens.logs.read import read_log
 from xsens.logs.samples import VECTORS, ImuLog
 
 CORPUS = sorted((Path(__file__).parent / "corpus").glob("*.bin"))

@@ -6,7 +6,7 @@ from imu_logs import WORLDS, samples
 from scipy.spatial.transform import Rotation
 
 from speckle3d.core.errors import InvalidInputError
-from xsens.logs.parts import Hints
+from xsens.logs.assembly import Hints
 from xsens.logs.textlogs import parse_text
 
 VECTORS = ("accelerometer_m_s2", "gyroscope_rad_s", "magnetometer_au")

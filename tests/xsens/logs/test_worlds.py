@@ -6,9 +6,8 @@ from imu_logs import WORLDS, samples
 from scipy.spatial.transform import Rotation
 
 from speckle3d.core.errors import InvalidInputError
-from xsens.logs.parts import Hints
+from xsens.logs.assembly import Claim, Hints
 from xsens.logs.textlogs import parse_text
-from xsens.logs.worlds import Claim
 
 UNNOTICED_DEG = 1e-3
 """Six decimals of a quaternion, in degrees, tenfold."""

@@ -1,19 +1,22 @@
-"""The sensor's own orientation, in any notation and world, as rotations to north, west and up (NWU).
+"""Samples as sent, from all readers of logs, to an `ImuLog`, and the sensor's own orientation to NWU.
 
-Turned into its world, the acceleration shows whether z is up (ENU, NWU) or down (NED), and the field's
-horizontal part whether north is y (ENU) or x (NWU, NED). Both are medians, so that movement and iron nearby
-may disturb some samples. The dip of the field has no part in it: it points up in the south.
+The orientation may be in any notation and world; NWU is x north, y west, z up. Turned into its world, the
+acceleration shows whether z is up (ENU, NWU) or down (NED), and the field's horizontal part whether north is
+y (ENU) or x (NWU, NED). Both are medians, so that movement and iron nearby may disturb some samples. The dip
+of the field has no part in it: it points up in the south.
 """
 
 from collections.abc import Mapping
-from dataclasses import replace
-from typing import NamedTuple
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.errors import InvalidInputError
+from xsens.logs.clocks import Stamps, timeline
+from xsens.logs.faults import without_faults
 from xsens.logs.samples import ImuLog, row_norms
 
 WORLDS = {
@@ -65,11 +68,99 @@ class Claim(NamedTuple):
     by_default: bool = False
 
 
-def nwu_from(world: str) -> Rotation:
-    """Rotation from a world by name; raises `InvalidInputError` if there is none of that name."""
-    if world.upper() not in WORLDS:
-        raise InvalidInputError(f"world: expected {', '.join(WORLDS)}, got {world!r}")
-    return WORLDS[world.upper()]
+@dataclass(frozen=True)
+class Hints:
+    """Facts known beside the log; each outweighs what the log says.
+
+    Attributes
+    ----------
+    rate_hz : float, optional
+        Samples per second, for logs with a counter but no clock.
+    world : str, optional
+        Of the sensor's own orientation, ENU, NED or NWU.
+    as_stated : bool
+        Take the world that the log states or its program's default, whatever its readings show: too few
+        samples of a live stream show nothing.
+
+    Raises
+    ------
+    InvalidInputError
+        If no sensor has such a rate, or there is no such world.
+    """
+
+    rate_hz: float | None = None
+    world: str | None = None
+    as_stated: bool = False
+
+    def __post_init__(self) -> None:
+        if self.rate_hz is not None and not 1e-3 <= self.rate_hz <= 1e5:
+            raise InvalidInputError(f"rate_hz: expected 0.001 to 100000, got {self.rate_hz:g}")
+        if self.world is not None and self.world.upper() not in WORLDS:
+            raise InvalidInputError(f"world: expected {', '.join(WORLDS)}, got {self.world!r}")
+
+
+@dataclass(frozen=True)
+class Parts:
+    """Samples as they were sent, one row for each message or line.
+
+    Attributes
+    ----------
+    stamps : Stamps
+    vectors : mapping of str to ndarray, shape (m, 3)
+        Readings by the names in `VECTORS`.
+    notations : mapping of str to ndarray, shape (m, 4)
+        The sensor's own orientation, as `to_nwu` has it.
+    claim : Claim, optional
+        Its world; None for one that has nothing to do with north and up.
+    increments : mapping of str to ndarray, shape (m, 3)
+        Of velocity, and rotation vectors, over each sampling period, by the names of their rates.
+    """
+
+    stamps: Stamps
+    vectors: Mapping[str, FloatArray]
+    notations: Mapping[str, FloatArray]
+    claim: Claim | None
+    notes: tuple[str, ...]
+    increments: Mapping[str, FloatArray]
+
+
+def assemble_log(parts: Parts, hints: Hints, source: str) -> ImuLog:
+    """Build the log of samples, without those that are no measurements.
+
+    Raises
+    ------
+    InvalidInputError
+        If they have neither a clock, nor a rate; if orientation and acceleration contradict each other; or if
+        they are of several sensors.
+    """
+    stamps, vectors = parts.stamps, {**parts.increments, **parts.vectors}
+    if hints.rate_hz is not None:
+        stamps = replace(stamps, period_s=1.0 / hints.rate_hz)
+    scaled = [name for name in parts.increments if name not in parts.vectors]
+    notes = [*parts.notes, *(f"{name.split('_')[0]}: increments over the sampling period" for name in scaled)]
+    line = timeline(stamps, [*vectors.values(), *parts.notations.values()])
+    notations = {meaning: wxyz[line.rows] for meaning, wxyz in parts.notations.items()}
+    wxyz = next(iter(notations.values()), np.zeros((0, 4)))
+    oriented = np.isfinite(wxyz[:, 0])
+    if missing := (~oriented).sum():
+        notes.append(f"{missing} samples lack the sensor's own orientation")
+    rotations = Rotation.from_quat(np.where(oriented[:, None], wxyz, 0.5), scalar_first=True)
+    columns: dict[str, Any] = {name: part[line.rows] for name, part in vectors.items()}
+    log = ImuLog(
+        line.time_s,
+        **columns,
+        world_from_sensor=rotations if oriented.any() else None,
+        counter=line.counter,
+        gaps=line.gaps,
+        notes=(*notes, *line.notes),
+        source=source,
+        oriented=oriented,
+    )
+    log = without_faults(replace(log, **{name: columns[name] * log.rate_hz for name in scaled}))
+    if log.world_from_sensor is None:
+        return log
+    claim = parts.claim if hints.world is None else Claim(hints.world.upper(), "as given", final=True)
+    return to_nwu(log, notations, claim, hints.as_stated)
 
 
 # -- notations
@@ -142,7 +233,7 @@ def to_nwu(
     if claim is not None and not as_stated:
         world, note = _world_of(claim, ups[meaning], _north_deg(_in_world(log, wxyz, log.magnetometer_au)))
         notes += filter(None, [note])
-    rotations = nwu_from(world) * Rotation.from_quat(wxyz, scalar_first=True)
+    rotations = WORLDS[world] * Rotation.from_quat(wxyz, scalar_first=True)
     return replace(log, world_from_sensor=rotations, notes=(*log.notes, *notes))
 
 
@@ -170,11 +261,11 @@ def _up(log: ImuLog, wxyz: FloatArray) -> FloatArray:
 
 def _world_of(claim: Claim, ups: FloatArray, north_deg: float) -> tuple[str, str]:
     """World of the orientations by what the readings say of it, and a note on it, perhaps empty."""
-    world = claim.world.upper()
+    world = claim.world
     if not ups.size:
         note = f"orientation: taken as {world}, {claim.by}: no accelerometer's reading tells"
         return world, note if claim.by_default else ""
-    up = float(np.median(ups))
+    up = np.median(ups)
     if abs(up) < _UPRIGHT:
         tilt = np.degrees(np.arccos(up))
         off = f"the orientation turns the accelerometer's reading {tilt:.0f} degrees from the vertical"
@@ -198,7 +289,7 @@ def _north_deg(fields: FloatArray) -> float:
     """Direction from x towards y of the horizontal part of fields in the world; NaN if they have none."""
     along = fields[:, :2] / np.maximum(row_norms(fields[:, :2]), 1e-12)[:, None]
     if not along.size or np.hypot(*along.mean(axis=0)) < _STEADY:
-        return float("nan")
+        return np.nan
     x, y = np.median(along, axis=0)
     return float(np.degrees(np.arctan2(y, x)))
 
