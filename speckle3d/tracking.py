@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from pathlib import Path
 from typing import Any
 
 from speckle3d.config import Config
@@ -10,7 +11,7 @@ from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.progress import Progress
 from speckle3d.core.sweep import Sweep
-from speckle3d.io.family.curves import curves_beside, read_curves, trust_words
+from speckle3d.io.family.curves import read_curves
 from speckle3d.matching.frames import ImageSink
 from speckle3d.pipeline import PairSink
 from speckle3d.pipeline import track as track_sweep
@@ -79,6 +80,29 @@ def track(
     require_kind(curves, DecorrelationCurves, "load_curves(path)")
     with naming(sweep.name):
         return track_sweep(sweep, curves, settings, progress, sink, images)
+
+
+def curves_beside(sweep_file: Path) -> Path:
+    """Path of the default curves of a sweep: curves.h5 in its folder.
+
+    Raises
+    ------
+    InvalidInputError
+        If there are none.
+    """
+    path = sweep_file.parent / "curves.h5"
+    if not path.is_file():
+        raise InvalidInputError(
+            f"expected decorrelation curves: --curves CURVES.h5 or {path}, got neither "
+            "(speckle3d calibrate curves makes them from a phantom sweep)"
+        )
+    return path
+
+
+def trust_words(path: Path, curves: DecorrelationCurves, same_probe: bool) -> str:
+    """Message that names the default curves and how far to trust them."""
+    percent = 196.0 * curves.mismatch(same_probe)
+    return f"curves: {path}, by {curves.origin}; lengths by them are right to {percent:.0f} % (95 %)"
 
 
 def require_kind(value: Any, kind: type, made_by: str) -> None:

@@ -89,10 +89,10 @@ def reconstruct(
     --------
     $ speckle3d reconstruct data/phantom.h5 -o out --drift orientation --drift pose
     """
-    from speckle3d.io.family.curves import curves_beside, trust_words
     from speckle3d.io.load import open_recording
     from speckle3d.study.posed import open_posed
     from speckle3d.study.scenes.voxels import write_voxels
+    from speckle3d.tracking import curves_beside, trust_words
 
     settings = s3.load_config(config_file).with_choices(drift_curves=drift_curves, region=region)
     modes, calibrations = list[str](dict.fromkeys(drift or ())), calibration or ()

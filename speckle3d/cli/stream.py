@@ -273,7 +273,7 @@ def play(
     require_extra("live", "play", "pyigtl", "fastcrc")
     from speckle3d.core.sweep import BModeSettings
     from speckle3d.io.igtl.link import Server
-    from speckle3d.io.igtl.played import clock_shift_s, played
+    from speckle3d.live.played import clock_shift_s, played
 
     read = s3.load_sweep(images)
     is_grey = isinstance(read.signal, BModeSettings)

@@ -21,12 +21,13 @@ from speckle3d.core.errors import Speckle3DError
 from speckle3d.core.progress import Progress
 from speckle3d.core.text import printable
 from speckle3d.io.family.calibrations import apply_calibrations
-from speckle3d.io.family.curves import curves_beside, read_curves
+from speckle3d.io.family.curves import read_curves
 from speckle3d.io.hdf5 import make_folder, one_line, sha256_of
 from speckle3d.io.load import load_sweep, recording_sha256
 from speckle3d.study.job import RESULTS, available_modes, run_job
 from speckle3d.study.results import FILES, Study, SweepOutcome, read_summary, require_own, write_study
 from speckle3d.study.schedulers import Scheduler
+from speckle3d.tracking import curves_beside
 
 
 @dataclass(frozen=True)

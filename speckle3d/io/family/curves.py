@@ -1,7 +1,5 @@
 """Decorrelation curves on disk (format ``speckle3d.curves``, version 1; 2 with a spectrum)."""
 
-from pathlib import Path
-
 import numpy as np
 
 from speckle3d.core.curves import CurveKey, DecorrelationCurves
@@ -12,29 +10,6 @@ from speckle3d.io.family.sweeps import read_signal
 from speckle3d.io.hdf5 import PathLike, open_family, read_text
 
 FORMAT = "speckle3d.curves"
-
-
-def curves_beside(sweep_file: Path) -> Path:
-    """Path of the default curves of a sweep: curves.h5 in its folder.
-
-    Raises
-    ------
-    InvalidInputError
-        If there are none.
-    """
-    path = sweep_file.parent / "curves.h5"
-    if not path.is_file():
-        raise InvalidInputError(
-            f"expected decorrelation curves: --curves CURVES.h5 or {path}, got neither "
-            "(speckle3d calibrate curves makes them from a phantom sweep)"
-        )
-    return path
-
-
-def trust_words(path: Path, curves: DecorrelationCurves, same_probe: bool) -> str:
-    """Message that names the default curves and how far to trust them."""
-    percent = 196.0 * curves.mismatch(same_probe)
-    return f"curves: {path}, by {curves.origin}; lengths by them are right to {percent:.0f} % (95 %)"
 
 
 def write_curves(path: PathLike, curves: DecorrelationCurves) -> None:

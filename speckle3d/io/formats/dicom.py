@@ -166,8 +166,6 @@ def _place(header: Any) -> Generator[Row, None, tuple[tuple[slice, slice], dict[
     # The first row taken is the region's last where y falls.
     for depth_cm in _along(region, "Y", y_cm, bottom - top if y_cm < 0 else 0):
         values["first_sample_depth_mm"] = Value(10.0 * depth_cm, "ReferencePixelY0 and its physical value")
-    if x_step < 0:
-        yield "columns", "run against the file's x (PhysicalDeltaX below 0): left as shown", ""
     depths = slice(top, bottom + 1)
     if y_cm < 0:
         yield "rows", "turned over: the file's y falls (PhysicalDeltaY below 0)", ""

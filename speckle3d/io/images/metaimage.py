@@ -46,10 +46,11 @@ _SIDES = ({"M", "F"}, {"M", "N"}, {"U", "F"}, {"U", "N"})
 
 @dataclass(frozen=True)
 class Layout:
-    """Layout of one image.
+    """Layout of the images of a file.
 
     Attributes
     ----------
+    header : SequenceHeader
     kind : str
         PLUS's image type: BRIGHTNESS, RF_REAL, RF_IQ_LINE (I and Q in turn along a line) or RF_I_LINE_Q_LINE
         (a line of I, a line of Q).
@@ -57,6 +58,7 @@ class Layout:
         As MF: columns to the marked side, rows away from the probe.
     """
 
+    header: SequenceHeader
     kind: str
     orientation: str
 
@@ -72,7 +74,7 @@ class Layout:
         usual = "FM" if kind in RF_TYPES else "MF"
         if machine and (machine[:1].upper() in "FN") == (usual == "FM"):
             usual = machine
-        return cls(kind, header.fields.get("UltrasoundImageOrientation", usual).upper())
+        return cls(header, kind, header.fields.get("UltrasoundImageOrientation", usual).upper())
 
     @property
     def is_rf(self) -> bool:
@@ -89,17 +91,6 @@ class Layout:
         """Whether depth grows, or shrinks, along the first axis."""
         return self.orientation.startswith(("F", "N"))
 
-    def fault(self, header: SequenceHeader) -> str:
-        """Why images are no ultrasound lines; empty where they are."""
-        content, dtype = "colour" if header.channels > 1 else self.kind, header.dtype.newbyteorder("=")
-        if content not in (*RF_TYPES, "BRIGHTNESS"):
-            return f"expected grey B-mode or RF images, got {content}: export them as grey"
-        if self.kind == "BRIGHTNESS" and dtype != np.uint8:
-            return f"expected B-mode of type uint8, got {dtype}"
-        if {*self.orientation[:2]} not in _SIDES or self.orientation[2:] not in ("", "A", "D"):
-            return f"UltrasoundImageOrientation: expected as MF, FM or MFA, got {self.orientation}"
-        return ""
-
     def frame(self, pixels: AnyArray) -> AnyArray:
         """Turn pixels, shape (y, x), into samples, shape (vector, sample): marked and far sides last."""
         lines = pixels if self.has_lines_in_rows else pixels.T
@@ -110,9 +101,10 @@ class Layout:
         lines = lines[:, ::-1] if "N" in self.orientation[:2] else lines
         return lines[::-1] if "U" in self.orientation[:2] else lines
 
-    def shape(self, size: tuple[int, ...]) -> tuple[int, int]:
-        """Vectors and samples of an image of a size (x, y)."""
-        vectors, samples = self.frame(np.broadcast_to(np.int8(0), size[1::-1])).shape
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Vectors and samples of an image."""
+        vectors, samples = self.frame(np.broadcast_to(np.int8(0), self.header.size[1::-1])).shape
         return vectors, samples
 
 
@@ -147,10 +139,10 @@ def open_sequence(path: Path, settings: ImportSettings) -> Facts:
         tracker, remarks = tracker_of(clock, poses.matrices)
     elif poses is None and names and settings.tracker_transform is None:
         remarks.append(f"no tracker: of {', '.join(names)}, name the sensor's with --transform")
-    if fault := _fault(header, layout, settings):
+    if fault := _fault(layout, settings):
         error = InvalidInputError(f"{path}: {fault}")
         return Recording(path, settings, tracker=tracker, remarks=remarks, fault=error)
-    own, place = own_values(header.path, header.fields), _calibration(header, settings, device, layout, poses)
+    own, place = own_values(header.path, header.fields), _calibration(settings, device, layout, poses)
     chain, substitutes = "", dict[str, str]()
     if poses is not None:
         has_mounting = place.value is not None and poses.pixels is None
@@ -186,8 +178,8 @@ def open_sequence(path: Path, settings: ImportSettings) -> Facts:
     return Recording(
         path,
         settings,
-        _frames(header, layout),
-        _numbers(next((size for size in sizes if size.value is not None), Value()), header, device, layout)
+        _frames(layout),
+        _numbers(next((size for size in sizes if size.value is not None), Value()), device, layout)
         | own_numbers,
         times,
         _faults(header),
@@ -202,8 +194,9 @@ def open_sequence(path: Path, settings: ImportSettings) -> Facts:
     )
 
 
-def _fault(header: SequenceHeader, layout: Layout, settings: ImportSettings) -> str:
+def _fault(layout: Layout, settings: ImportSettings) -> str:
     """Why there is no sweep in a file; empty where there is."""
+    header, kind, orientation = layout.header, layout.kind, layout.orientation
     if not header.has_images:
         use = f"a tracker's recording of {header.frame_count} frames, for --poses"
         return f"expected pixels of images, got {use if names_of(header) else 'none'}"
@@ -212,7 +205,14 @@ def _fault(header: SequenceHeader, layout: Layout, settings: ImportSettings) -> 
             "expected a sequence of images, got a volume, whose third axis is in space by its Kinds; if it "
             "is time, say so by --frame-rate-hz"
         )
-    return layout.fault(header)
+    content, dtype = "colour" if header.channels > 1 else kind, header.dtype.newbyteorder("=")
+    if content not in (*RF_TYPES, "BRIGHTNESS"):
+        return f"expected grey B-mode or RF images, got {content}: export them as grey"
+    if not layout.is_rf and dtype != np.uint8:
+        return f"expected B-mode of type uint8, got {dtype}"
+    if {*orientation[:2]} not in _SIDES or orientation[2:] not in ("", "A", "D"):
+        return f"UltrasoundImageOrientation: expected as MF, FM or MFA, got {orientation}"
+    return ""
 
 
 def _times(header: SequenceHeader) -> FloatArray | None:
@@ -229,9 +229,7 @@ def _faults(header: SequenceHeader) -> list[str]:
     return ["" if word == "OK" else "not valid by their status" for word in words]
 
 
-def _calibration(
-    header: SequenceHeader, settings: ImportSettings, device: DeviceSet, layout: Layout, poses: Poses | None
-) -> Value:
+def _calibration(settings: ImportSettings, device: DeviceSet, layout: Layout, poses: Poses | None) -> Value:
     """Transform of this image's pixels to mm on the tracked tool."""
     tool = device.probe if poses is None else poses.tool
     if (matrix := settings.image_to_probe) is not None:
@@ -239,16 +237,16 @@ def _calibration(
     if poses is not None and poses.pixels is not None:
         return Value(poses.pixels, f"{poses.chain[0]}Transform")
     for name in (f"{device.image}To{tool}", "Calibration"):  # the second is of Ibis
-        if (transform := fixed_transform(header, name)) is not None:
+        if (transform := fixed_transform(layout.header, name)) is not None:
             return Value(transform, f"{name}Transform")
     # The device set's is for the image that the machine shows, not for the lines it was made of.
     transform = None if layout.is_rf else device.transform(device.image, tool)
     return Value(transform, f"{device.image}To{tool} of the device set")
 
 
-def _numbers(pixel: Value, header: SequenceHeader, device: DeviceSet, layout: Layout) -> dict[str, Value]:
+def _numbers(pixel: Value, device: DeviceSet, layout: Layout) -> dict[str, Value]:
     """Numbers that a sweep of this kind needs, by the size of a pixel and the device set."""
-    vectors, samples = layout.shape(header.size)
+    vectors, samples = layout.shape
     across, down = (replace(pixel, value=size) for size in pixel.value or (None, None))
     scan = partial(Value, source="ScanConversion of the device set")
     width_mm = device.scan("TransducerWidthMm")
@@ -278,20 +276,21 @@ def _orientation(header: SequenceHeader, clock: FloatArray | None) -> Orientatio
     return OrientationSensor(TimedRotations(time_s, turns), mounting)
 
 
-def _frames(header: SequenceHeader, layout: Layout) -> FileFrames:
+def _frames(layout: Layout) -> FileFrames:
     """Frames of the pixels' type; RF of wider numbers than int16 as float32."""
+    header = layout.header
     dtype, narrow = header.dtype.newbyteorder("="), None
     if layout.is_complex:
         dtype, narrow = np.dtype(np.complex64), dtype if dtype == np.int16 else None
     elif layout.is_rf and dtype != np.int16:
         dtype = np.dtype(np.float32)
-    shape = (header.frame_count, *layout.shape(header.size))
-    return FileFrames(header.path, partial(_open_images, header, layout), shape, dtype, narrow)
+    shape = (header.frame_count, *layout.shape)
+    return FileFrames(header.path, partial(_open_images, layout), shape, dtype, narrow)
 
 
-def _open_images(header: SequenceHeader, layout: Layout) -> ReadFrame:
+def _open_images(layout: Layout) -> ReadFrame:
     """Map or unpack images, and turn them."""
-    images = header.images()
+    images = layout.header.images()
     return lambda i: layout.frame(images[i])
 
 
