@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import nullcontext, suppress
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -33,7 +34,7 @@ def held_log(path: Path) -> ImuLog | None:
     samples = sensor_of(path)
     rotations = samples.world_from_sensor
     meaning = () if rotations is None else (f"the sensor's quaternion is {MEANING}",)
-    return _log(samples, samples.time_s, rotations, path.name, (*meaning, *samples.remarks))
+    return _log(samples.vectors, samples.time_s, rotations, path.name, (*meaning, *samples.remarks))
 
 
 def ridden_along(path: Path) -> OrientationSensor | None:
@@ -49,11 +50,11 @@ def ridden_along(path: Path) -> OrientationSensor | None:
 def log_of(sensor: OrientationSensor, source: str) -> ImuLog:
     """Log of a sweep's orientation sensor, on its own clock."""
     readings = sensor.readings
-    return _log(sensor, readings.time_s, readings.world_from_sensor, source)
+    return _log(vars(sensor), readings.time_s, readings.world_from_sensor, source)
 
 
 def _log(
-    vectors: object,
+    vectors: Mapping[str, Any],
     time_s: FloatArray,
     rotations: Rotation | None,
     source: str,
@@ -62,7 +63,7 @@ def _log(
     clock = timeline(Stamps(time_s=time_s))
     log = ImuLog(
         clock.time_s,
-        **{name: getattr(vectors, name) for name in INERTIAL},
+        **{name: vectors[name] for name in INERTIAL},
         world_from_sensor=rotations,
         # A sensor without a counter may send in bursts: how many samples a pause lost is not known.
         gaps=tuple(replace(gap, lost=0) for gap in clock.gaps),

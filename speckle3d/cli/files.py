@@ -38,18 +38,9 @@ def info(path: Path) -> Result:
     --------
     $ speckle3d info sweep.h5
     """
-    from speckle3d.io.describe import describe
-    from speckle3d.io.family.reconstructions import FORMAT
+    from speckle3d.cli.describe import describe
 
-    rows = describe(path)
-    if rows[0][1] == FORMAT:
-        from speckle3d.scoring.lengths import part_lengths
-
-        result = s3.load_reconstruction(path)
-        if len(result.frame_time_s):
-            lengths_mm = part_lengths(result.poses, result.grid.centre_mm)[1]
-            rows += [(f"length, mode {mode}", f"{mm.sum():.2f}", "mm") for mode, mm in lengths_mm.items()]
-    return rows_of(rows)
+    return rows_of(describe(path))
 
 
 def config() -> None:

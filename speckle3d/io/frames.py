@@ -5,7 +5,7 @@ import threading
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any, Self, TypeAlias
+from typing import Any, Self
 
 import h5py
 import numpy as np
@@ -16,7 +16,7 @@ from speckle3d.core.files import PathLike
 from speckle3d.core.geometry import require_finite
 from speckle3d.io.hdf5 import open_hdf5, reading, require_dataset
 
-ReadFrame: TypeAlias = Callable[[int], AnyArray]
+ReadFrame = Callable[[int], AnyArray]
 """Reads frame i of an open file, shape (vector, sample)."""
 
 

@@ -11,7 +11,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 
@@ -307,7 +307,7 @@ class Recording:
         )
 
 
-Facts: TypeAlias = Generator[Row, None, Recording]
+Facts = Generator[Row, None, Recording]
 """What a reader's generator is: it yields rows of facts and returns the recording."""
 
 

@@ -88,7 +88,7 @@ RECORDS = {"curves", "calibration", "reconstruction"}
 
 def read(path):
     """Read all of a file, as its users would."""
-    from speckle3d.io.describe import describe
+    from speckle3d.cli.describe import describe
     from speckle3d.io.load import load_sweep
     from speckle3d.io.points import read_points
     from speckle3d.io.shapes import SUFFIXES, read_surface

@@ -4,7 +4,7 @@ import numpy as np
 import sweep_examples
 from image_examples import frame_fields, grey, write_mha
 
-from speckle3d.io.describe import describe
+from speckle3d.cli.describe import describe
 from speckle3d.io.family.sweep_writer import write_sweep
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.load import import_record, load_sweep, open_recording

@@ -30,6 +30,7 @@ References
 
 import re
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -38,7 +39,7 @@ from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.geometry import RIGID_TOLERANCE
 from speckle3d.core.streams import TimedRotations
-from speckle3d.core.sweep import OrientationSensor
+from speckle3d.core.sweep import INERTIAL, OrientationSensor
 from speckle3d.io.clarius.package import Member
 from speckle3d.io.pose_paths import usable
 from speckle3d.io.recordings import Row
@@ -64,11 +65,10 @@ class SensorSamples:
     ----------
     time_s : ndarray, shape (m,)
         On the frames' clock.
-    accelerometer_m_s2 : ndarray, shape (m, 3)
-        Specific force: what is measured, or against it, as the quaternion's z tells; against it where the
-        quaternion is not believed, as in both public recordings.
-    gyroscope_rad_s : ndarray, shape (m, 3)
-    magnetometer_au : ndarray, shape (m, 3), optional
+    vectors : dict of str to ndarray, shape (m, 3), or None
+        By their names in an `OrientationSensor`. The accelerometer's are specific force: what is measured, or
+        against it, as the quaternion's z tells; against it where the quaternion is not believed, as in both
+        public recordings.
     world_from_sensor : Rotation, optional
         None where there is no quaternion, or it does not agree with gravity.
     rows : list of Row
@@ -78,9 +78,7 @@ class SensorSamples:
     """
 
     time_s: FloatArray
-    accelerometer_m_s2: FloatArray
-    gyroscope_rad_s: FloatArray
-    magnetometer_au: FloatArray | None
+    vectors: dict[str, Any]
     world_from_sensor: Rotation | None
     rows: list[Row]
     remarks: list[str]
@@ -90,12 +88,7 @@ class SensorSamples:
         """Stream of a sweep, whose world is z up; None where the quaternion is not believed."""
         if self.world_from_sensor is None:
             return None
-        return OrientationSensor(
-            TimedRotations(self.time_s, self.world_from_sensor),
-            accelerometer_m_s2=self.accelerometer_m_s2,
-            gyroscope_rad_s=self.gyroscope_rad_s,
-            magnetometer_au=self.magnetometer_au,
-        )
+        return OrientationSensor(TimedRotations(self.time_s, self.world_from_sensor), **self.vectors)
 
 
 def read_samples(member: Member) -> SensorSamples:
@@ -151,12 +144,6 @@ def read_samples(member: Member) -> SensorSamples:
             f"the sensor's quaternion {fault}: the sweep has no orientation, which `speckle3d imu orient "
             f"{member.path} --into SWEEP.h5` finds"
         )
-    return SensorSamples(
-        stamps[places, 0] / 1e9,
-        sign * G_M_S2 * measured_g,
-        gyroscope,
-        magnetometer if has_column[6:9].all() else None,
-        rotation,
-        facts,
-        remarks,
-    )
+    streams = sign * G_M_S2 * measured_g, gyroscope, magnetometer if has_column[6:9].all() else None
+    vectors = dict(zip(INERTIAL, streams, strict=True))
+    return SensorSamples(stamps[places, 0] / 1e9, vectors, rotation, facts, remarks)

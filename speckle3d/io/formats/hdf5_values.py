@@ -4,7 +4,7 @@ import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
-from typing import Any, TypeAlias
+from typing import Any
 
 import h5py
 import numpy as np
@@ -17,7 +17,7 @@ from speckle3d.io.hdf5 import has_member, locate, read_array
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.recordings import Value, rate_by_spacing, step_of
 
-Turn: TypeAlias = Callable[..., AnyArray]
+Turn = Callable[..., AnyArray]
 """Makes a frame (vector, sample) of slices of data sets."""
 
 ENVELOPE_RANGE_DB = 80.0

@@ -13,7 +13,7 @@ import re
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 import pyigtl.messages
@@ -29,7 +29,6 @@ _STATUS = struct.Struct("> H q 20s")
 _TYPE = re.compile(rb"[A-Z][A-Z0-9_]*\0*")
 _MOST_BYTES = 2**28
 """A colour volume of 400 voxels along each axis; more is a header that is none."""
-_OK = 1
 _RAS_FROM_LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
 
 
@@ -80,7 +79,7 @@ class TransformReceived:
     valid: bool
 
 
-Received: TypeAlias = ImageReceived | TransformReceived
+Received = ImageReceived | TransformReceived
 
 
 def body_bytes(start: bytes) -> int:
@@ -163,10 +162,10 @@ def packed_text(device: str, time_s: float, text: str) -> bytes:
     return _pack(message, device, time_s)
 
 
-def packed_status(device: str, time_s: float, text: str, code: int = _OK) -> bytes:
+def packed_status(device: str, time_s: float, text: str, code: int) -> bytes:
     """Pack a STATUS, which pyigtl does not know; `code` 1 says that all is well."""
     message: Any = MessageBase()
-    body = _STATUS.pack(code, 0, b"OK" if code == _OK else b"") + text.encode("ascii", "backslashreplace")
+    body = _STATUS.pack(code, 0, b"OK" if code == 1 else b"") + text.encode("ascii", "backslashreplace")
     message._message_type, message._pack_content = "STATUS", lambda: body + b"\0"
     return _pack(message, device, time_s)
 

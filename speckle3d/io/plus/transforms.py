@@ -6,7 +6,6 @@
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import TypeAlias
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -18,7 +17,7 @@ from speckle3d.core.grid import ImageGrid
 from speckle3d.io.images.headers import SequenceHeader
 from speckle3d.io.text import numbers
 
-Pair: TypeAlias = tuple[str, str]
+Pair = tuple[str, str]
 """Frames from which and to which a transform leads."""
 
 SKEW_TOLERANCE = 0.1

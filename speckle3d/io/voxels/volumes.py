@@ -79,7 +79,7 @@ def may_be_volume(path: PathLike) -> bool:
         If it cannot be read.
     """
     start = first_bytes(path)
-    return b"Seq_Frame" not in start if is_image(start) else _is_nifti(Path(path), start)
+    return (is_image(start) and b"Seq_Frame" not in start) or _is_nifti(Path(path), start)
 
 
 def read_volume(path: PathLike) -> Volume:

@@ -3,9 +3,9 @@ import pytest
 from format_examples import region, write_dicom
 from sweep_examples import frames_of
 
+from speckle3d.cli.describe import describe
 from speckle3d.core.errors import FileError
 from speckle3d.core.grid import ImageGrid
-from speckle3d.io.describe import describe
 from speckle3d.io.import_settings import ImportSettings, MissingSettingsError
 from speckle3d.io.load import load_sweep, open_recording
 

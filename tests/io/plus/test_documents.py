@@ -2,8 +2,8 @@
 
 import pytest
 
+from speckle3d.cli.describe import describe
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.io.describe import describe
 from speckle3d.io.load import kind_of, load_sweep
 
 

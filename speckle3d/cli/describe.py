@@ -112,6 +112,11 @@ def _reconstruction_rows(path: PathLike) -> Iterator[Row]:
         yield f"calibration of {calibration.sensor}", calibration.path, ""
     if (settings := result.provenance.imported) is not None:
         yield f"import settings of {settings.name}", settings.settings_json, ""
+    if times.size:
+        from speckle3d.scoring.lengths import part_lengths
+
+        for mode, mm in part_lengths(result.poses, result.grid.centre_mm)[1].items():
+            yield f"length, mode {mode}", f"{mm.sum():.2f}", "mm"
 
 
 def _source_rows(source: Any) -> Iterator[Row]:
