@@ -216,10 +216,10 @@ def require_dataset(group: h5py.Group, name: str, shape: tuple[int | str, ...] |
     node = find_member(group, name)
     if not isinstance(node, h5py.Dataset):
         raise InvalidInputError(f"{locate(group, name)}: expected a data set, got {node}")
-    free = [
-        length if isinstance(n, str) else n for n, length in zip(shape or (), node.shape or (), strict=False)
-    ]
-    if shape is not None and (len(free) != len(shape) or node.shape != (*free,)):
+    if shape is not None and (
+        node.ndim != len(shape)
+        or any(n != m and not isinstance(n, str) for n, m in zip(shape, node.shape, strict=True))
+    ):
         raise InvalidInputError(f"{locate(group, name)}: expected shape {shape}, got {node.shape}")
     return node
 

@@ -220,18 +220,25 @@ class Description:
             raise InvalidInputError(f"{self.where}: {': '.join(place)}: expected a number, got none")
         return number
 
-    def places(self, count: int) -> FloatArray:
-        """Element where each line is received and its angle in degrees, shape (line, 2).
+    def elements(self, count: int) -> FloatArray:
+        """Element where each line is received; lines that are steered are refused.
 
-        Files may give the first and the last alone.
+        Files may give the first and the last line alone.
         """
         lines = self.fields.get("lines") or ()
         rows = np.array([[self.require(name, of=line) for name in ("rx element", "angle")] for line in lines])
         if len(rows) == 2:
-            return np.linspace(rows[0], rows[1], count)
+            rows = np.linspace(rows[0], rows[1], count)
         if len(rows) != count:
             raise InvalidInputError(f"{self.where}: lines: expected {count} lines, got {len(rows)}")
-        return rows
+        elements, angle_deg = rows.T
+        if (oblique := np.flatnonzero(angle_deg)).size:
+            raise InvalidInputError(
+                f"{self.where}: lines[{oblique[0]}]: angle: expected 0 (lines that are not steered), got "
+                f"{angle_deg[oblique[0]]:g} deg, and {oblique.size} of {count} lines steered: record "
+                "without steering and Doppler, or give another of its raw files"
+            )
+        return np.asarray(elements)
 
     @property
     def receive(self) -> tuple[float, ...] | None:
@@ -246,7 +253,9 @@ class Description:
 
 
 def open_raw(member: Member, kind: str) -> AnyArray:
-    """Frames as they lie in a raw file: ``time`` in ns and ``samples``, shape (line, sample, part).
+    """Frames as they lie in a raw file, unpacked where lzop packed it: ``time`` in ns and ``samples``.
+
+    Samples of a frame have the shape (line, sample, part).
 
     Raises
     ------
@@ -255,8 +264,13 @@ def open_raw(member: Member, kind: str) -> AnyArray:
     InvalidInputError
         If its samples are of another size than those of the kind.
     """
-    content, (dtype, parts, _) = _content(member), SAMPLES[kind]
-    with reading(member.where, struct.error):
+    dtype, parts, _ = SAMPLES[kind]
+    with reading(member.where, struct.error, IndexError):
+        content: Any
+        if member.name.endswith(".lzo"):
+            content = _unpack(member, member.path.stat().st_mtime_ns)
+        else:
+            content = np.memmap(member.path, np.uint8, "r", member.start, (member.size,))
         _, count, *size, sample_bytes = HEADER.unpack(content[: HEADER.size])
         record = np.dtype([("time", "<u8"), ("samples", dtype, (*size, parts))])
     if sample_bytes != parts * np.dtype(dtype).itemsize:
@@ -279,14 +293,6 @@ def open_frames(member: Member, kind: str, turns: ComplexArray | None = None) ->
         return echoes if turns is None else echoes * turns
 
     return frame
-
-
-def _content(member: Member) -> Any:
-    """Bytes of a file, unpacked where it is packed by lzop."""
-    with reading(member.where, struct.error, IndexError):
-        if member.name.endswith(".lzo"):
-            return _unpack(member, member.path.stat().st_mtime_ns)
-        return np.memmap(member.path, np.uint8, "r", member.start, (member.size,))
 
 
 @lru_cache(1)

@@ -82,7 +82,7 @@ def open_package(path: Path, settings: ImportSettings) -> Facts:
     yml, member, signal = ymls[kind], raw[kind], ymls[kind].kind
     records = open_raw(member, signal)
     shape = records["samples"].shape[:3]
-    elements = _elements(yml, shape[1])
+    elements = yml.elements(shape[1])
     yield "first line at element", f"{elements[0]:g}, taken as the image's left", ""
     if (count := yml.number("frames")) not in (None, len(records)):
         remarks.append(f"the yml says {count:g} frames, the raw file holds {len(records)}")
@@ -192,18 +192,6 @@ def _oscillator(
     oscillator_hz = np.interp(depths_mm, [0.0, filter_mm], [shallow_hz, deep_hz])
     middle_hz = float(np.interp(depths_mm[[0, -1]].mean(), depths_mm, oscillator_hz))
     return middle_hz, cumulative_trapezoid(oscillator_hz - middle_hz, initial=0) / rate_hz
-
-
-def _elements(yml: Description, count: int) -> FloatArray:
-    """Elements at which the lines are received; lines that are steered are refused."""
-    elements, angle_deg = yml.places(count).T
-    if (oblique := np.flatnonzero(angle_deg)).size:
-        raise InvalidInputError(
-            f"{yml.where}: lines[{oblique[0]}]: angle: expected 0 (lines that are not steered), got "
-            f"{angle_deg[oblique[0]]:g} deg, and {oblique.size} of {count} lines steered: record "
-            "without steering and Doppler, or give another of its raw files"
-        )
-    return np.asarray(elements)
 
 
 def _line_values(

@@ -67,12 +67,13 @@ def is_zea(file: h5py.File) -> bool:
 
 def _members(file: h5py.File) -> list[str]:
     """Members of the ``data`` groups: at the root, or of tracks."""
-    tracks = find_member(file, "tracks")
-    names = tracks if isinstance(tracks, h5py.Group) else ()
-    homes = ["data", *(f"tracks/{name}/data" for name in names)]
-    nodes = ((home, find_member(file, home)) for home in homes)
-    groups = [(home, node) for home, node in nodes if isinstance(node, h5py.Group)]
-    return [f"{home}/{name}" for home, group in groups for name in group if has_member(group, name)]
+
+    def places(home: str) -> list[str]:
+        node = find_member(file, home)
+        return [f"{home}/{name}" for name in node] if isinstance(node, h5py.Group) else []
+
+    homes = ["data", *(f"{track}/data" for track in places("tracks"))]
+    return [place for home in homes for place in places(home) if has_member(file, place)]
 
 
 def open_zea(file: h5py.File, settings: ImportSettings) -> Facts:
