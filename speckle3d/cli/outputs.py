@@ -80,8 +80,9 @@ def require_own_place(out: Path, kind: str, *inputs: Path) -> None:
 def _kinds_of(path: Path) -> set[str]:
     """Kinds that a file may be, by its content."""
     from speckle3d.io.hdf5 import SIGNATURE, file_format, open_hdf5
+    from speckle3d.io.images.headers import is_image
     from speckle3d.io.tum import is_tum
-    from speckle3d.io.voxels.volumes import may_be_volume
+    from speckle3d.io.voxels.volumes import is_nifti
 
     with path.open("rb") as stream:
         start = stream.read(_FIRST_BYTES)
@@ -89,14 +90,15 @@ def _kinds_of(path: Path) -> set[str]:
         with open_hdf5(path) as file:
             kind = file_format(file).removeprefix("speckle3d.")
             return {kind, *({"simulation"} & {*file})}
-    triangles = int.from_bytes(start[80:84], "little")
+    is_sequence, triangles = b"Seq_Frame" in start, int.from_bytes(start[80:84], "little")
     signs = {
         "log": b"\ntime_s," in b"\n" + start,
         "picture": start.startswith(b"\x89PNG\r\n\x1a\n"),
-        "sequence": b"Seq_Frame" in start,
+        "sequence": is_sequence,
         "surface": start.startswith((b"ply", b"# vtk DataFile", b"solid"))
         or path.stat().st_size == 84 + 50 * triangles,  # binary STL
         "trajectory": is_tum(path),
-        "volume": may_be_volume(path),
+        # Programs may not say what their axes are.
+        "volume": is_nifti(path, start) or (is_image(start) and not is_sequence),
     }
     return {kind for kind, applies in signs.items() if applies}

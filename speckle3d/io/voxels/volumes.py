@@ -65,21 +65,7 @@ def is_volume(path: PathLike) -> bool:
         If it cannot be read, or its header does not make sense.
     """
     start = first_bytes(path)
-    return read_header(path).is_volume if is_image(start) else _is_nifti(Path(path), start)
-
-
-def may_be_volume(path: PathLike) -> bool:
-    """Whether a file is a NIfTI image, or a MetaImage or NRRD one without fields of frames near its start.
-
-    Unlike `is_volume` it takes files of programs that do not say what their axes are.
-
-    Raises
-    ------
-    FileError
-        If it cannot be read.
-    """
-    start = first_bytes(path)
-    return (is_image(start) and b"Seq_Frame" not in start) or _is_nifti(Path(path), start)
+    return read_header(path).is_volume if is_image(start) else is_nifti(Path(path), start)
 
 
 def read_volume(path: PathLike) -> Volume:
@@ -105,7 +91,7 @@ def read_volume(path: PathLike) -> Volume:
         If it is not a grey three-dimensional image.
     """
     start, file = first_bytes(path), Path(path)
-    if not (is_image(start) or _is_nifti(file, start)):
+    if not (is_image(start) or is_nifti(file, start)):
         raise InvalidInputError(
             f"{path}: expected NRRD, MetaImage or NIfTI (.nii.gz, .nii, .hdr), got something else"
         )
@@ -207,7 +193,7 @@ def _labels(voxels: AnyArray) -> AnyArray:
     return labels
 
 
-def _is_nifti(path: Path, start: bytes) -> bool:
+def is_nifti(path: Path, start: bytes) -> bool:
     """Whether a file is NIfTI by its first bytes; one packed by gzip, by its name."""
     return start[:4] in _SIZES or (start.startswith(b"\x1f\x8b") and path.name.lower().endswith(".nii.gz"))
 
