@@ -14,7 +14,7 @@ from scipy.spatial.transform import RigidTransform
 
 from speckle3d.config import Config
 from speckle3d.core.arrays import FloatArray, IntArray
-from speckle3d.core.curves import DecorrelationCurves, SpeckleSize
+from speckle3d.core.curves import DecorrelationCurves, EchoSpectra, SpeckleSize
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.progress import Progress, after
 from speckle3d.core.sweep import Sweep
@@ -23,7 +23,6 @@ from speckle3d.matching.matcher import FrameMatcher
 from speckle3d.matching.patches import PatchGrid
 from speckle3d.matching.schedule import KnownSchedule
 from speckle3d.matching.table import CorrelationTable
-from speckle3d.matching.texture import mean_spectra
 from speckle3d.motion.phantom import CurveSettings, PhantomSamples, fit_curves
 
 SMOOTHED_FRAMES = 8
@@ -74,7 +73,7 @@ def calibrate_curves(
     return replace(
         curves,
         speckle=_mean_speckle(curves.depth_mm, sizes),
-        spectrum=mean_spectra([spectrum for spectrum in spectra if spectrum is not None]),
+        spectrum=_mean_spectra([spectrum for spectrum in spectra if spectrum is not None]),
     )
 
 
@@ -159,3 +158,12 @@ def _mean_speckle(
             return None
         means.append(np.mean([np.interp(depth_mm, *sweep) for sweep in finite], axis=0))
     return SpeckleSize(*means)
+
+
+def _mean_spectra(spectra: Sequence[EchoSpectra]) -> EchoSpectra | None:
+    """Mean of some sweeps' spectra at the depths of the first; None of none."""
+    if not spectra:
+        return None
+    first = spectra[0]
+    power = np.mean([spectrum.at(first.depth_mm, first.frequency_hz) for spectrum in spectra], axis=0)
+    return EchoSpectra(first.depth_mm, first.frequency_hz, power)

@@ -18,11 +18,11 @@ from speckle3d.core.reconstruction import FramePairs
 from speckle3d.core.sweep import Sweep
 from speckle3d.examine.curves import examine_key
 from speckle3d.examine.disagreements import disagreements
+from speckle3d.examine.frames import placed_flags
 from speckle3d.examine.images import examine_echoes, examine_images, examine_processing
 from speckle3d.examine.sensors import examine_sensors
 from speckle3d.matching.frames import ImageSink, match_sweep
 from speckle3d.matching.matcher import FrameMatcher
-from speckle3d.matching.quality import placed_flags
 from speckle3d.matching.schedule import PairSchedule
 from speckle3d.motion.estimate import estimate_motion, frame_pairs
 from speckle3d.motion.planes import MotionProblem

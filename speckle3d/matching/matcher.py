@@ -150,13 +150,12 @@ class FrameMatcher:
         # Of echoes two samples are pooled for the coarse search: speckle has four, and matching goes on from
         # the peak's sample.
         self._pool = np.array([1, 1 if rf is None else 2])
-        self._reach = np.minimum(
-            np.ceil(s.inplane.search_mm / (spacing * self._pool)), sides // self._pool - 1
-        )
-        self._reach = self._reach.astype(np.int64)
+        reach = np.ceil(s.inplane.search_mm / (spacing * self._pool))
+        self._reach = np.minimum(reach, sides // self._pool - 1).astype(np.int64)
         self._lengths = [fft.next_fast_len(int(n), True) for n in sides // self._pool + self._reach]
         self.of_echo = rf is not None and s.matching.correlate == "echo"
         self._wavenumber, fan = two_way_wavenumber(rf) if rf is not None else 0.0, sweep.grid.fan
+        lines = ("parallel", 0.0, 0.0) if fan is None else ("fan", fan.radius_mm, fan.step_rad)
         self.key = CurveKey(
             signal,
             self.grid.vector_pitch_mm,
@@ -166,9 +165,7 @@ class FrameMatcher:
             "echo" if self.of_echo else "intensity",
             s.intensity.edge_fraction,
             sweep.probe,
-            "parallel" if fan is None else "fan",
-            0.0 if fan is None else fan.radius_mm,
-            0.0 if fan is None else fan.step_rad,
+            *lines,
         )
         if curves is not None:
             curves.key.require_same(self.key)

@@ -16,7 +16,6 @@ import enum
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from textwrap import shorten
 from typing import Any
 
 import numpy as np
@@ -24,14 +23,10 @@ import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
 
 from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
-from speckle3d.core.errors import InsufficientDataError
 from speckle3d.matching.patches import PatchGrid
 
 _SAMPLES = 40
 """Samples in depth of which a patch's statistics are taken at least, where it has more: speckle has four."""
-
-LARGEST_LOSS = 0.3
-"""Share of frames that may not be placed; with more, lengths are mostly guesses."""
 
 
 class FrameFlag(enum.IntFlag):
@@ -47,15 +42,6 @@ class FrameFlag(enum.IntFlag):
     """A signal without the statistics of speckle, or none."""
     UNMATCHED = 16
     """Shares too little speckle with any earlier frame; set where frames are matched."""
-
-
-_WORDS = {
-    FrameFlag.FROZEN: "frozen",
-    FrameFlag.SATURATED: "saturated",
-    FrameFlag.LIFTED: "with the probe lifted",
-    FrameFlag.NO_SPECKLE: "without speckle",
-    FrameFlag.UNMATCHED: "unlike any earlier frame",
-}
 
 
 class QualitySettings(BaseModel):
@@ -204,33 +190,3 @@ def flag_frames(features: Sequence[FrameFeatures], settings: QualitySettings | N
             # Noise of an amplifier is in most patches, if none holds an echo.
             flags[k] |= FrameFlag.LIFTED if frame.noise_share > 1 / 2 else FrameFlag.NO_SPECKLE
     return flags
-
-
-def placed_flags(flags: IntArray, loose: BoolArray | bool = False) -> IntArray:
-    """Flags of all frames, with those that no pair joins to earlier ones.
-
-    Raises
-    ------
-    InsufficientDataError
-        If too many frames have a flag.
-    """
-    flags = np.where(loose & (flags == 0), int(FrameFlag.UNMATCHED), flags)
-    count = int((flags != 0).sum())
-    if count > LARGEST_LOSS * len(flags):
-        raise InsufficientDataError(
-            f"expected frames with speckle in common, got {count} of {len(flags)} that cannot be placed: "
-            f"{'; '.join(describe(flags))}"
-        )
-    return flags
-
-
-def describe(flags: npt.ArrayLike) -> list[str]:
-    """Tell the flagged frames, a line for every kind of flag: how many, and the first of them."""
-    values = np.asarray(flags, dtype=np.int64)
-    lines = []
-    for flag, words in _WORDS.items():
-        frames = np.flatnonzero(values & int(flag)).tolist()
-        if frames:
-            numbers = shorten(", ".join(map(str, frames)), 40, placeholder=" ...")
-            lines.append(f"{len(frames)} frame{'s' * (len(frames) > 1)} {words}: {numbers}")
-    return lines

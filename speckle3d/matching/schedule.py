@@ -71,8 +71,8 @@ class PairSchedule:
     before them are kept until one resembles them again.
     """
 
-    def __init__(self, settings: TrajectorySettings | None = None) -> None:
-        self.settings = settings or TrajectorySettings()
+    def __init__(self, settings: TrajectorySettings) -> None:
+        self.settings = settings
         self.least_correlation = self.settings.least_correlation
         self._keys: list[int] = []
         self._sound: list[int] = []

@@ -42,10 +42,8 @@ class CorrelationTable:
     @cached_property
     def median(self) -> FloatArray:
         """Median of each pair's correlations, shape (e,); zero where there is none."""
-        ordered = np.sort(self.correlation.astype(float), axis=1)  # NaN comes last.
-        count = np.isfinite(ordered).sum(axis=1, keepdims=True)
-        middle = np.maximum(np.hstack([count - 1, count]) // 2, 0)
-        return np.asarray(np.nan_to_num(np.take_along_axis(ordered, middle, axis=1).mean(axis=1)))
+        values = np.ma.masked_invalid(self.correlation.astype(float))
+        return np.asarray(np.ma.median(values, axis=1).filled(0.0))  # type: ignore[no-untyped-call]
 
     def among(self, usable: BoolArray) -> CorrelationTable:
         """Copy of the table without the correlations of some patches."""

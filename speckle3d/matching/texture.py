@@ -4,7 +4,6 @@ The size of speckle along the vectors is the pulse's, across them the aperture's
 on what is scanned as long as it scatters as a phantom does; patches whose contrast denies that do not count.
 """
 
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -188,15 +187,6 @@ def measured_texture(sweep: Sweep, matcher: FrameMatcher) -> Texture:
     for number in numbers:
         texture.keep(number, matcher.ready(sweep.frames[number]))
     return texture
-
-
-def mean_spectra(spectra: Sequence[EchoSpectra]) -> EchoSpectra | None:
-    """Mean of some sweeps' spectra at the depths of the first; None of none."""
-    if not spectra:
-        return None
-    first = spectra[0]
-    power = np.mean([spectrum.at(first.depth_mm, first.frequency_hz) for spectrum in spectra], axis=0)
-    return EchoSpectra(first.depth_mm, first.frequency_hz, power)
 
 
 def _powers(echo: Complex64Array) -> FloatArray:

@@ -9,8 +9,8 @@ from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.errors import Speckle3DError
 from speckle3d.core.reconstruction import Reconstruction
+from speckle3d.examine.frames import describe
 from speckle3d.io.family.reconstructions import read_reconstruction
-from speckle3d.matching.quality import describe
 from speckle3d.scoring.lengths import TRACKER
 from speckle3d.scoring.references import SweepCurves, find_reference, sweep_curves, tracker_alone
 from speckle3d.study.images import sweep_of

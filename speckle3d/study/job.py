@@ -33,13 +33,13 @@ from speckle3d.correction.modes import CUBIC_MODES, require_modes
 from speckle3d.corrections import Correction, correct
 from speckle3d.crossing_sweeps import cross_with, require_pair, stack_for
 from speckle3d.examine.disagreements import differing_lengths
+from speckle3d.examine.frames import describe
 from speckle3d.examine.sensors import credible_sensors, repair_readings, require_credible
 from speckle3d.io.family.calibrations import apply_calibrations
 from speckle3d.io.family.reconstructions import write_reconstruction
 from speckle3d.io.fileset import FileSet
 from speckle3d.io.hdf5 import PathLike
 from speckle3d.io.load import import_record, load_landmarks, load_sweep, recording_sha256
-from speckle3d.matching.quality import describe
 from speckle3d.motion.sensors import sensed_orientation
 from speckle3d.scoring.displacements import score_row
 from speckle3d.scoring.lengths import TRACKER

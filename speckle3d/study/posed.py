@@ -16,6 +16,7 @@ from speckle3d.core.errors import InsufficientDataError, InvalidInputError, Mism
 from speckle3d.core.reconstruction import Reconstruction
 from speckle3d.core.sweep import BModeSettings, Sweep
 from speckle3d.core.text import shown
+from speckle3d.examine.frames import describe
 from speckle3d.imaging.images import ChosenImages, PosedImages
 from speckle3d.imaging.voxels.settings import Levels
 from speckle3d.io.family.calibrations import apply_calibrations, fitted_pixels, resized
@@ -23,7 +24,6 @@ from speckle3d.io.family.reconstructions import FORMAT
 from speckle3d.io.hdf5 import PathLike
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.load import kind_of, open_recording
-from speckle3d.matching.quality import describe
 from speckle3d.scoring.modes import default_mode
 from speckle3d.scoring.references import REFERENCES, find_reference
 from speckle3d.scoring.trajectories import poses_of

@@ -13,7 +13,7 @@ from speckle3d.examine.images import (
     doubt_path,
     far_apart,
 )
-from speckle3d.matching.schedule import PairSchedule
+from speckle3d.matching.schedule import PairSchedule, TrajectorySettings
 from speckle3d.matching.table import CorrelationTable
 
 WIDTH_MM, CELLS, PAIRS = 0.45, 60.0, 100
@@ -22,7 +22,7 @@ PATCHES_MM = np.array([[x, y] for x in (2.0, 6.0, 10.0) for y in np.linspace(5.0
 
 def table_of(position_mm, gain=1.0, source=None):
     """The pairs that the schedule wants; `source`: which tissue each frame shows."""
-    rng, schedule = np.random.default_rng(0), PairSchedule()
+    rng, schedule = np.random.default_rng(0), PairSchedule(TrajectorySettings())
     source = np.zeros(len(position_mm)) if source is None else source
     rows = []
     for frame in range(len(position_mm)):
