@@ -55,7 +55,13 @@ def track(
 
     tissue = tissue_curves(curves, matches.texture)
     problem = MotionProblem(
-        tissue.curves, matcher.patches, matcher.centre_mm, len(sweep), settings.planes, settings.trajectory
+        tissue.curves,
+        matcher.patches,
+        matcher.centre_mm,
+        len(sweep),
+        settings.planes,
+        settings.trajectory,
+        matches.repeats,
     )
     motion = estimate_motion(problem, matches.table.where(matches.sound))
     flags = placed_flags(matches.flags, loose_frames(motion.pairs.second, matches.flags.size))

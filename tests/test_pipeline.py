@@ -108,6 +108,17 @@ def test_a_spoilt_frame_is_placed_between_its_neighbours_and_not_trusted(sweep, 
     assert deviation[11] > 3 * np.delete(deviation, [0, 11]).max()
 
 
+def test_frames_that_a_recorder_repeats_are_where_their_image_is(sweep, curves):
+    short, rows = sweep.part(0, 16), np.repeat(np.arange(16), 3)
+    time_s = short.frame_time_s[rows] + np.tile([0.0, 0.01, 0.02], 16)
+    triple = replace(short, frames=frames_of(short)[rows], frame_time_s=time_s, truth=None)
+    whole, tracking = track(short, curves), track(triple, curves)
+    assert np.flatnonzero(tracking.flags == 0).tolist() == list(range(0, 48, 3))
+    z, expected = (t.image.apply(sweep.grid.centre_mm)[:, 2] for t in (tracking, whole))
+    assert np.abs(z - expected[rows]).max() < 0.03
+    assert tracking.covariance[-1, 2, 2] < 1.2 * whole.covariance[-1, 2, 2]
+
+
 def test_curves_beside_a_recording_are_taken_and_said(data_folder):
     sweep = load_sweep(data_folder / "phantom.h5").part(0, 12)
     with pytest.warns(UserWarning, match=r"curves\.h5, by phantom; .* % \(95 %\)"):

@@ -212,7 +212,7 @@ def _tell(result: s3.JobResult) -> None:
     """Note on stderr what limits the results."""
     details = result.summary.details
     for line in details["flagged_frames"]:
-        note(f"{line}: poses there are guesses")
+        note(line)
     if 0 < result.summary.coverage < 1:
         note(f"compared over the {100 * result.summary.coverage:.0f} % of frames that have a reference")
     share = details["rejected_patch_share"]

@@ -15,6 +15,8 @@ from speckle3d.core.poses import (
     HELD,
     SCALE_CHANGE_MM,
     SHARED,
+    SIDEWAYS,
+    SIDEWAYS_BY_SHARE,
     STRUCTURE,
     TURN_CHANGE_MM,
     RelativePoses,
@@ -26,9 +28,6 @@ from speckle3d.correction.scale import ScaleEvidence
 FRAMES_PER_KNOT = 4
 """Corrections change from knot to knot: the images' own detail is finer than any sensor's between them. Half
 of it moves lengths of five sweeps, each with three sets of sensors, by at most 0.4 %, claims by 12 %."""
-SIDEWAYS, SIDEWAYS_BY_SHARE = 0.005, (0.5, 0.1)
-"""Standard deviation of motion along x and y that images see for each mm along z where structure runs across:
-least, and its growth with the share of echoes that stay. Of simulated phantoms and tissue."""
 HAND_TURN_RAD = float(np.deg2rad(1.0))
 """How far a scanning hand tilts and yaws in a second, deviation of a random walk: over tissue images see none
 of it. Three freehand sweeps of the PLUS library turn by 0.4 to 1.6 degrees in a second. Halved and doubled it
@@ -93,7 +92,7 @@ class ImagePath:
         basis[np.arange(1, n), :, interval + 1] = (length / travel[interval])[:, None]
         basis[:, :5, 0] = step[:, None]
         yaw, tilt = shared.turn_sigma_per_mm
-        x, y = SIDEWAYS + np.multiply(SIDEWAYS_BY_SHARE, share)
+        x, y = SIDEWAYS + SIDEWAYS_BY_SHARE * share
         density = SCALE_CHANGE_MM * np.square([x, y, shared.scale_sigma, 0.0, 0.0, 0.0])
         density[3:5] = TURN_CHANGE_MM * np.square([tilt, yaw])
         sigma = np.ones((6, knots.size))

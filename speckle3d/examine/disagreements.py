@@ -23,8 +23,6 @@ BY_IMAGES = {"image", "consistent-subset", "orientation"}
 LEAST_SIGMA_MM, LEAST_SIGMA_RAD = 0.1, 0.013
 """Errors of place and roll that sensors have beside their jitter: of a mounting off by 1 mm or a third
 of a degree while the probe turns by 5 degrees, and of a heading."""
-SIDEWAYS = 0.05
-"""Motion along x or y that images see for each mm of travel where structure of tissue runs across."""
 
 
 def disagreements(sweep: Sweep, image: RigidTransform, covariance: FloatArray) -> tuple[Doubt, ...]:
@@ -65,7 +63,7 @@ def _doubt_sensor(
     for axis, name in (2, "length"), (0, "x"), (1, "y"), (5, "roll"):
         if axis < 3 and not isinstance(sensor, Tracker):
             continue
-        image_sigma = np.hypot(np.sqrt(covariance[:, axis, axis]), SIDEWAYS * travel if axis < 2 else 0.0)
+        image_sigma = np.sqrt(covariance[:, axis, axis])
         least = LEAST_SIGMA_MM if axis < 3 else LEAST_SIGMA_RAD
         jitter_left = noise[int(axis > 2)] / np.sqrt(SMOOTH)
         sensor_sigma = np.full_like(image_sigma, np.hypot(jitter_left, least))

@@ -13,11 +13,11 @@ LARGEST_LOSS = 0.3
 """Share of frames that may not be placed; with more, lengths are mostly guesses."""
 
 _WORDS = {
-    FrameFlag.FROZEN: "frozen",
-    FrameFlag.SATURATED: "saturated",
-    FrameFlag.LIFTED: "with the probe lifted",
-    FrameFlag.NO_SPECKLE: "without speckle",
-    FrameFlag.UNMATCHED: "unlike any earlier frame",
+    FrameFlag.FROZEN: "that repeat the one before, at its place",
+    FrameFlag.SATURATED: "saturated, poses guessed",
+    FrameFlag.LIFTED: "with the probe lifted, poses guessed",
+    FrameFlag.NO_SPECKLE: "without speckle, poses guessed",
+    FrameFlag.UNMATCHED: "unlike any earlier one, poses guessed",
 }
 
 
@@ -27,13 +27,14 @@ def placed_flags(flags: IntArray, loose: BoolArray | bool = False) -> IntArray:
     Raises
     ------
     InsufficientDataError
-        If too many frames have a flag.
+        If too many frames, but for repeated ones, have a flag.
     """
     flags = np.where(loose & (flags == 0), int(FrameFlag.UNMATCHED), flags)
-    count = int((flags != 0).sum())
-    if count > LARGEST_LOSS * len(flags):
+    own = flags[flags != FrameFlag.FROZEN]
+    count = np.count_nonzero(own)
+    if count > LARGEST_LOSS * own.size:
         raise InsufficientDataError(
-            f"expected frames with speckle in common, got {count} of {len(flags)} that cannot be placed: "
+            f"expected frames with speckle in common, got {count} of {own.size} that cannot be placed: "
             f"{'; '.join(describe(flags))}"
         )
     return flags

@@ -228,7 +228,7 @@ class LiveTracker:
             first=np.searchsorted(frames, self._tables[number].first),
             second=np.full(len(self._tables[number]), frames.size - 1),
         )
-        problem, before = replace(motion.problem, frames=frames.size), self._poses[frames[:-1]]
+        problem, before = replace(motion.problem, frames=frames.size, repeats=()), self._poses[frames[:-1]]
         rows = alike_pairs(problem, table, table.median)
         models = motion.coherence.models(np.full(rows.size, LAST))
         pairs, has_plane = pair_planes(problem, table, rows, models)
@@ -259,7 +259,8 @@ class LiveTracker:
         sound = table.joins((flags[begin:] & ~FrameFlag.UNMATCHED) == 0)
         if not sound.any():
             return
-        problem = replace(self._problem, frames=count - begin)
+        repeats = np.flatnonzero(flags[begin:] & FrameFlag.FROZEN)
+        problem = replace(self._problem, frames=count - begin, repeats=repeats)
         try:
             motion = estimate_motion(problem, table.where(sound))
         except (InsufficientDataError, np.linalg.LinAlgError):

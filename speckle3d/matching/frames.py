@@ -46,6 +46,11 @@ class MatchedSweep:
     echoless: FloatArray
 
     @property
+    def repeats(self) -> IntArray:
+        """Frames with the image of the one before."""
+        return np.flatnonzero(self.flags & FrameFlag.FROZEN)
+
+    @property
     def sound(self) -> BoolArray:
         """Pairs both of whose frames hold speckle, shape (e,)."""
         return self.table.joins((self.flags & ~FrameFlag.UNMATCHED) == 0)

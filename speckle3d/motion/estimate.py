@@ -149,7 +149,9 @@ def solve_planes(
 ) -> tuple[RelativePoses, Trajectory]:
     """Trajectory of some pairs, and the edges that it is solved from."""
     edges = edges_of(table, pairs)
-    return edges, solve_trajectory(edges, problem.frames, problem.centre_mm, problem.trajectory.huber)
+    return edges, solve_trajectory(
+        edges, problem.frames, problem.centre_mm, problem.trajectory.huber, problem.repeats
+    )
 
 
 def alike_pairs(problem: MotionProblem, table: CorrelationTable, correlation: FloatArray) -> IntArray:

@@ -16,6 +16,7 @@ from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
 import numpy as np
+import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
 
 from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
@@ -84,6 +85,8 @@ class MotionProblem:
         Of the sweep.
     planes : PlaneSettings
     trajectory : TrajectorySettings
+    repeats : array_like of int
+        Frames with the image of the one before, in no pair.
     """
 
     curves: DecorrelationCurves
@@ -92,6 +95,7 @@ class MotionProblem:
     frames: int
     planes: PlaneSettings
     trajectory: TrajectorySettings
+    repeats: npt.ArrayLike = ()
 
     @cached_property
     def at_patches(self) -> PatchCurves:

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from scipy.interpolate import make_interp_spline
 from scipy.sparse import bsr_array
 from scipy.sparse.linalg import splu
@@ -18,6 +19,8 @@ from speckle3d.motion.planes import PairPlanes
 
 ROUNDS = 4
 """Of Gauss-Newton; the next has steps below 1e-4 mm and rad."""
+SAME = 1e-9
+"""Variance of places and turns between images that are the same, mm^2 and rad^2: no graph can weigh 0."""
 
 
 @dataclass(frozen=True)
@@ -59,6 +62,7 @@ def solve_trajectory(
     frames: int,
     centre_mm: FloatArray,
     huber: float = 2.0,
+    repeats: npt.ArrayLike = (),
 ) -> Trajectory:
     """Poses of all frames from all pairs: robust Gauss-Newton on the graph of relative poses.
 
@@ -68,8 +72,10 @@ def solve_trajectory(
     ----------
     huber : float
         Standard deviations at which a pair begins to lose weight.
+    repeats : array_like of int
+        Frames with the image of the one before, in no pair; they are where that is.
     """
-    pairs = _with_loose_edges(pairs, frames)
+    pairs = _with_loose_edges(pairs, frames, np.isin(np.arange(frames), repeats))
     poses, root = RigidTransform.identity(frames), np.linalg.cholesky(np.linalg.inv(pairs.covariance))
     for number in range(ROUNDS):
         # From nowhere, all pairs are far off alike.
@@ -116,15 +122,18 @@ def loose_frames(second: IntArray, frames: int) -> BoolArray:
     return ~np.isin(np.arange(frames), np.append(0, second))
 
 
-def _with_loose_edges(pairs: RelativePoses, frames: int) -> RelativePoses:
-    """Join loose frames to their neighbours by edges of large covariance."""
-    lone = np.flatnonzero(loose_frames(pairs.second, frames))
-    after = lone[lone + 1 < frames]
+def _with_loose_edges(pairs: RelativePoses, frames: int, is_repeat: BoolArray) -> RelativePoses:
+    """Join loose frames to their neighbours by edges of large covariance, repeats to what they repeat."""
+    loose = loose_frames(pairs.second, frames)
+    second = np.flatnonzero(loose | np.append(False, loose[:-1]))
+    latest_image = np.maximum.accumulate(np.where(is_repeat, 0, np.arange(frames)))
+    variance = (second - latest_image[second - 1])[:, None] * HELD**2
+    variance[is_repeat[second]] = SAME
     return RelativePoses(
-        np.concatenate([pairs.first, lone - 1, after]),
-        np.concatenate([pairs.second, lone, after + 1]),
-        RigidTransform.concatenate([pairs.poses, RigidTransform.identity(lone.size + after.size)]),
-        np.concatenate([pairs.covariance, np.tile(np.diag(HELD**2), (lone.size + after.size, 1, 1))]),
+        np.concatenate([pairs.first, second - 1]),
+        np.concatenate([pairs.second, second]),
+        RigidTransform.concatenate([pairs.poses, RigidTransform.identity(second.size)]),
+        np.concatenate([pairs.covariance, variance[:, :, None] * np.eye(6)]),
     )
 
 
@@ -137,8 +146,7 @@ def edges_of(table: CorrelationTable, planes: PairPlanes) -> RelativePoses:
     rotation = rotation_from_fixed_angles(roll, yaw, tilt)
     poses = RigidTransform.from_components(np.column_stack([x, y, a]), rotation)
     covariance = np.zeros((len(planes), 6, 6))
-    # Images that are the same, one not next to the other, leave no error at all, which no graph can weigh.
-    covariance[:, [[0], [1], [5]], [0, 1, 5]] = table.inplane_covariance[planes.row] + 1e-9 * np.eye(3)
+    covariance[:, [[0], [1], [5]], [0, 1, 5]] = table.inplane_covariance[planes.row] + SAME * np.eye(3)
     # (a, b, c) is (z, -yaw, tilt) for small angles.
     order = np.array([[1.0, 0, 0], [0, 0, 1.0], [0, -1.0, 0]])
     covariance[:, 2:5, 2:5] = order @ planes.covariance @ order.T

@@ -10,6 +10,8 @@ from speckle3d.core.poses import (
     ERROR_STEPS,
     SCALE_CHANGE_MM,
     SHARED,
+    SIDEWAYS,
+    SIDEWAYS_BY_SHARE,
     STRUCTURE,
     TURN_CHANGE_MM,
     PoseErrors,
@@ -29,7 +31,8 @@ def claimed_covariance(
 
     Of (x, y, z, tilt, yaw, roll) about the image's centre along the first frame's axes, mm and rad. To the
     pairs' own scatter come the scale of distances, wrong by a share that is the same over the sweep
-    and by one that changes along it, and slopes seen over the distance travelled, which bend the sweep.
+    and by one that changes along it, slopes seen over the distance travelled, which bend the sweep, and
+    structure that runs across, which moves sideways in the image.
 
     Parameters
     ----------
@@ -44,7 +47,10 @@ def claimed_covariance(
     turn[:, :3, :3] = turn[:, 3:, 3:] = poses.rotation.as_matrix()
     grown = SHARED * (1.0 + STRUCTURE * structure)
     pair_covariance = turn @ (independent * np.outer(grown, grown)) @ turn.transpose(0, 2, 1)
-    return np.asarray(pair_covariance + shared_covariance(poses, centre_mm, shared))
+    covariance = np.asarray(pair_covariance + shared_covariance(poses, centre_mm, shared))
+    along = poses.apply(centre_mm)[:, 2:] - poses[0].apply(centre_mm)[2]
+    covariance[:, [0, 1], [0, 1]] += ((SIDEWAYS + SIDEWAYS_BY_SHARE * structure) * along) ** 2
+    return covariance
 
 
 def shared_covariance(poses: RigidTransform, centre_mm: FloatArray, shared: SharedErrors) -> FloatArray:

@@ -65,6 +65,6 @@ def load_view(directory: Path, outcome: SweepOutcome) -> SweepView:
     covariance = None
     if reconstruction.trust is not None:
         covariance = reconstruction.trust.covariance
-        notes += [f"{line}: poses there are guesses" for line in describe(reconstruction.trust.flags)]
+        notes += describe(reconstruction.trust.flags)
     curves = sweep_curves(poses, reconstruction.grid.centre_mm, reference, covariance)
     return SweepView(folder, reconstruction, curves, poses, notes)

@@ -114,7 +114,7 @@ class PosedSweep:
             )
         trust = self.reconstruction and self.reconstruction.trust
         if trust:
-            lines += [f"{flag}: poses there are guesses" for flag in describe(trust.flags)]
+            lines += describe(trust.flags)
         return lines
 
 
