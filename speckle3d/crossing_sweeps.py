@@ -7,6 +7,7 @@ import numpy as np
 from speckle3d.config import Config
 from speckle3d.core.curves import BAND_ADVICE, DecorrelationCurves
 from speckle3d.core.errors import InvalidInputError, MismatchError
+from speckle3d.core.poses import SIDEWAYS, SIDEWAYS_BY_SHARE
 from speckle3d.core.progress import Progress, after
 from speckle3d.core.sweep import Sweep
 from speckle3d.correction.crossing.pair import CrossedPair, solve_crossing
@@ -140,4 +141,5 @@ def crossing_side(sweep: Sweep, tracking: Tracked, stack: ImageStack, config: Co
         sensed_orientation(credible_sensors(sweep, tracking.doubts), config.sensors),
         tracking.flags,
         sweep.frame_time_s,
+        float((SIDEWAYS + SIDEWAYS_BY_SHARE * tracking.coherence.share.mean())[0]),
     )

@@ -63,7 +63,7 @@ class Prior:
 
     Attributes
     ----------
-    information : ndarray, shape (24, 24)
+    information : ndarray, shape (30, 30)
         Inverse covariance of the parameters; zero where nothing is known.
     turn : Rotation or None
         Of the second path against the first, by sensors.
@@ -73,7 +73,7 @@ class Prior:
     turn: Rotation | None = None
 
     def deviation(self, placing: Placing) -> FloatArray:
-        """Parameters less what is expected, shape (24,)."""
+        """Parameters less what is expected, shape (30,)."""
         away = np.concatenate([np.zeros(RIGID), placing.bends.ravel()])
         if self.turn is not None:
             away[3:RIGID] = (placing.first_from_second.rotation * self.turn.inv()).as_rotvec()
@@ -123,7 +123,7 @@ class CrossingFit:
 
     @cached_property
     def normal_equations(self) -> tuple[FloatArray, FloatArray]:
-        """Matrix of Gauss and Newton with the prior's, shape (24, 24), and gradient of the cost."""
+        """Matrix of Gauss and Newton with the prior's, shape (30, 30), and gradient of the cost."""
         information = self.prior.information
         gradient, hessian = information @ self.prior.deviation(self.placing), np.zeros_like(information)
         for way in self.ways:
@@ -184,10 +184,10 @@ class Parts:
 
     Attributes
     ----------
-    pulls : ndarray, shape (n, 24)
+    pulls : ndarray, shape (n, 30)
         Gradient of the cost with the parameters. The first three shift the second sweep against the first, so
         that they are a part's own shift, too.
-    coupling : ndarray, shape (n, 3, 24)
+    coupling : ndarray, shape (n, 3, 30)
         Matrix of Gauss and Newton between that shift, mm, and all parameters.
     correlation : ndarray, shape (3 n, 3 n)
         Correlation of the displacements of all parts and directions.
@@ -219,7 +219,7 @@ class Parts:
 
         Parameters
         ----------
-        matrix : ndarray, shape (24, 24)
+        matrix : ndarray, shape (30, 30)
             Of Gauss and Newton and of the prior, of a fit under a blur that is wide against the displacement:
             only then residuals are in proportion.
         """
@@ -240,7 +240,7 @@ class Parts:
 
 
 def covariance(fit: CrossingFit, displacement_mm: float) -> FloatArray:
-    """Covariance of all parameters, shape (24, 24).
+    """Covariance of all parameters, shape (30, 30).
 
     The images' curvature says how the answer moves with the residuals; what the parts of the tissue pull by
     says how much residuals vary if they err independently, and what tissue that moved as one does to the

@@ -332,7 +332,9 @@ def _prior(
             # A drift from -1 to 1 along the sweep has a standard deviation of 1 / sqrt(3).
             rates = np.minimum(rates, 2.0 * np.sqrt(3.0) * over / side.length_mm)
         block = slice(number * BENDS, (number + 1) * BENDS)
-        spread[block, block] = np.diag(np.repeat([settings.tissue_sigma, *rates], ORDERS) ** 2)
+        spread[block, block] = np.diag(
+            np.repeat([settings.tissue_sigma, *rates, sweep.sideways_per_mm], ORDERS) ** 2
+        )
     # Probe and curves are the same: so is the error of the scale.
     spread[np.ix_([0, BENDS], [0, BENDS])] += sweeps[0].scale_sigma * sweeps[1].scale_sigma
     # A kilometre and 1000 radians of place and turn: as good as nothing.

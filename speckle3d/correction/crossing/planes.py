@@ -20,10 +20,12 @@ from speckle3d.correction.crossing.sweep import CrossingSweep
 from speckle3d.correction.crossing.texture import local_contrast
 from speckle3d.correction.curves import ELEVATIONAL, CorrectedChain
 
+BENT = (*ELEVATIONAL, "x")
 ORDERS = 3
-BENDS = len(ELEVATIONAL) * ORDERS
+BENDS = len(BENT) * ORDERS
 """Coefficients of Legendre polynomials along the sweep: of the relative change of elevational steps, then of
-tilt and yaw per signed elevational mm of the images, rad/mm."""
+tilt, yaw and motion sideways per signed elevational mm of the images, rad/mm and 1. Where sweeps cross
+obliquely, structure that moves sideways feigns another length: 2 % of it at 45 degrees for 3 % sideways."""
 
 _SMOOTH_MM = 1.0
 """Travel over which the path is smoothed: a hand's slow wander stays. A third of it and twice as much move
@@ -74,8 +76,8 @@ class StraightSweep:
         return RigidTransform.from_matrix(start[at] @ np.linalg.inv(poses[at]) @ poses)
 
     def mean_rates(self) -> FloatArray:
-        """Mean relative change of steps, tilt and yaw per mm by bends, shape (3, 9)."""
-        return np.asarray(np.kron(np.eye(3), self.planes.basis[1:, 0].mean(axis=0) / PIXEL_MM))
+        """Mean relative change of steps, tilt and yaw per mm by bends, shape (3, 12)."""
+        return np.asarray(np.kron(np.eye(3, len(BENT)), self.planes.basis[1:, 0].mean(axis=0) / PIXEL_MM))
 
 
 def relative_turn(first: StraightSweep, second: StraightSweep) -> Rotation | None:
@@ -143,11 +145,11 @@ def straighten(sweep: CrossingSweep, nearest_mm: float = 0.0) -> StraightSweep:
 def _chain(poses: RigidTransform, travel_mm: FloatArray) -> CorrectedChain:
     """Poses whose steps along the path are bent by polynomials of the travel, which is zero in its middle."""
     along = 0.5 * (travel_mm[1:] + travel_mm[:-1]) / np.abs(travel_mm).max()
-    basis = np.zeros((len(poses), len(ELEVATIONAL), ORDERS))
+    basis = np.zeros((len(poses), len(BENT), ORDERS))
     basis[1:] = (elevational_steps(poses, np.zeros(3))[:, None] * legendre.legvander(along, ORDERS - 1))[
         :, None
     ]
-    return CorrectedChain.of(poses, ELEVATIONAL, basis)
+    return CorrectedChain.of(poses, BENT, basis)
 
 
 def _smooth_path(travel: FloatArray, poses: RigidTransform, at: FloatArray) -> RigidTransform:

@@ -32,7 +32,7 @@ class Placing:
     ----------
     first_from_second : RigidTransform
         Between the paths' frames.
-    bends : ndarray, shape (2, 9)
+    bends : ndarray, shape (2, 12)
     """
 
     first_from_second: RigidTransform
@@ -91,7 +91,7 @@ class OneWay:
     ----------
     values, levels : ndarray, shape (n,)
         Of the points, and what the other sweep shows there; NaN where it shows nothing.
-    rows : ndarray, shape (n, 24)
+    rows : ndarray, shape (n, 30)
         Change of `levels` with the parameters.
     points_mm : ndarray, shape (n, 3)
         In the first path's frame.

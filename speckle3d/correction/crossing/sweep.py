@@ -7,6 +7,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import FloatArray, IntArray
+from speckle3d.core.poses import SIDEWAYS
 from speckle3d.correction.crossing.stack import ImageStack
 
 
@@ -97,6 +98,8 @@ class CrossingSweep:
         Not zero for frames that are not to be trusted.
     frame_time_s : ndarray, shape (n,), or None
         By which a sweep is known again; see `CrossedPair.of`.
+    sideways_per_mm : float
+        Standard deviation of motion along x that the images see for each mm along z.
     """
 
     name: str
@@ -108,6 +111,7 @@ class CrossingSweep:
     orientation: Rotation | None = None
     flags: IntArray | None = None
     frame_time_s: FloatArray | None = None
+    sideways_per_mm: float = SIDEWAYS
 
     @property
     def good(self) -> IntArray:
