@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from sweep_examples import frames_of
 
+from speckle3d.config import Config
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.geometry import mirrored
 from speckle3d.io.family.curves import read_curves
@@ -117,6 +118,15 @@ def test_frames_that_a_recorder_repeats_are_where_their_image_is(sweep, curves):
     z, expected = (t.image.apply(sweep.grid.centre_mm)[:, 2] for t in (tracking, whole))
     assert np.abs(z - expected[rows]).max() < 0.03
     assert tracking.covariance[-1, 2, 2] < 1.2 * whole.covariance[-1, 2, 2]
+
+
+def test_an_image_one_patch_wide_has_the_length_of_the_whole(sweep, curves):
+    """Places along a line do not determine roll: motion along x must not read as elevation for that."""
+    narrow = Config.model_validate({"patches": {"region": f"rectangle 2,2 6,{sweep.grid.depth_mm}"}})
+    paths = sweep.truth, track(sweep.part(0, 24), curves, narrow).image
+    true, estimate = (path[0].inv() * path[23] for path in paths)
+    centre = sweep.grid.centre_mm
+    assert estimate.apply(centre)[2] == pytest.approx(true.apply(centre)[2], rel=0.05)
 
 
 def test_curves_beside_a_recording_are_taken_and_said(data_folder):

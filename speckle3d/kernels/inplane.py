@@ -7,6 +7,7 @@ from numba import njit
 
 from speckle3d.core.arrays import BoolArray, Complex64Array, Float32Array, FloatArray, IntArray
 from speckle3d.core.leastsquares import MAD_TO_SIGMA
+from speckle3d.core.poses import HELD
 from speckle3d.kernels.copying import copy_into
 from speckle3d.kernels.correlation import LAGS, cohere_patch, common_window, correlate_patch, phase_ramp
 
@@ -19,9 +20,14 @@ _HUBER, _ROUNDS = 1.5, 3
 """Robust standard deviations at which a patch begins to lose weight, and times that it is weighed anew."""
 _NOWHERE = np.iinfo(np.int64).max
 _LEAST_PATCHES = 6
+"""From which the scatter of their shifts about an affine field says how far these are wrong."""
 _COLLINEAR = 1e-10
 """Determinant of the normal equations over the product of their diagonal, below which patches lie on a line;
 on a grid of a hundred by a hundred patches that do not it is above 1e-5."""
+
+
+_SLOPES = np.array([0.0, 1.0, 1.0, 0.0, 1.0, 1.0]) / HELD[5] ** 2
+"""Information on the field's slopes: a hand's roll between two frames."""
 
 
 class Frame(NamedTuple):
@@ -160,31 +166,47 @@ def _ramp(geometry: Geometry, field: FloatArray, p: int, across: float) -> tuple
 
 @njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
 def _fit(
-    geometry: Geometry, shift: FloatArray, weight: FloatArray, field: FloatArray, covariance: FloatArray
+    geometry: Geometry,
+    usable: int,
+    shift: FloatArray,
+    weight: FloatArray,
+    field: FloatArray,
+    covariance: FloatArray,
 ) -> bool:
     """Fit an affine field, shape (2, 3), to the patches' shifts across and along their vectors, shape (2, p).
 
     Least squares with Huber weights; either shift has its own robust standard deviation: along vectors it is
-    far smaller. False, and nothing changed, if the places do not determine it.
+    far smaller. Where the places do not determine the slopes these are expected to be what they are, as far
+    as a hand turns between frames. False, and nothing changed, with too few peaks.
+
+    Parameters
+    ----------
+    usable : int
+        Number of patches that could have a peak.
     """
-    rows = np.flatnonzero(weight > 0.0)
+    rows, few = np.flatnonzero(weight > 0.0), usable < _LEAST_PATCHES
+    if rows.size < (2 if few else _LEAST_PATCHES):
+        return False
     design, turn, own = geometry.design[rows], geometry.turn[rows], weight[rows]
     normal = (design * own.reshape(-1, 1)).T @ design
     determined = np.linalg.det(normal) > _COLLINEAR * normal[0, 0] * normal[1, 1] * normal[2, 2]
-    if rows.size < _LEAST_PATCHES or not determined:
-        return False
+    prior = np.zeros(6) if determined and not few else _SLOPES
     sine, cosine = turn[:, :1].copy(), turn[:, 1:].copy()
     terms = (np.hstack((cosine * design, -sine * design)), np.hstack((sine * design, cosine * design)))
     data, total, scale = (shift[0][rows], shift[1][rows]), (own.copy(), own.copy()), np.ones(2)
-    for _ in range(_ROUNDS):
-        joint, right = np.zeros((6, 6)), np.zeros(6)
+    if few:
+        for i in range(2):
+            away = data[i] - (own * data[i]).sum() / own.sum()
+            scale[i] = np.sqrt((own * away**2).sum() / (rows.size - 1)) + 1e-12
+    for _ in range(1 if few else _ROUNDS):
+        joint, right = np.diag(prior), prior * field.copy().ravel()
         for i in range(2):
             weighted = terms[i] * (total[i] / scale[i] ** 2).reshape(-1, 1)
             joint += weighted.T @ terms[i]
             right += weighted.T @ data[i]
         inverse = np.linalg.inv(joint)
         solution, before = inverse @ right, scale.copy()
-        for i in range(2):
+        for i in range(0 if few else 2):
             size = np.abs(data[i] - terms[i] @ solution) * np.sqrt(own)
             scale[i] = MAD_TO_SIGMA * np.median(size) + 1e-12
             copy_into(total[i], own * (_HUBER / np.maximum(size / scale[i], _HUBER)))
@@ -245,7 +267,7 @@ def match_pair(fixed: Frame, moving: Frame, geometry: Geometry, matches: Matches
                 lateral, axial, weight[p] = _peak(z, logarithmic[p])
                 shift[0, p], shift[1, p] = (at[0] + lateral) * spacing[p, 0], (at[1] + axial) * spacing[p, 1]
         if not by_echo:
-            fitted = _fit(geometry, shift, weight, field, covariance)
+            fitted = _fit(geometry, usable.sum(), shift, weight, field, covariance)
             if not fitted:
                 copy_into(field, start)
     places = _places(geometry, field)
