@@ -64,7 +64,7 @@ def of_kind(*kinds, **options):
     )
 
 
-def wait_until(condition, seconds=8.0):
+def wait_until(condition, seconds=120.0):
     end = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < end, "waited in vain"

@@ -11,14 +11,14 @@ pytestmark = needs_browser
 def test_the_page_has_picture_length_and_end(browser, data_folder, tmp_path, monkeypatch):
     monkeypatch.setenv("BROWSER", "true")  # the one that this test brings looks at it
     port = free_port()
-    # Slowly: a page on a busy machine takes seconds to open.
+    # More slowly than it came: a page on a busy machine lags.
     play = command("play", data_folder / "phantom.h5", "--port", port, "--rate", "0.3")
     live = command("live", f"localhost:{port}", "-o", tmp_path / "out", "--curves", data_folder / "curves.h5",
                    "--view", *RF)  # fmt: skip
-    with running(play, stderr=subprocess.PIPE) as playing:
-        read_until(playing, "127.0.0.1")
-        with running(live, stderr=subprocess.PIPE) as session:
-            page = open_page(browser, read_until(session, "http"))
+    with running(live, stderr=subprocess.PIPE) as session:
+        page = open_page(browser, read_until(session, "http"))
+        page.wait_for_selector("text=/waiting for/")
+        with running(play, stderr=subprocess.PIPE):
             page.wait_for_selector("text=/\\+1\\d\\.\\d mm ±\\d/")
             page.wait_for_selector("text=/the sweep has ended/")
             session.communicate()

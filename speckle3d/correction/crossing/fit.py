@@ -50,9 +50,6 @@ claims of six simulated pairs are up to 15 % smaller; lengths stay."""
 FACES = 0.006
 """Relative standard deviation of the scale by what is not understood: lengths of simulated pairs with exact
 poses came out 0.6 % long, cause unknown. Sweeps of simulated radio-frequency data do not show it."""
-OBLIQUE = 0.022
-"""The same of sweeps that cross obliquely, times the cosine of their angle: of four pairs of simulated
-radio-frequency sweeps at 45 degrees lengths came out 0.5 to 3.6 % short, 2.7 rms and cause unknown."""
 SCALES = [RIGID, RIGID + BENDS]
 """Where the mean scales of both sweeps are among the parameters."""
 
@@ -257,5 +254,5 @@ def covariance(fit: CrossingFit, displacement_mm: float) -> FloatArray:
     scatter += displacement_mm**2 * coupling.T @ parts.correlation @ coupling
     inverse = np.linalg.inv(fit.normal_equations[0])
     whole = inverse @ (scatter + fit.prior.information) @ inverse
-    whole[SCALES, SCALES] += FACES**2 + (OBLIQUE * np.cos(np.deg2rad(fit.angle_deg))) ** 2
+    whole[SCALES, SCALES] += FACES**2
     return np.asarray(whole)

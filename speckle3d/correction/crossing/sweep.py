@@ -69,7 +69,10 @@ class CrossingSettings(BaseModel):
         "other.",
     )
     largest_sigma: float = Field(
-        0.02, gt=0, description="Relative standard deviation of the length above which a pair is refused."
+        0.04,
+        gt=0,
+        description="Relative standard deviation of the length above which a pair is refused: half "
+        "of what images alone leave open.",
     )
 
 

@@ -1,6 +1,5 @@
 import os
 import signal
-import subprocess
 import sys
 import time
 from datetime import UTC, datetime, timedelta
@@ -18,6 +17,7 @@ pytest.importorskip("serial", reason="needs pyserial")
 if not hasattr(os, "openpty"):
     pytest.skip("needs pseudo-terminals", allow_module_level=True)
 
+from browsers import running
 from simulated_device import KINDS, of_kind, wait_until
 
 FAST = DeviceSettings(baud=115200)
@@ -69,8 +69,8 @@ class TestRecording:
             "import sys; from xsens import DeviceSettings, record\n"
             "for state in record(sys.argv[1], sys.argv[2], DeviceSettings(baud=115200)): pass"
         )
-        with subprocess.Popen([sys.executable, "-c", code, str(sensor.path), str(path)]) as recording:
-            wait_until(lambda: path.exists() and len(counters(path)) > 50, 20.0)
+        with running([sys.executable, "-c", code, sensor.path, path]) as recording:
+            wait_until(lambda: path.exists() and len(counters(path)) > 50)
             sensor.settle()
             recording.send_signal(signal.SIGKILL)
         counts_sent = list(sensor.run)
