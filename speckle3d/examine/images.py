@@ -78,7 +78,7 @@ def examine_echoes(matches: MatchedSweep) -> tuple[Doubt, ...]:
         If the echoes are not of that band, or grey levels too few.
     """
     texture = matches.texture
-    return require_usable((doubt_band(texture), doubt_steps(texture.grey_step_db())), MismatchError)
+    return require_usable((doubt_band(texture), doubt_steps(texture)), MismatchError)
 
 
 def doubt_band(texture: Texture) -> Doubt | None:
@@ -87,9 +87,10 @@ def doubt_band(texture: Texture) -> Doubt | None:
     Tissue takes high frequencies away and adds none, so most of the echo above the noise cannot lie above the
     band; below it lies what attenuation or a harmonic leaves, which is no contradiction.
     """
-    signal, power = texture.signal, texture.sample_power()
+    signal = texture.signal
     if not isinstance(signal, RFSettings):
         return None
+    power = np.mean([look.sampled for look in texture.looks.values()], axis=0)
     low, high = signal.bandwidth_hz
     frequency = signal.bin_frequency_hz(power.size)
     rising = np.argsort(frequency)
@@ -109,8 +110,13 @@ def doubt_band(texture: Texture) -> Doubt | None:
     return Doubt(IMAGES, "sampling rate or band", evidence, True)
 
 
-def doubt_steps(step_db: float) -> Doubt | None:
+def doubt_steps(texture: Texture) -> Doubt | None:
     """Refute images whose neighbouring grey levels are farther apart than speckle varies."""
+    signal = texture.signal
+    if isinstance(signal, RFSettings):
+        return None
+    step = np.median([look.step for look in texture.looks.values()])
+    step_db = float(step / signal.full_scale * signal.dynamic_range_db)
     if step_db <= SPECKLE_DB:
         return None
     evidence = f"expected grey levels at most {SPECKLE_DB:g} dB apart, got {step_db:.1f} dB"
@@ -174,9 +180,9 @@ def examine_images(
         cannot be those of one probe that moves.
     """
     pairs, problem, texture, z_mm = motion.pairs, motion.problem, matches.texture, motion.path[:, 0]
-    inside, frames = problem.patches.inside, texture.frames
+    inside, frames = problem.patches.inside, np.array(list(texture.looks))
     far = far_apart(z_mm, frames[usable[frames]], curves)
-    share = texture.standing_share(far) if len(far) else np.full(inside.size, np.nan)
+    share = standing_share(texture, far) if len(far) else np.full(inside.size, np.nan)
     share[~inside | (matches.echoless > 0.5)] = np.nan
     images = (
         doubt_shadow(matches.echoless[inside]),
@@ -265,13 +271,40 @@ def far_apart(position_mm: FloatArray, frames: IntArray, curves: DecorrelationCu
     return np.asarray(pairs[np.abs(np.diff(position_mm[pairs], axis=1))[:, 0] >= apart_mm])
 
 
+def standing_share(texture: Texture, pairs: IntArray) -> FloatArray:
+    """Share of each patch's power that is the same in all frames: median over pairs of them, shape (p,).
+
+    Echoes that stay where they are while the probe moves are reverberation, side lobes, electronics.
+    Speckle of places a beam's width and more apart has nothing in common, so that the product of two such
+    frames' echoes, sample by sample and without looking for in-plane motion, averages to zero. What is
+    added to every frame alike does not: the product's mean is its share of the power. The tissue's own
+    structure moves in the image as the hand wanders, and a quarter of a wavelength in depth turns its
+    phase round.
+
+    Parameters
+    ----------
+    pairs : ndarray of int, shape (m, 2)
+        Of frames looked at, far apart. The median lets some see what others do, as on the way back.
+
+    Returns
+    -------
+    ndarray, shape (p,)
+        Of power, or with images of intensity of its variation; of either sign and about zero where
+        nothing stays. NaN where there is no echo.
+    """
+    frames, at = np.unique(pairs, return_inverse=True)
+    echoes = np.stack([texture.looks[k].echo for k in frames.tolist()], axis=1)
+    common = echoes @ echoes.transpose(0, 2, 1)
+    return np.asarray(np.median(common[:, *at.reshape(-1, 2).T], axis=1), dtype=float)
+
+
 def doubt_clutter(share: FloatArray, pairs: int, cells: float, of_echo: bool = True) -> Doubt | None:
     """Doubt images with static echoes in frames far apart.
 
     Parameters
     ----------
     share : ndarray, shape (p,)
-        Of each patch's power, from `Texture.standing_share`.
+        Of each patch's power, from `standing_share`.
     pairs : int
         Of frames, from which it was measured.
     cells : float

@@ -9,10 +9,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy import fft
 
-from speckle3d.core.arrays import Complex64Array, Float32Array, FloatArray, IntArray
+from speckle3d.core.arrays import Complex64Array, Float32Array, FloatArray
 from speckle3d.core.curves import EchoSpectra, SpeckleSize
 from speckle3d.core.images import spread_frames
-from speckle3d.core.sweep import BModeSettings, RFSettings, Sweep
+from speckle3d.core.sweep import RFSettings, Sweep
 from speckle3d.matching.matcher import FrameMatcher, ReadyFrame
 from speckle3d.matching.quality import FrameFeatures, correlation
 
@@ -26,7 +26,7 @@ SPECKLE_SPREAD_DB = 10.0 * np.abs(np.diff(np.log10(-np.log([0.9, 0.5, 0.1]))))
 """Distances of the 10th and the 90th percentile of an exponential variable's decibels from the median."""
 
 
-class _Look(NamedTuple):
+class Look(NamedTuple):
     """Statistics of one frame.
 
     Attributes
@@ -61,12 +61,14 @@ class Texture:
     Attributes
     ----------
     signal : RFSettings or BModeSettings
+    looks : dict of int to Look
+        By the frame's number, increasing.
     """
 
     def __init__(self, matcher: FrameMatcher) -> None:
         self.signal, self._patches = matcher.signal, matcher.patches
         self._edge_fraction = matcher.key.edge_fraction
-        self._looks: dict[int, _Look] = {}
+        self.looks: dict[int, Look] = {}
 
     def keep(self, number: int, ready: ReadyFrame) -> None:
         """Measure the usable patches of one frame, later than those before."""
@@ -86,12 +88,7 @@ class Texture:
             step = float(np.median(np.diff(np.unique(ready.samples))))
         size = _sizes(intensity, ready.features, patches.spacing_mm)
         size, power = (np.where(usable, values, np.nan) for values in (size, power))
-        self._looks[number] = _Look(size, power, level, sample_power, _unit_echoes(local_tiles), step)
-
-    @property
-    def frames(self) -> IntArray:
-        """Numbers of the frames that were looked at, increasing."""
-        return np.array(list(self._looks), dtype=np.int64)
+        self.looks[number] = Look(size, power, level, sample_power, _unit_echoes(local_tiles), step)
 
     def speckle_size(self) -> SpeckleSize:
         """Lateral and axial size of speckle in each row of patches.
@@ -104,19 +101,12 @@ class Texture:
         size = np.ma.median(self._rows("size"), axis=(0, 3))  # type: ignore[no-untyped-call]
         return SpeckleSize(*size.filled(np.nan))
 
-    def grey_step_db(self) -> float:
-        """Between neighbouring grey levels, dB; 0 of echoes."""
-        if not isinstance(self.signal, BModeSettings):
-            return 0.0
-        step = np.median([look.step for look in self._looks.values()])
-        return float(step / self.signal.full_scale * self.signal.dynamic_range_db)
-
     def grey_spread_db(self) -> FloatArray:
         """Distances of the 10th and the 90th percentile from the median, dB, of the median patch, shape (2,).
 
         Speckle's if nothing tells otherwise, as in echoes.
         """
-        levels = [look.level for look in self._looks.values() if look.level.size]
+        levels = [look.level for look in self.looks.values() if look.level.size]
         if not levels:
             return SPECKLE_SPREAD_DB
         low, middle, high = 10.0 * np.log10(np.e) * np.concatenate(levels, axis=1)
@@ -144,39 +134,9 @@ class Texture:
             self._patches.row_depth_mm[has_echo], frequency[band], power.data[has_echo][:, band]
         )
 
-    def sample_power(self) -> FloatArray:
-        """Power of the samples as read, by `RFSettings.bin_frequency_hz`."""
-        return np.asarray(np.mean([look.sampled for look in self._looks.values()], axis=0))
-
-    def standing_share(self, pairs: IntArray) -> FloatArray:
-        """Share of each patch's power that is the same in all frames: median over pairs of them, shape (p,).
-
-        Echoes that stay where they are while the probe moves are reverberation, side lobes, electronics.
-        Speckle of places a beam's width and more apart has nothing in common, so that the product of two such
-        frames' echoes, sample by sample and without looking for in-plane motion, averages to zero. What is
-        added to every frame alike does not: the product's mean is its share of the power. The tissue's own
-        structure moves in the image as the hand wanders, and a quarter of a wavelength in depth turns its
-        phase round.
-
-        Parameters
-        ----------
-        pairs : ndarray of int, shape (m, 2)
-            Of `frames`, far apart. The median lets some see what others do, as on the way back.
-
-        Returns
-        -------
-        ndarray, shape (p,)
-            Of power, or with images of intensity of its variation; of either sign and about zero where
-            nothing stays. NaN where there is no echo.
-        """
-        frames, at = np.unique(pairs, return_inverse=True)
-        echoes = np.stack([self._looks[k].echo for k in frames.tolist()], axis=1)
-        common = echoes @ echoes.transpose(0, 2, 1)
-        return np.asarray(np.median(common[:, *at.reshape(-1, 2).T], axis=1), dtype=float)
-
     def _rows(self, name: str) -> Any:
         """Values of all frames by rows and columns, shape (n, k, r, c), masked where they are not usable."""
-        values = np.stack([getattr(look, name) for look in self._looks.values()])
+        values = np.stack([getattr(look, name) for look in self.looks.values()])
         return np.ma.masked_invalid(self._patches.rows_of(values))
 
 

@@ -7,14 +7,12 @@ from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.poses import (
-    ERROR_STEPS,
     SCALE_CHANGE_MM,
     SHARED,
     SIDEWAYS,
     SIDEWAYS_BY_SHARE,
     STRUCTURE,
     TURN_CHANGE_MM,
-    PoseErrors,
 )
 from speckle3d.core.reconstruction import SharedErrors
 from speckle3d.motion.planes import PairPlanes, PlaneSettings
@@ -55,7 +53,7 @@ def claimed_covariance(
 
 def shared_covariance(poses: RigidTransform, centre_mm: FloatArray, shared: SharedErrors) -> FloatArray:
     """Covariance of every frame's pose by errors common to all pairs, shape (n, 6, 6)."""
-    common, way = _common_factors(poses, centre_mm, shared), _travel(poses, centre_mm)
+    common, way = common_factors(poses, centre_mm, shared), travel(poses, centre_mm)
     covariance = np.einsum("mia,mib->iab", common, common)
     covariance[:, 2, 2] += shared.scale_sigma**2 * SCALE_CHANGE_MM * way
     # Each turn on the way moves the centre by its product with what is travelled along z after it.
@@ -70,7 +68,7 @@ def shared_covariance(poses: RigidTransform, centre_mm: FloatArray, shared: Shar
     return np.asarray(covariance)
 
 
-def _common_factors(poses: RigidTransform, centre_mm: FloatArray, shared: SharedErrors) -> FloatArray:
+def common_factors(poses: RigidTransform, centre_mm: FloatArray, shared: SharedErrors) -> FloatArray:
     """Errors of poses for one deviation of the scale, of yaw and of tilt per mm, shape (3, n, 6)."""
     z = poses.apply(centre_mm)[:, 2]
     z = z - z[0]
@@ -83,45 +81,10 @@ def _common_factors(poses: RigidTransform, centre_mm: FloatArray, shared: Shared
     return factors
 
 
-def _travel(poses: RigidTransform, centre_mm: FloatArray) -> FloatArray:
+def travel(poses: RigidTransform, centre_mm: FloatArray) -> FloatArray:
     """Path length of the image's centre up to every frame, shape (n,), mm."""
     steps = np.linalg.norm(np.diff(poses.apply(centre_mm), axis=0), axis=1)
     return np.append(0.0, np.cumsum(steps))
-
-
-def joint_errors(
-    covariance: FloatArray,
-    world_from_image: RigidTransform,
-    centre_mm: FloatArray,
-    shared: SharedErrors | None,
-) -> PoseErrors:
-    """Errors of all frames together whose covariances, frame by frame, are those given.
-
-    What all frames have in common is carried as it was claimed. The rest has grown along the way: errors of
-    two frames are correlated as a random walk's, by the root of the ratio of their ways.
-
-    Parameters
-    ----------
-    covariance : ndarray, shape (n, 6, 6)
-        Of (x, y, z, tilt, yaw, roll) about the image's centre along the first frame's axes, mm and rad.
-    world_from_image : RigidTransform, length n
-    centre_mm : ndarray, shape (3,)
-    shared : SharedErrors or None
-        Which part of `covariance` all frames have in common; None: none of it.
-    """
-    poses = world_from_image[0].inv() * world_from_image
-    common = _common_factors(poses, centre_mm, shared or SharedErrors(0.0, 0.0, np.zeros(2)))
-    remainder = covariance - np.einsum("mia,mib->iab", common, common)
-    # In units of the whole, and no less than nothing: what all have in common may be more than a frame's own.
-    size = np.sqrt(np.maximum(np.diagonal(covariance, axis1=1, axis2=2), 1e-24))
-    value, axes = np.linalg.eigh(remainder / (size[:, :, None] * size[:, None, :]))
-    root = size[:, :, None] * (axes * np.sqrt(np.maximum(value, 0.0))[:, None, :]) @ axes.transpose(0, 2, 1)
-    way = np.maximum(_travel(poses, centre_mm), 1e-6)
-    begin, width = np.linspace(0.0, way[-1], ERROR_STEPS, endpoint=False), way[-1] / ERROR_STEPS
-    share = np.sqrt(np.clip(way - begin[:, None], 0.0, width) / way)
-    grown = np.einsum("ki,iam->kmia", share, root).reshape(-1, len(poses), 6)
-    factors = np.concatenate([common, grown])
-    return PoseErrors(factors[np.abs(factors).max(axis=(1, 2)) > 1e-12], world_from_image, centre_mm)
 
 
 BEYOND_DOUBT = 2.0

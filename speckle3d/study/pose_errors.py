@@ -5,14 +5,15 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError
-from speckle3d.core.poses import PoseErrors
+from speckle3d.core.poses import ERROR_STEPS, PoseErrors
 from speckle3d.core.reconstruction import Reconstruction, SharedErrors
 from speckle3d.imaging.measures.belonging import require_inside
 from speckle3d.imaging.measures.measure import Measurement, measure_points
-from speckle3d.motion.uncertainty import joint_errors
+from speckle3d.motion.uncertainty import common_factors, travel
 from speckle3d.scoring.modes import default_mode
 from speckle3d.scoring.trajectories import poses_of
 
@@ -113,3 +114,38 @@ def errors_of(reconstruction: Reconstruction, mode: str = "image") -> PoseErrors
         return joint_errors(claim.covariance, poses, centre, stretch)
     images = joint_errors(trust.covariance, reconstruction.poses["image"], centre, trust.shared)
     return replace(images, world_from_image=poses)
+
+
+def joint_errors(
+    covariance: FloatArray,
+    world_from_image: RigidTransform,
+    centre_mm: FloatArray,
+    shared: SharedErrors | None,
+) -> PoseErrors:
+    """Errors of all frames together whose covariances, frame by frame, are those given.
+
+    What all frames have in common is carried as it was claimed. The rest has grown along the way: errors of
+    two frames are correlated as a random walk's, by the root of the ratio of their ways.
+
+    Parameters
+    ----------
+    covariance : ndarray, shape (n, 6, 6)
+        Of (x, y, z, tilt, yaw, roll) about the image's centre along the first frame's axes, mm and rad.
+    world_from_image : RigidTransform, length n
+    centre_mm : ndarray, shape (3,)
+    shared : SharedErrors or None
+        Which part of `covariance` all frames have in common; None: none of it.
+    """
+    poses = world_from_image[0].inv() * world_from_image
+    common = common_factors(poses, centre_mm, shared or SharedErrors(0.0, 0.0, np.zeros(2)))
+    remainder = covariance - np.einsum("mia,mib->iab", common, common)
+    # In units of the whole, and no less than nothing: what all have in common may be more than a frame's own.
+    size = np.sqrt(np.maximum(np.diagonal(covariance, axis1=1, axis2=2), 1e-24))
+    value, axes = np.linalg.eigh(remainder / (size[:, :, None] * size[:, None, :]))
+    root = size[:, :, None] * (axes * np.sqrt(np.maximum(value, 0.0))[:, None, :]) @ axes.transpose(0, 2, 1)
+    way = np.maximum(travel(poses, centre_mm), 1e-6)
+    begin, width = np.linspace(0.0, way[-1], ERROR_STEPS, endpoint=False), way[-1] / ERROR_STEPS
+    share = np.sqrt(np.clip(way - begin[:, None], 0.0, width) / way)
+    grown = np.einsum("ki,iam->kmia", share, root).reshape(-1, len(poses), 6)
+    factors = np.concatenate([common, grown])
+    return PoseErrors(factors[np.abs(factors).max(axis=(1, 2)) > 1e-12], world_from_image, centre_mm)

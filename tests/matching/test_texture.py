@@ -8,7 +8,7 @@ import speckle
 
 from speckle3d.core.sweep import BModeSettings, RFSettings, Sweep
 from speckle3d.examine.curves import doubt_sign
-from speckle3d.examine.images import doubt_band
+from speckle3d.examine.images import doubt_band, standing_share
 from speckle3d.matching.matcher import FrameMatcher
 from speckle3d.matching.texture import measured_texture
 
@@ -107,7 +107,7 @@ def share_of(frames):
     signal = speckle.RF
     grid = replace(speckle.GRID, vectors=36, samples=900, sample_spacing_mm=signal.sample_spacing_mm)
     sweep = Sweep(frames.astype(np.float32), grid, signal, np.arange(len(frames)) / 25)
-    return texture_of(sweep).standing_share(np.column_stack(np.triu_indices(5, 1)))
+    return standing_share(texture_of(sweep), np.column_stack(np.triu_indices(5, 1)))
 
 
 @pytest.mark.parametrize("power", [0.0, 0.1, 1.0])

@@ -9,9 +9,9 @@ from speckle3d.motion.uncertainty import (
     SCALE_CHANGE_MM,
     TURN_CHANGE_MM,
     claimed_covariance,
-    joint_errors,
     shared_covariance,
 )
+from speckle3d.study.pose_errors import joint_errors
 
 CENTRE_MM = np.array([7.0, 22.0, 0.0])
 Z_MM = np.concatenate([np.linspace(0, 10, 51), np.linspace(10, 0, 51)[1:]])
