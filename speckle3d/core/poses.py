@@ -42,7 +42,7 @@ grow to 0.3 degrees in 1 mm, 0.7 in 4, 1.0 in 8 and 2.0 in 24. Tracked hands ove
 ERROR_STEPS = 40
 """Places along a sweep at which its errors are computed; between them they are interpolated."""
 
-HELD = np.array([1.0, 1.0, 1.0, 0.05, 0.05, 0.05])
+HELD = np.repeat([1.0, 0.05], 3)
 """How far a probe may go between two frames that no pair joins, deviations of (x, y, z, tilt, yaw, roll), mm
 and rad: 25 mm and 70 degrees in a second at 25 frames."""
 
@@ -176,5 +176,5 @@ def plot_poses(
                     lw=0,
                     label="its 95 % interval",
                 )
-    axes[0].legend(fontsize="small", frameon=False)
+    axes[0].legend(fontsize="small")
     return figure
