@@ -169,8 +169,8 @@ def mount(sweep: s3.Sweep, paths: Sequence[Path]) -> s3.Sweep:
     """Put calibration files on a sweep's sensors, and report on stderr where they contradict the sweep."""
     import numpy as np
 
+    from speckle3d.calibration_files import apply_calibrations
     from speckle3d.core.geometry import rigid
-    from speckle3d.io.family.calibrations import apply_calibrations
 
     for path in paths:
         calibration = s3.load_calibration(path)

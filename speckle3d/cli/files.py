@@ -95,7 +95,7 @@ def convert(
     $ speckle3d convert scan.mha sweep.h5 --calibration tracker.h5
     """
     from speckle3d.calibrating.recordings import require_unsaid
-    from speckle3d.io.family.calibrations import fitted_pixels, resized
+    from speckle3d.calibration_files import fitted_pixels, resized
     from speckle3d.io.family.reconstructions import FORMAT
     from speckle3d.io.hdf5 import require_suffix
     from speckle3d.io.load import kind_of, open_recording

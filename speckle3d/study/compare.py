@@ -16,11 +16,11 @@ from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 
+from speckle3d.calibration_files import apply_calibrations
 from speckle3d.config import Config, config_from_toml
 from speckle3d.core.errors import Speckle3DError
 from speckle3d.core.progress import Progress
 from speckle3d.core.text import printable
-from speckle3d.io.family.calibrations import apply_calibrations
 from speckle3d.io.family.curves import read_curves
 from speckle3d.io.hdf5 import make_folder, one_line, sha256_of
 from speckle3d.io.load import load_sweep, recording_sha256

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from speckle3d.calibration_files import apply_calibrations
 from speckle3d.config import stored_config
 from speckle3d.core.arrays import Float32Array, FloatArray
 from speckle3d.core.errors import InvalidInputError, MismatchError
@@ -15,7 +16,6 @@ from speckle3d.core.grid import ImageGrid, ScanConversion
 from speckle3d.core.reconstruction import Reconstruction
 from speckle3d.core.sweep import BModeSettings, Sweep
 from speckle3d.imaging.voxels.settings import Levels
-from speckle3d.io.family.calibrations import apply_calibrations
 from speckle3d.io.family.reconstructions import read_reconstruction
 from speckle3d.io.load import load_sweep, recording_sha256
 from speckle3d.matching.intensity import IntensityExtractor, IntensitySettings

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from speckle3d.calibration_files import apply_calibrations
 from speckle3d.config import Config
 from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.core.errors import InsufficientDataError, MismatchError
@@ -35,7 +36,6 @@ from speckle3d.crossing_sweeps import cross_with, require_pair, stack_for
 from speckle3d.examine.disagreements import differing_lengths
 from speckle3d.examine.frames import describe
 from speckle3d.examine.sensors import credible_sensors, repair_readings, require_credible
-from speckle3d.io.family.calibrations import apply_calibrations
 from speckle3d.io.family.reconstructions import write_reconstruction
 from speckle3d.io.fileset import FileSet
 from speckle3d.io.hdf5 import PathLike

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from speckle3d.calibration_files import apply_calibrations, fitted_pixels, resized
 from speckle3d.core.arrays import IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
 from speckle3d.core.reconstruction import Reconstruction
@@ -19,7 +20,6 @@ from speckle3d.core.text import shown
 from speckle3d.examine.frames import describe
 from speckle3d.imaging.images import ChosenImages, PosedImages
 from speckle3d.imaging.voxels.settings import Levels
-from speckle3d.io.family.calibrations import apply_calibrations, fitted_pixels, resized
 from speckle3d.io.family.reconstructions import FORMAT
 from speckle3d.io.hdf5 import PathLike
 from speckle3d.io.import_settings import ImportSettings

@@ -267,12 +267,11 @@ def write_volume(path: PathLike, volume: Volume, compress: bool = True) -> None:
     ...     read_volume(f"{folder}/v.nrrd").shape
     (4, 3, 2)
     """
-    is_labels = isinstance(volume, LabelMap)
-    suffix = require_suffix(path, (LABELS_ALONE, *SUFFIXES) if is_labels else SUFFIXES)
     plain = _segment_fields(volume.segments, volume.shape) if isinstance(volume, LabelMap) else {}
+    suffix = require_suffix(path, (LABELS_ALONE, *SUFFIXES) if plain else SUFFIXES)
     with atomic_path(path) as part:
         if ".nii" in suffix:
-            _write_nifti(part, volume, {**volume.fields, **plain}, is_labels)
+            _write_nifti(part, volume, {**volume.fields, **plain})
             return
         named = {f"{_PREFIX}{name}": value for name, value in volume.fields.items()} | plain
         fields = {name: _escape(value) for name, value in named.items()}
@@ -296,14 +295,14 @@ Segment{i}_Layer=0
     return names | dict(line.split("=") for line in text.splitlines())
 
 
-def _write_nifti(path: Path, volume: Volume, fields: Mapping[str, str], is_labels: bool) -> None:
+def _write_nifti(path: Path, volume: Volume, fields: Mapping[str, str]) -> None:
     # NIfTI-1 counts voxels along an axis by two bytes.
     kind: Any = nibabel.Nifti2Image if max(volume.shape) >= 2**15 else nibabel.Nifti1Image
     image = kind(volume.voxels, _RAS_FROM_LPS @ volume.world_from_index)
     image.set_qform(image.affine, 1)
     image.set_sform(image.affine, 1)
     image.header.set_xyzt_units("mm")
-    if is_labels:
+    if isinstance(volume, LabelMap):
         image.header.set_intent(_LABELS)
     if fields:
         text = json.dumps({_COMMENT: dict(fields)}, ensure_ascii=False).encode("utf-8", "backslashreplace")

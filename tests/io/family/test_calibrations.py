@@ -5,8 +5,9 @@ import pytest
 import sweep_examples
 from calibration_files import example_calibration
 
+from speckle3d.calibration_files import apply_calibrations
 from speckle3d.core.errors import MismatchError
-from speckle3d.io.family.calibrations import apply_calibrations, write_calibration
+from speckle3d.io.family.calibrations import write_calibration
 from speckle3d.io.hdf5 import sha256_of
 
 
