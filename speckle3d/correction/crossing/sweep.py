@@ -69,10 +69,10 @@ class CrossingSettings(BaseModel):
         "other.",
     )
     largest_sigma: float = Field(
-        0.04,
+        0.05,
         gt=0,
-        description="Relative standard deviation of the length above which a pair is refused: half "
-        "of what images alone leave open.",
+        description="Relative standard deviation of the length above which a pair is refused; images alone "
+        "leave 8 % open.",
     )
 
 
