@@ -11,9 +11,8 @@ from imu_messages import (
 )
 from scipy.spatial.transform import Rotation
 
-from xsens.messages.control import MessageId, RawCalibration
+from xsens.messages.contents import DataLayout, MessageId, OutputMode, RawCalibration
 from xsens.messages.framing import Message, encode
-from xsens.messages.mtdata import DataLayout, OutputMode
 
 G = 9.80665
 

@@ -5,9 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from xsens.messages.control import MessageId
+from xsens.messages.contents import KINDS, MessageId
 from xsens.messages.framing import Message
-from xsens.messages.mtdata import KINDS
 
 
 def bytes_from_numbers(values, form):

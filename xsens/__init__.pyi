@@ -1,12 +1,12 @@
 # The public names: read by type checkers, and by lazy_loader when the package is imported.
+from .accuracy.angles import MechanismSettings as MechanismSettings
 from .accuracy.angles import PairErrors as PairErrors
 from .accuracy.angles import common_readings as common_readings
 from .accuracy.angles import mounting_from_motion as mounting_from_motion
 from .accuracy.angles import pair_errors as pair_errors
+from .accuracy.angles import read_mechanism_csv as read_mechanism_csv
+from .accuracy.angles import readings_at as readings_at
 from .accuracy.figures import figure_turns as figure_turns
-from .accuracy.mechanism import MechanismSettings as MechanismSettings
-from .accuracy.mechanism import read_mechanism_csv as read_mechanism_csv
-from .accuracy.mechanism import readings_at as readings_at
 from .fusion.online import OnlineFilter as OnlineFilter
 from .fusion.online import OnlineState as OnlineState
 from .fusion.orient import Method as Method
@@ -14,7 +14,7 @@ from .fusion.orient import Orientation as Orientation
 from .fusion.orient import orient as orient
 from .live.device import DeviceError as DeviceError
 from .live.device import DeviceSettings as DeviceSettings
-from .live.monitor import LiveState as LiveState
+from .live.recording import LiveState as LiveState
 from .live.recording import Recorder as Recorder
 from .live.recording import record as record
 from .logs.assembly import Hints as Hints

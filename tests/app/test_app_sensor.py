@@ -11,7 +11,7 @@ from speckle3d.app.sensor.watch import SensorWatch
 from xsens.fusion.field import Trust
 from xsens.fusion.online import OnlineState
 from xsens.fusion.orient import orient
-from xsens.live.monitor import LiveState
+from xsens.live.recording import LiveState
 
 
 @pytest.fixture(scope="module")

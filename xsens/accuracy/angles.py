@@ -10,15 +10,15 @@ References
    reconstruction accuracy", table 2.
 """
 
-from __future__ import annotations
-
+import re
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from speckle3d.core.arrays import FloatArray
-from speckle3d.core.errors import InsufficientDataError, MismatchError
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
+from speckle3d.core.files import PathLike, open_regular
 from speckle3d.core.streams import TimedRotations
 from speckle3d.core.text import shown, text_table
 
@@ -134,7 +134,11 @@ def pair_errors(
     # (S C)^-1 (T C) = C^-1 (S^-1 T) C turns by the rotation vector of S^-1 T in the image's axes, so that
     # each pair's rotation vector is computed once for all calibrations.
     angles = np.einsum("kji,pj->kpi", matrices, turns)
-    errors = _nearest_turn(angles, reference) - reference
+    # Of the two turns to the same orientation, the nearer to the reference's: near half a turn a small error
+    # changes which is shorter.
+    size = np.linalg.norm(angles, axis=-1, keepdims=True)
+    longer = (angles * (angles - reference)).sum(axis=-1, keepdims=True) > np.pi * size
+    errors = angles * (1.0 - longer * 2.0 * np.pi / np.maximum(size, 1e-12)) - reference
     return PairErrors(len(world_from_sensor), reference[:, ::-1], errors[..., ::-1])
 
 
@@ -220,21 +224,147 @@ def _turns(measured: Rotation, reference: Rotation) -> tuple[FloatArray, FloatAr
     if n < 2:
         raise InsufficientDataError(f"expected at least 2 orientations, got {n}")
     first, second = np.triu_indices(n, 1)
-    vectors = [(poses[first].inv() * poses[second]).as_rotvec() for poses in (measured, reference)]
-    return vectors[0], vectors[1]
-
-
-def _nearest_turn(turns: FloatArray, reference: FloatArray) -> FloatArray:
-    """The rotation vector nearer to the reference's, of the two that give the same orientation.
-
-    Near half a turn a small error changes which of the two is shorter.
-    """
-    angle = np.linalg.norm(turns, axis=-1, keepdims=True)
-    opposite = turns * (1.0 - 2.0 * np.pi / np.maximum(angle, 1e-12))
-    nearer = np.linalg.norm(opposite - reference, axis=-1) < np.linalg.norm(turns - reference, axis=-1)
-    return np.where(nearer[..., None], opposite, turns)
+    turns, truth = ((poses[first].inv() * poses[second]).as_rotvec() for poses in (measured, reference))
+    return turns, truth
 
 
 def span(time_s: FloatArray) -> str:
     """First and last of some times, in words."""
     return f"{time_s[0]:.3f} to {time_s[-1]:.3f} s"
+
+
+# -- a mechanism as the reference
+
+_COLUMNS = ("tilt", "yaw", "roll", "time", "until")
+
+_AXIS = {"roll": "Z", "yaw": "Y", "tilt": "X"}
+
+
+@dataclass(frozen=True)
+class MechanismSettings:
+    """Orientations the mechanism was set to.
+
+    Attributes
+    ----------
+    base_from_image : Rotation, length n
+        The probe's orientation as set, relative to the mechanism's base.
+    time_s, until_s : ndarray, shape (n,), optional
+        Start and end of the mechanism's standstill, on the sensor's clock; without `until_s` a moment.
+    """
+
+    base_from_image: Rotation
+    time_s: FloatArray | None = None
+    until_s: FloatArray | None = None
+
+
+def read_mechanism_csv(path: PathLike, turns: str = "roll, yaw, tilt") -> MechanismSettings:
+    """Read the settings of a mechanism that holds the probe at known orientations, one per line.
+
+    ::
+
+        # anything after a hash is a comment
+        tilt,yaw,roll,time_s,until_s
+        -16.4,-5.5,0,12.0,14.5
+        -14.5,-5.5,0,17.0,19.5
+
+    Angles are in degrees. The columns may be in any order and separated by commas, semicolons, tabs or
+    blanks; ``roll`` may be missing and is then 0; on the sensor's clock, ``time_s`` is when the mechanism
+    came to rest and ``until_s`` when it left. Without a header the columns are tilt, yaw and, if there is a
+    third, roll.
+
+    Parameters
+    ----------
+    path : path
+        Comma-separated text as above.
+    turns : str
+        The mechanism's axes from its base to the probe: each turn carries the axes after it. The default
+        is the convention of the fixed angles, R = Rz(roll) Ry(yaw) Rx(tilt).
+
+    Returns
+    -------
+    MechanismSettings
+        Settings by line, angles in radians.
+
+    Raises
+    ------
+    FileError
+        If the file cannot be read, or is no file.
+    InvalidInputError
+        With file and line, if the text is not as described.
+    """
+    sequence = re.split(r"[\s,-]+", turns.strip().lower())
+    if sorted(sequence) != sorted(_AXIS):
+        raise InvalidInputError(f"turns: expected roll, yaw and tilt in some order, got {turns!r}")
+    with open_regular(path) as file:
+        text = file.read()
+    table = _table(text.decode("utf-8-sig", errors="replace"), str(path))
+    angles = [table.get(name, np.zeros(len(table["tilt"]))) for name in sequence]
+    order = "".join(_AXIS[name] for name in sequence)
+    rotation = Rotation.from_euler(order, np.stack(angles, axis=1), degrees=True)
+    start_s, end_s = table.get("time"), table.get("until")
+    if start_s is not None and end_s is not None and (less := end_s < start_s).any():
+        k = less.argmax()
+        expected = f"expected until_s no less than time_s, {start_s[k]:g} s"
+        raise InvalidInputError(f"{path}: setting {k + 1}: {expected}, got {end_s[k]:g} s")
+    return MechanismSettings(rotation, start_s, end_s)
+
+
+def readings_at(sensor: TimedRotations, settings: MechanismSettings) -> Rotation:
+    """Reading of the sensor for each setting, averaged over the time the mechanism stood still.
+
+    Parameters
+    ----------
+    sensor : TimedRotations
+        Readings of the sensor.
+    settings : MechanismSettings
+        When the mechanism stood at which angles.
+
+    Returns
+    -------
+    Rotation
+        Rotations at these settings.
+
+    Raises
+    ------
+    InsufficientDataError
+        If the sensor has no reading at the time of a setting, or the settings have no times and their number
+        is not that of the readings.
+    """
+    start_s, count = settings.time_s, len(settings.base_from_image)
+    if start_s is None:
+        if len(sensor) != count:
+            raise InsufficientDataError(
+                f"expected times with the {count} settings, or as many readings, got no times and "
+                f"{len(sensor)} readings"
+            )
+        return sensor.world_from_sensor
+    end_s = start_s if settings.until_s is None else settings.until_s
+    spans = zip(np.searchsorted(sensor.time_s, [start_s, end_s]).T, 0.5 * (start_s + end_s), strict=True)
+    return Rotation.concatenate(
+        [
+            sensor.world_from_sensor[low:high].mean() if high - low > 1 else sensor.at(middle_s)
+            for (low, high), middle_s in spans
+        ]
+    )
+
+
+def _table(text: str, where: str) -> dict[str, FloatArray]:
+    """Columns by name; where semicolons separate, the decimal sign may be a comma."""
+    lines = [content for line in text.splitlines() if (content := line.partition("#")[0].strip().lower())]
+    if any(";" in line for line in lines):
+        lines = [line.replace(",", ".") for line in lines]
+    names = ["tilt", "yaw", "roll"]
+    if lines and re.match(r"[\"a-z]", lines[0]):
+        names = re.findall("|".join(_COLUMNS), lines.pop(0))  # Tilt_deg, tilt/deg and tilt(deg) are all tilt
+    try:
+        columns = np.array([re.split(r"\s*[;,]\s*|\s+", line) for line in lines], dtype=float).T
+    except ValueError as error:
+        raise InvalidInputError(f"{where}: expected as many numbers in every line, got others") from error
+    table = dict(zip(names, columns, strict=False))
+    required = {"tilt", "yaw", "time"} if "until" in table else {"tilt", "yaw"}
+    if len(table) != len(columns) or not required <= set(table) or not np.isfinite(columns).all():
+        raise InvalidInputError(
+            f"{where}: expected settings of tilt and yaw, perhaps roll, time_s and with it until_s, "
+            f"got {len(lines)} of {len(columns)} columns"
+        )
+    return table

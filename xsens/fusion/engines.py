@@ -82,10 +82,10 @@ class Filter:
         most = min(m, int(2.0 * samples.step_s.sum() / BLOCK_S) + 2)
         rows, xyzw = np.zeros(most, kernel.STEP), np.empty((m, 4))
         covariance, transition = np.empty((2, most if covariances else 0, kernel.SIZE, kernel.SIZE))
-        arguments: list[Any] = [np.ascontiguousarray(values) for values in vars(samples).values()]
-        arguments += [to_end, self._filter, self._unfinished]
+        readings: Any = map(np.ascontiguousarray, vars(samples).values())
+        state = self._filter, self._unfinished
         run: Any = kernel.run_filter
-        n = run(*arguments, rows, covariance, transition, xyzw)
+        n = run(*readings, to_end, *state, rows, covariance, transition, xyzw)
         return rows[:n], xyzw, covariance[:n], transition[:n]
 
     def run(self, samples: Samples, to_end: bool = False) -> Estimate:
@@ -193,9 +193,8 @@ def by_vqf(stretch: Samples, claims: Estimate, offline: bool, magnetic: bool) ->
     place = (time_s - time_s[0]) / step_s
     grid = np.arange(max(round(place[-1]), 1) + 1.0)
     # A gyroscope's reading is the mean rate since the one before, here too: turns stay what they were.
-    angle = np.cumsum(stretch.rate_rad_s * np.diff(place, prepend=0.0)[:, None], axis=0)
+    angle = np.cumsum(stretch.rate_rad_s * np.diff(place, prepend=-1.0)[:, None], axis=0)
     rate = np.diff(_at(grid, place, angle), axis=0, prepend=0.0)
-    rate[0] = stretch.rate_rad_s[0]
     force = _at(grid, place, stretch.force_m_s2)
     field = _at(grid, place, stretch.field_au) if magnetic else None
     readings = rate, force, field

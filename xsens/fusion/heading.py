@@ -226,8 +226,8 @@ class HeadingFilter:
         return rows
 
 
-def _angle(difference: FloatArray) -> FloatArray:
-    return np.asarray(np.angle(np.exp(1j * difference)))
+def _angle(difference: FloatArray) -> Any:
+    return np.angle(np.exp(1j * difference))
 
 
 def _empty_arrays(*shape: int) -> list[FloatArray]:

@@ -125,7 +125,7 @@ class OnlineFilter:
         lost_rad2 = 0.0
         if self._rate is None:
             self._usual_s = min(step_s, PAUSE_S)
-        elif step_s > LOST * self._usual_s:
+        else:
             steps, rates = np.array([0.0, step_s]), np.array([self._rate, rate])
             lost_rad2 = float(lost_variance(steps, rates, self._usual_s)[0])
         self._usual_s += _FOLLOWS * (min(step_s, LOST * self._usual_s) - self._usual_s)

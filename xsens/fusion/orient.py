@@ -9,7 +9,6 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
-from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.streams import TimedRotations
 from speckle3d.core.text import shown
 from xsens.fusion.readings import BIAS_SD_RAD_S, PAUSE_S, Estimate, Samples, usable_samples
@@ -137,8 +136,6 @@ def orient(log: ImuLog, magnetometer: bool = True, method: Method | str = Method
     >>> bool(found.rotations.world_from_sensor.magnitude().max() < 1e-6)
     True
     """
-    if not isinstance(log, ImuLog):
-        raise InvalidInputError(f"expected an ImuLog, as read_log(path) gives, got {type(log).__name__}")
     method, used = Method(method), log if magnetometer else replace(log, magnetometer_au=None)
     rows, samples, notes, scale_error = usable_samples(used)
     magnetic = bool(finite_rows(samples.field_au).any())

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
@@ -78,9 +79,9 @@ class Estimate:
 
 def turn_about_up(angles_rad: FloatArray | float, xyzw: FloatArray) -> FloatArray:
     """Quaternions, shape (k, 4), turned about up."""
-    c, s = np.cos(0.5 * angles_rad), np.sin(0.5 * angles_rad)
-    x, y, z, w = xyzw.T
-    return np.column_stack([c * x - s * y, c * y + s * x, c * z + s * w, c * w - s * z])
+    return (
+        Rotation.from_rotvec(np.multiply.outer(angles_rad, [0.0, 0.0, 1.0])) * Rotation.from_quat(xyzw)
+    ).as_quat()
 
 
 def usable_samples(log: ImuLog) -> tuple[IntArray, Samples, list[str], float]:

@@ -15,9 +15,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.extras import extra_module
-from xsens.messages.control import BASE_RATE_HZ, Configuration, MessageId
+from xsens.messages.contents import BASE_RATE_HZ, Configuration, MessageId, OutputMode, OutputSettings
 from xsens.messages.framing import Framer, Message, encode
-from xsens.messages.mtdata import OutputMode, OutputSettings
 
 if TYPE_CHECKING:
     from serial import Serial
@@ -118,16 +117,12 @@ class Device:
     def _on_port(self) -> Iterator[None]:
         try:
             yield
-        except DeviceError:
-            raise
         except OSError as error:  # pyserial's own errors are OSErrors
             raise DeviceError(f"{self._port.name}: the port is gone: {error}") from error
 
     def request(self, mid: int, payload: bytes = b"", tries: int = _TRIES) -> Message:
         """Answer to a request; `DeviceError` if there is none after `tries`, or it is an error."""
-        with self._on_port():
-            while self._port.in_waiting:  # a late answer to an earlier request is not one to this
-                self.receive()
+        self.receive()  # a late answer to an earlier request is not one to this
         for _ in range(tries):
             self.send(Message(mid, payload))
             deadline = time.monotonic() + ANSWER_S

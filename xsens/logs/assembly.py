@@ -2,8 +2,8 @@
 
 The orientation may be in any notation and world; NWU is x north, y west, z up. Turned into its world, the
 acceleration shows whether z is up (ENU, NWU) or down (NED), and the field's horizontal part whether north is
-y (ENU) or x (NWU, NED). Both are medians, so that movement and iron nearby may disturb some samples. The dip
-of the field has no part in it: it points up in the south.
+y (ENU) or x (NWU, NED). They are a median and a mean of directions, so that movement and iron nearby may
+disturb some samples. The dip of the field has no part in it: it points up in the south.
 """
 
 from collections.abc import Mapping
@@ -250,13 +250,13 @@ def _likelier(ups: Mapping[str, FloatArray]) -> str:
     return best if tilts_deg[first] > _BETTER * tilts_deg[best] else first
 
 
-def _up(log: ImuLog, wxyz: FloatArray) -> FloatArray:
+def _up(log: ImuLog, wxyz: FloatArray) -> Any:
     """Vertical parts of the accelerations' directions at rest, in the orientations' world, shape (n,)."""
     vectors = _in_world(log, wxyz, log.accelerometer_m_s2)
     length = row_norms(vectors)
     calm = np.abs(length - np.median(length)) < _AT_REST * np.median(length) if length.size else length > 0.0
     calm |= calm.sum() < _FEWEST
-    return np.asarray(vectors[calm, 2] / length[calm])
+    return vectors[calm, 2] / length[calm]
 
 
 def _world_of(claim: Claim, ups: FloatArray, north_deg: float) -> tuple[str, str]:
@@ -287,11 +287,10 @@ def _world_of(claim: Claim, ups: FloatArray, north_deg: float) -> tuple[str, str
 
 def _north_deg(fields: FloatArray) -> float:
     """Direction from x towards y of the horizontal part of fields in the world; NaN if they have none."""
-    along = fields[:, :2] / np.maximum(row_norms(fields[:, :2]), 1e-12)[:, None]
-    if not along.size or np.hypot(*along.mean(axis=0)) < _STEADY:
+    if not fields.size:
         return np.nan
-    x, y = np.median(along, axis=0)
-    return float(np.degrees(np.arctan2(y, x)))
+    x, y = (fields[:, :2] / np.maximum(row_norms(fields[:, :2]), 1e-12)[:, None]).mean(axis=0)
+    return np.degrees(np.arctan2(y, x)) if np.hypot(x, y) > _STEADY else np.nan
 
 
 def _in_world(log: ImuLog, wxyz: FloatArray, vectors: FloatArray | None) -> FloatArray:

@@ -54,7 +54,7 @@ class Stamps:
         Sampling period as configured or stated; NaN if not known.
     extras : ndarray of int, shape (m,), optional
         Number of messages before each sample that the sensor counted, but that were no samples.
-    computer_s : ndarray, shape (m,), optional
+    computer_s : ndarray, shape (m,), or NaN
         The computer's clock where it was recorded before a sample, as at each new start; NaN elsewhere.
     """
 
@@ -62,7 +62,7 @@ class Stamps:
     time_s: FloatArray | None = None
     period_s: float = np.nan
     extras: IntArray | None = None
-    computer_s: FloatArray | None = None
+    computer_s: FloatArray | float = np.nan
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,7 @@ def timeline(stamps: Stamps, readings: Sequence[FloatArray] = ()) -> Timeline:
             )
         if numbers is None:
             notes.append("samples have no counter: losses cannot be found")
-            numbers = np.arange(len(readings[0] if stamps.computer_s is None else stamps.computer_s))
+            numbers = np.arange(len(readings[0]) if readings else np.size(stamps.computer_s))
         values = (numbers - numbers[0]) * stamps.period_s
     elif (stamps_s := _spread(values, readings)) is not values:
         notes.append(f"several samples to a stamp, {len(values)} in all: spread evenly between stamps")
@@ -115,8 +115,9 @@ def timeline(stamps: Stamps, readings: Sequence[FloatArray] = ()) -> Timeline:
     anew = _new_starts(values, stamps.computer_s)
     if anew.any():
         steps = np.where(anew[1:], 0.0, np.diff(values))
-        clock_s = np.full(len(values), np.nan) if stamps.computer_s is None else stamps.computer_s
-        behind = clock_s - _running_sums(steps)  # constant while the sensor runs, and larger by each pause
+        behind = stamps.computer_s - _running_sums(
+            steps
+        )  # constant while the sensor runs, and larger by each pause
         pauses = np.diff(behind[np.append(0, np.flatnonzero(anew))])
         certain = pauses > 0.0
         steps[anew[1:]] = np.where(certain, pauses, UNKNOWN_PAUSE_S)
@@ -139,7 +140,7 @@ def timeline(stamps: Stamps, readings: Sequence[FloatArray] = ()) -> Timeline:
     return Timeline(rows, time_s, counter, gaps, (*notes, *more))
 
 
-def _spread(values: FloatArray, readings: Sequence[FloatArray]) -> FloatArray:
+def _spread(values: FloatArray, readings: Sequence[FloatArray]) -> Any:
     """Times of samples that came together, stamped on arrival, spread over the time since those before.
 
     Rows of readings that repeat the one before are the same sample, sent twice.
@@ -155,7 +156,7 @@ def _spread(values: FloatArray, readings: Sequence[FloatArray]) -> FloatArray:
     usual = np.median(spans)
     period_s = np.append(usual, np.minimum(spans, _LONGER * usual))
     places = np.arange(values.size) - np.repeat(last, counts)
-    return np.asarray(np.repeat(arrival_s, counts) + places * np.repeat(period_s, counts))
+    return np.repeat(arrival_s, counts) + places * np.repeat(period_s, counts)
 
 
 def _gaps(
@@ -177,10 +178,12 @@ def _gaps(
         longest = _MUCH_LONGER
         span = f"{1e3 * seconds.min():.3g} to {1e3 * seconds.max():.3g} ms"
         notes.append(f"irregular clock, steps of {span}: single losses cannot be told")
-    medians_hz = [float(np.median(rates)) for rates in rates_hz if running.size and stated_s > 0.0]
+    medians_hz = [np.median(rates) for rates in rates_hz if running.size and stated_s > 0.0]
     if medians_hz and not any(1.0 / _AGREES < hz * stated_s < _AGREES for hz in medians_hz):
-        rates = f"{1.0 / stated_s:g} Hz, got {medians_hz[0]:.4g} Hz"
-        contradiction = f"expected times at the stated rate, {rates} by their clock"
+        contradiction = (
+            f"expected times at the stated rate, {1.0 / stated_s:g} Hz, got {medians_hz[0]:.4g} Hz by their "
+            "clock"
+        )
         if counter is not None:
             raise InvalidInputError(contradiction)
         notes.append(f"{contradiction}, which holds")
@@ -209,7 +212,7 @@ def _sample_numbers(counter: IntArray, extras: IntArray | None) -> FloatArray:
     return numbers / stride
 
 
-def _new_starts(values: FloatArray, computer_s: FloatArray | None) -> BoolArray:
+def _new_starts(values: FloatArray, computer_s: FloatArray | float) -> BoolArray:
     """Mark the samples before which the sensor was started anew.
 
     A step far back shows it, unless those overtaken were followed by a jump forward to where it was.
@@ -222,7 +225,6 @@ def _new_starts(values: FloatArray, computer_s: FloatArray | None) -> BoolArray:
     for i in back[:_OVERTAKINGS].tolist():
         later = values[i + 1 :] > values[i]
         anew[i + 1] = not later.any() or steps[i + int(np.argmax(later))] < _LONGER * usual
-    if computer_s is not None:
-        anew |= np.isfinite(computer_s)
+    anew |= np.isfinite(computer_s)
     anew[0] = False
     return anew

@@ -13,17 +13,21 @@ from xsens.logs.assembly import Claim, Hints, Parts, assemble_log, quaternions_o
 from xsens.logs.clocks import COUNTS, TICK_S, TICKS, Stamps, unwrap
 from xsens.logs.faults import stuck_axes
 from xsens.logs.samples import VECTORS, ImuLog
-from xsens.messages.control import (
+from xsens.messages.contents import (
     BLOCK_SIZE,
     COMPENSATION_NOTE,
     DATA,
     Configuration,
+    DataLayout,
     MessageId,
+    OutputMode,
     RawCalibration,
+    Values,
+    as_floats,
+    read_items,
     utc_time_s,
 )
 from xsens.messages.framing import Frames, Message, find_frames
-from xsens.messages.mtdata import DataLayout, OutputMode, Values, as_floats, read_items
 
 
 def parse_stream(data: bytes | ByteArray, hints: Hints | None = None, source: str = "stream") -> ImuLog:

@@ -9,12 +9,14 @@ from scipy.spatial.transform import Rotation
 from speckle3d.core.geometry import rotation_from_fixed_angles
 from speckle3d.core.streams import TimedRotations
 from xsens.accuracy.angles import (
+    MechanismSettings,
     PairErrors,
     common_readings,
     mounting_from_motion,
     pair_errors,
+    read_mechanism_csv,
+    readings_at,
 )
-from xsens.accuracy.mechanism import MechanismSettings, read_mechanism_csv, readings_at
 
 TILTS_DEG, YAWS_DEG = np.linspace(-16.4, 2.2, 11), np.linspace(-5.5, 5.5, 7)
 """The mechanism's settings in Housden et al., 2008."""

@@ -4,7 +4,7 @@ from contextlib import closing
 import pytest
 
 from xsens.live.device import DeviceSettings, connect, prepare
-from xsens.messages.control import MessageId
+from xsens.messages.contents import MessageId
 
 pytest.importorskip("serial", reason="needs pyserial")
 if not hasattr(os, "openpty"):

@@ -3,10 +3,9 @@ import pytest
 import simulated_device as device_model
 from imu_messages import configuration_message, mtdata_payloads
 
-from xsens.live.monitor import Monitor
-from xsens.messages.control import MessageId
+from xsens.live.recording import Monitor
+from xsens.messages.contents import DataLayout, MessageId, OutputMode
 from xsens.messages.framing import Message, encode
-from xsens.messages.mtdata import DataLayout, OutputMode
 
 RATE_HZ = 100.0
 MODE = OutputMode.CALIBRATED | OutputMode.ORIENTATION

@@ -10,7 +10,7 @@ import pytest
 from xsens.live.device import DeviceSettings
 from xsens.live.recording import Recorder, record
 from xsens.logs.read import read_log
-from xsens.messages.control import MessageId
+from xsens.messages.contents import MessageId
 from xsens.messages.framing import decode
 
 pytest.importorskip("serial", reason="needs pyserial")

@@ -13,8 +13,8 @@ from xsens.logs.datamessages import parse_stream
 from xsens.logs.faults import without_faults
 from xsens.logs.samples import VECTORS, ImuLog
 from xsens.logs.textlogs import parse_text
+from xsens.messages.contents import DataLayout, OutputMode
 from xsens.messages.framing import encode
-from xsens.messages.mtdata import DataLayout, OutputMode
 
 RATE_HZ = 100.0
 SWING_RAD, SWING_HZ = np.deg2rad(34.4), 0.5

@@ -22,9 +22,8 @@ from xsens.logs.datamessages import parse_stream
 from xsens.logs.read import read_log
 from xsens.logs.samples import Gap
 from xsens.logs.textlogs import write_csv
-from xsens.messages.control import MessageId, utc_message
+from xsens.messages.contents import DataLayout, MessageId, OutputMode, OutputSettings, utc_message
 from xsens.messages.framing import encode
-from xsens.messages.mtdata import DataLayout, OutputMode, OutputSettings
 
 UNIT = calibration()
 COUNTER_SETTING = OutputSettings.COUNTER

@@ -1,4 +1,4 @@
-from xsens.messages.control import (
+from xsens.messages.contents import (
     Configuration,
     MessageId,
 )

@@ -1,7 +1,7 @@
 import numpy as np
 
+from xsens.messages.contents import DataLayout, OutputMode, read_items
 from xsens.messages.framing import find_frames
-from xsens.messages.mtdata import DataLayout, OutputMode, read_items
 
 
 def test_a_record_of_a_real_mt9():

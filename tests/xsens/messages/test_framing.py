@@ -2,7 +2,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from xsens.messages.control import MessageId
+from xsens.messages.contents import MessageId
 from xsens.messages.framing import Framer, Message, decode, encode, find_frames
 
 FEW = settings(deadline=None, max_examples=40)
