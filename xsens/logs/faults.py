@@ -16,23 +16,25 @@ from xsens.logs.samples import VECTORS, ImuLog, finite_rows, median_norm, row_no
 
 
 class _Limits(NamedTuple):
-    """Largest value of an axis, change that ends a repeat, and height of a spike, in a sensor's unit."""
+    """Largest value of an axis, change that ends a repeat, height of a spike, and least end of the range."""
 
     largest: float
     change: float
     spike: float
+    least_end: float = np.inf
 
 
 _ORIENTATION = "own orientation"
 LIMITS = {
-    VECTORS[0]: _Limits(2000.0, 0.3, 100.0),
-    VECTORS[1]: _Limits(60.0, 0.03, 10.0),
+    VECTORS[0]: _Limits(2000.0, 0.3, 100.0, 12.0),
+    VECTORS[1]: _Limits(60.0, 0.03, 10.0, 0.05),
     VECTORS[2]: _Limits(100.0, 0.03, 1.0),
     _ORIENTATION: _Limits(np.inf, 0.05, np.inf),
 }
 """Accelerometers end at 200 g, gyroscopes at 35 rad/s; a hand's knock lasts longer than a sample. A resting
 sensor's readings change by less than the second, its orientation by less than two degrees. The field's limits
-are in its median norm: a magnet at 1 cm makes six of it, over many samples."""
+are in its median norm: a magnet at 1 cm makes six of it, over many samples. A range ends beyond gravity, and
+beyond a resting gyroscope's bias."""
 
 _ABSURD = 1e6
 """Larger numbers are damage in any unit."""
@@ -61,6 +63,10 @@ Runs that chance makes: longer ones are none, where readings change by many last
 
 _STUCK = 5
 """Samples in which an axis may stand still by chance, where its noise is a few of its last digits."""
+
+_BELOW = 16.0
+"""How many times its bend from row to row a reading is below the end of its range, as many rows before and
+after those in which it stays within one: twice a parabola's eight. 36 simulated hands have none."""
 
 _END_TO_END = 1.5
 """Of an axis's largest reading, the change that only a number that wraps round makes, of two at most."""
@@ -128,6 +134,7 @@ def _bad(name: str, rows: FloatArray, force: FloatArray, rate: FloatArray) -> di
         "out of range": beyond,
         "repeated": repeats,
         "with an axis that stands still": stuck_axes(rows, _SLOW_RAD_S if name == VECTORS[1] else 0.0),
+        "at the end of the range": np.any([_cut_off(axis, limits.least_end) for axis in rows.T], axis=0),
         "single spikes": _spikes(rows, limits.spike * unit),
         "beyond a jump from end to end of the range": _wrapped(rows) & (name == VECTORS[1]),
     }
@@ -192,6 +199,24 @@ def stuck_axes(rows: FloatArray, least: float = 0.0) -> BoolArray:
         stuck &= np.add.reduceat(np.append(alone[:, k], 0), first) > 1
         bad |= np.repeat(stuck, length)
     return bad
+
+
+def _cut_off(axis: FloatArray, least: float) -> Any:
+    """Rows at the end of an axis's range, if it stays there as no smooth peak does, whatever noise is added.
+
+    A peak that stays within a band of its height is a parabola, and eight bands lower as many rows away.
+    Noise of the usual bend from row to row keeps no reading within such a band for long.
+    """
+    size, steps, bends = np.abs(axis), np.diff(axis), np.abs(np.diff(axis, 2))
+    bends, end = bends[np.isfinite(bends)], np.fmax.reduce(size)
+    if not (bends.size and end >= least):
+        return np.zeros(size.size, dtype=bool)
+    band = max(np.median(bends), _digit(steps))
+    inside = size >= end - band
+    first, after = np.flatnonzero(np.diff(np.pad(inside, 1))).reshape(-1, 2).T
+    count = after - first
+    around = size.take([first - count, after + count - 1], mode="clip").max(axis=0)
+    return inside & ((count > _STUCK) & (around < end - _BELOW * band)).any()
 
 
 def _spikes(rows: FloatArray, height: float) -> BoolArray:

@@ -115,12 +115,13 @@ def with_every(step, rows, value):
     ("name", "spoil"),
     [
         (VECTORS[1], lambda rows: np.clip(rows, -1.2, 1.2)),
+        (VECTORS[1], lambda rows: np.clip(rows, -1.6, 1.6 + 1e-4 * np.sin(1e6 * rows))),
         (VECTORS[1], lambda rows: (rows + 1.5) % 3.0 - 1.5),
         (VECTORS[1], lambda rows: with_every(97, rows, [25.0, -25.0, 25.0])),
         (VECTORS[2], lambda rows: with_every(97, rows, [9.0, 0.0, 0.0])),
         (VECTORS[0], lambda rows: rows * np.where(np.arange(len(rows))[:, None] < 600, 1.0, [1.0, 1.0, 0.0])),
     ],
-    ids=["saturated", "wrapped round", "spikes", "a field's spikes", "half dead"],
+    ids=["saturated", "saturated under noise", "wrapped round", "spikes", "a field's spikes", "half dead"],
 )
 @pytest.mark.parametrize("method", ["smoother", "filter"])
 def test_saturation_and_values_no_hand_makes_are_missing(name, spoil, method):
