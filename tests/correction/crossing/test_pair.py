@@ -84,6 +84,20 @@ def test_claims_for_tissue_that_moved_a_little():
         assert abs(errors(side.poses, truth)[0]) < 2 * 100 * side.length_sigma
 
 
+@pytest.mark.slow
+def test_structure_that_slides_sideways_feigns_little_length_where_sweeps_cross_obliquely():
+    pair = pair_of(seed=12, angle_deg=45.0)
+    plain, other = (replace(side, sideways_per_mm=0.05) for side in (pair.first, pair.second))
+    slide_mm = 0.04 * plain.poses.apply(GRID.centre_mm)[:, 2]
+    slid = RigidTransform.from_translation(np.outer(slide_mm, [1.0, 0.0, 0.0])) * plain.poses
+    lengths = []
+    for first in (plain, replace(plain, poses=slid)):
+        solution = solve_crossing(first, other)
+        lengths.append([solution.first.log_scale, solution.second.log_scale])
+    # Not asked for, the slide makes one 1.0 and the other 2.5 % longer.
+    assert np.abs(np.diff(lengths, axis=0)).max() < 0.0075
+
+
 REFUSED = {
     "less pressure": {"seed": 240, "moved_mm": 1.0},
     "turn the probe by 90 degrees": {"seed": 421, "angle_deg": 18.0},
