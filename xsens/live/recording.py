@@ -17,7 +17,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass, replace
 from itertools import groupby
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -27,13 +27,15 @@ from speckle3d.core.errors import FileError, InvalidInputError, Speckle3DError, 
 from speckle3d.core.files import PathLike, cannot_write
 from speckle3d.core.text import shown
 from xsens.fusion.field import ROUGH, dip_rad
-from xsens.fusion.online import OnlineFilter, OnlineState
 from xsens.live.device import Device, DeviceError, DeviceInfo, DeviceSettings, connect, prepare
 from xsens.logs.assembly import Hints
 from xsens.logs.datamessages import parse_stream
 from xsens.logs.samples import ImuLog
 from xsens.messages.contents import DATA, MessageId, utc_message
 from xsens.messages.framing import Framer, Message, encode
+
+if TYPE_CHECKING:
+    from xsens.fusion.online import OnlineFilter, OnlineState
 
 _INTERVAL_S = 0.25
 """Time between two states that `record` yields."""
@@ -147,7 +149,7 @@ class Monitor:
         """Begin to measure; the sensor's counter may start anywhere."""
         self._header, self._framer = b"".join(map(encode, header)), Framer()
         self._counter: int | None = None
-        self._filter = OnlineFilter()
+        self._filter: OnlineFilter | None = None
         self._set(connected=True)
 
     def _interrupt(self, reason: str) -> None:
@@ -194,6 +196,9 @@ class Monitor:
         if gyroscope is None or accelerometer is None or not self._now.rate_hz:
             return None
         steps = np.append((1 + missing) / self._now.rate_hz, np.diff(log.time_s))
+        from xsens.fusion.online import OnlineFilter  # which loads numba
+
+        self._filter = self._filter or OnlineFilter()
         try:
             self._filter.push(steps, gyroscope, accelerometer, log.magnetometer_au)
         except InvalidInputError:  # damaged readings: the recording keeps them, the displayed filter restarts
@@ -203,6 +208,8 @@ class Monitor:
 
 def warm_up() -> None:
     """Load the filter, or compile it, which would keep a recording from reading its port for too long."""
+    from xsens.fusion.online import OnlineFilter
+
     readings = np.full((150, 3), 5.7)  # as long as gravity
     OnlineFilter().push(np.full(150, 0.01), readings, readings, readings)
 
