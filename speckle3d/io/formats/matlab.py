@@ -75,6 +75,8 @@ def open_matlab(path: Path, settings: ImportSettings) -> Facts:
         )
     with naming(where):
         nodes = [_array(variables, arrays[role]) for role in data]
+        if len({node.shape for node in nodes}) > 1:
+            raise InvalidInputError(f"expected arrays of one size, got {' and '.join(map(_size, nodes))}")
         if _kind(nodes[0]).startswith("complex") != (data == ("iq",)):
             raise InvalidInputError(f"{data[0]}: expected complex numbers as iq alone, got {_kind(nodes[0])}")
         names, shape = _axes(arrays.get("axes", ""), nodes[0])

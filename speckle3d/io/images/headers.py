@@ -276,8 +276,9 @@ def read_header(path: PathLike) -> SequenceHeader:
             raise InvalidInputError(f"encoding: expected raw, gzip, bzip2 or text, got {words['encoding']!r}")
         start, skip = stream.tell(), words.get("byte skip", 0)
         if file := words.get("data file"):
-            data, start = data.parent / file, 0
-            if os.path.relpath(data, Path(path).parent).startswith(".."):
+            folder, data, start = data.parent, data.parent / file, 0
+            own, place = {os.path.abspath(folder), os.path.realpath(folder)}, Path(os.path.abspath(data))
+            if own.isdisjoint(map(str, place.parents)):
                 raise InvalidInputError(f"expected pixels in the header's folder or below it, got {file}")
         if lines := words.get("line skip", 0):
             with open_regular(data) as pixels:
