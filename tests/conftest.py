@@ -9,7 +9,12 @@ from pathlib import Path
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import pytest
+from hypothesis import settings
 from made_once import made_once
+
+# The same examples in every run, however busy the machine.
+settings.register_profile("same", derandomize=True, deadline=None)
+settings.load_profile("same")
 
 # Started in the background or by nohup, a process ignores these, and so would all that tests interrupt.
 signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -78,7 +78,8 @@ def _dots(image: npt.NDArray[Any], pixel_mm: FloatArray, inside: BoolArray) -> t
     limit = max(_NOISE_SDS * robust_sigma(levels[::7]), _FAINTEST * float(levels.max()))
     near = np.ones(2 * np.maximum(np.rint(_APART_MM / pixel_mm), 1).astype(int) + 1, dtype=bool)
     features = extra_module("skimage.feature", "calibrate", "finding dots of wires")
-    peaks = features.peak_local_max(contrast, footprint=near, threshold_abs=limit, exclude_border=False)
+    # A dot halfway between two pixels has two maxima, one beside the other.
+    peaks = features.peak_local_max(contrast, 2, limit, exclude_border=False, footprint=near)
     peaks = peaks[inside[tuple(peaks.T)]]
     score = contrast[tuple(peaks.T)] - _along_lines(contrast, peaks, pixel_mm)
     best = np.argsort(-score, kind="stable")

@@ -19,7 +19,6 @@ TURN = st.floats(-np.pi + 1e-6, np.pi - 1e-6)
 YAW = st.floats(-np.pi / 2 + 1e-3, np.pi / 2 - 1e-3)
 
 
-@settings(deadline=None)
 @given(psi=TURN, phi=YAW, theta=TURN)
 def test_matrix_is_equation_2_of_housden_2008_and_angles_come_back(psi, phi, theta):
     (cf, cp, ct), (sf, sp, st_) = np.cos([phi, psi, theta]), np.sin([phi, psi, theta])
@@ -57,7 +56,7 @@ def test_single_precision_is_rigid_enough_and_what_is_not_rigid_is_named(diagona
         transforms_from_matrices(matrices, "tracker")
 
 
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 @given(seed=st.integers(0, 2**32 - 1), columns=st.sampled_from([2, 3]))
 def test_no_rotation_is_nearer_than_the_nearest(seed, columns):
     rng = np.random.default_rng(seed)

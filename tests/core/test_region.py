@@ -21,7 +21,7 @@ def _text(pairs):
     return " ".join(f"{float(x)!r},{float(y)!r}" for x, y in pairs)
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(
     apex=st.tuples(st.floats(3, 6), st.floats(-3, 0.5)),
     angles=st.tuples(st.floats(-89, -5), st.floats(5, 89)),

@@ -33,7 +33,7 @@ def test_poses_are_equation_1_written_out(curves):
     np.testing.assert_allclose(chain.poses(coefficients), expected, atol=1e-10)
 
 
-@settings(deadline=None, max_examples=25)
+@settings(max_examples=25)
 @given(seed=st.integers(0, 2**32 - 1), curves=st.sampled_from(["time", "distance"]))
 def test_twists_are_the_derivative_of_every_frame(seed, curves):
     _, chain = chain_of(seed, frames=12, curves=curves)

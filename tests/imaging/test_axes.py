@@ -15,7 +15,7 @@ GRID = ImageGrid(
 )
 
 
-@settings(max_examples=6, deadline=None)
+@settings(max_examples=6)
 @given(seed=st.integers(0, 2**32 - 1), turns=st.integers(0, 2))
 def test_the_principal_box_is_the_smallest(seed, turns):
     rng = np.random.default_rng(seed)

@@ -40,7 +40,7 @@ def by_itk(path):
     return affine, SimpleITK.GetArrayFromImage(image).T
 
 
-@settings(deadline=None, max_examples=15)
+@settings(max_examples=15)
 @given(
     suffix=st.sampled_from(SUFFIXES),
     dtype=st.sampled_from(VOXEL_TYPES),

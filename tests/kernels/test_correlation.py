@@ -37,7 +37,7 @@ def cohere(fixed, moving, first, shift, ramp=(0.0, 0.0), least_overlap=0.6):
     return out
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(
     seed=st.integers(0, 2**32 - 1),
     first=patches,

@@ -90,7 +90,7 @@ def test_i_and_q_give_what_their_rf_gives(middle_hz, every):
     np.testing.assert_allclose(intensity[:, :count], expected[:, :count], atol=3e-3 * expected.max())
 
 
-@settings(deadline=None, max_examples=50)
+@settings(max_examples=50)
 @given(
     decibel=st.floats(-59.0, 0.0),
     dynamic_range=st.sampled_from([60.0, 72.5]),

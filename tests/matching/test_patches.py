@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from speckle3d.core.errors import InvalidInputError, MismatchError
@@ -8,7 +8,6 @@ from speckle3d.core.grid import ImageGrid
 from speckle3d.matching.patches import PatchSettings, lay_patches
 
 
-@settings(deadline=None)
 @given(
     vectors=st.integers(24, 300),
     samples=st.integers(200, 900),

@@ -16,7 +16,7 @@ def sweep(seed, duration_s=6.4, **changes):
     return hand_sweep(SimulationSettings(**changes), duration_s, 37.8, RigidTransform.identity(), rng)
 
 
-@settings(deadline=None, max_examples=25)
+@settings(max_examples=25)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_a_sweep_stays_within_what_a_hand_does(seed):
     poses = sweep(seed).medium_from_image(np.arange(160) / 25.0)

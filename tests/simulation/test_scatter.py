@@ -16,7 +16,7 @@ def random_beam(rng):
     return field, reach, curvature, np.array([1.0, 0.5, 0.1, 0.1])
 
 
-@settings(deadline=None, max_examples=20)
+@settings(max_examples=20)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_echoes_match_every_scatterer_for_every_vector(seed):
     rng = np.random.default_rng(seed)

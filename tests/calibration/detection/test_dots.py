@@ -12,7 +12,7 @@ def dots_in(image, *options):
 
 
 @given(u=st.floats(20, 100), v=st.floats(20, 80), gain=st.floats(0.1, 1000), floor=st.floats(-50, 50))
-@settings(deadline=None, max_examples=25)
+@settings(max_examples=25)
 def test_a_dot_is_placed_between_pixels_whatever_the_gain(u, v, gain, floor):
     x, y = (
         ((np.arange(n) - at) * mm / sd) ** 2

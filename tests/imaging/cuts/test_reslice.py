@@ -29,7 +29,7 @@ def pixel_points(plane):
     return plane.world_from_picture.apply(local.reshape(-1, 3)).reshape(rows, columns, 3)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(seed=st.integers(0, 2**32 - 1), max_distance_mm=st.floats(0.05, 2.0), moderate=st.booleans())
 def test_matches_brute_force_for_any_plane(seed, max_distance_mm, moderate):
     rng = np.random.default_rng(seed)

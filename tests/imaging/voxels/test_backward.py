@@ -20,7 +20,7 @@ def hand_path(rng, frames, step_mm, turn_rad=0.05):
     return RigidTransform.from_components(places, turns)
 
 
-@settings(max_examples=6, deadline=None)
+@settings(max_examples=6)
 @given(
     seed=st.integers(0, 2**32 - 1),
     spacing=st.sampled_from([(0.4, 0.4, 0.4), (0.6, 0.5, 1.2), (0.9, 0.7, 0.2)]),

@@ -15,7 +15,7 @@ GRID = ImageGrid(
 )
 
 
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=8)
 @given(
     seed=st.integers(0, 2**32 - 1),
     turns=st.integers(0, 2),
@@ -51,7 +51,7 @@ def test_what_is_asked_for_is_had_to_the_last_bit():
         assert grid_around(GRID, poses, spacing, axes, origin_mm=origin, size_mm=size).shape == shape
 
 
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=8)
 @given(seed=st.integers(0, 2**32 - 1), gigabytes=st.floats(1e-7, 10.0))
 def test_the_spacing_within_a_memory_is_the_finest_round_one(seed, gigabytes):
     poses = hand_sweep(np.random.default_rng(seed), 8, 40.0)

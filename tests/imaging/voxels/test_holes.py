@@ -29,7 +29,7 @@ def fill_by_definition(voxels, state, boxes):
     return voxels_after, state_after
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(
     seed=st.integers(0, 2**32 - 1),
     spacing=st.tuples(*[st.sampled_from([0.2, 0.25, 0.5, 0.7, 1.0, 3.0])] * 3),

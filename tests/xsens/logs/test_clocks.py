@@ -9,7 +9,7 @@ from xsens.logs.samples import ImuLog
 PERIOD_S = 1 / 256
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(st.integers(0, 65535), st.sets(st.integers(1, 900), max_size=60), st.sampled_from([1, 2, 4]))
 def test_lost_samples_are_found_wherever_the_counter_wraps(first, missing, stride):
     indices = np.array([i for i in range(1000) if i not in missing])

@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 from xsens.messages.contents import MessageId
 from xsens.messages.framing import Framer, Message, decode, encode, find_frames
 
-FEW = settings(deadline=None, max_examples=40)
+FEW = settings(max_examples=40)
 
 messages = st.builds(
     Message,
