@@ -27,12 +27,12 @@ def placed_flags(flags: IntArray, loose: BoolArray | bool = False) -> IntArray:
     Raises
     ------
     InsufficientDataError
-        If too many frames, but for repeated ones, have a flag.
+        If too many frames, but for repeated ones, have a flag, or all repeat the first.
     """
     flags = np.where(loose & (flags == 0), int(FrameFlag.UNMATCHED), flags)
     own = flags[flags != FrameFlag.FROZEN]
     count = np.count_nonzero(own)
-    if count > LARGEST_LOSS * own.size:
+    if count > LARGEST_LOSS * own.size or own.size < min(2, flags.size):
         raise InsufficientDataError(
             f"expected frames with speckle in common, got {count} of {own.size} that cannot be placed: "
             f"{'; '.join(describe(flags))}"
