@@ -7,13 +7,13 @@ import numpy.typing as npt
 
 from speckle3d.core.arrays import BoolArray, IntArray
 from speckle3d.core.errors import InsufficientDataError
-from speckle3d.matching.quality import FrameFlag
+from speckle3d.matching.quality import FrameFlag, short_repeats
 
 LARGEST_LOSS = 0.3
 """Share of frames that may not be placed; with more, lengths are mostly guesses."""
 
 _WORDS = {
-    FrameFlag.FROZEN: "that repeat the one before, at its place",
+    FrameFlag.FROZEN: "that repeat the one before",
     FrameFlag.SATURATED: "saturated, poses guessed",
     FrameFlag.LIFTED: "with the probe lifted, poses guessed",
     FrameFlag.NO_SPECKLE: "without speckle, poses guessed",
@@ -27,12 +27,12 @@ def placed_flags(flags: IntArray, loose: BoolArray | bool = False) -> IntArray:
     Raises
     ------
     InsufficientDataError
-        If too many frames, but for repeated ones, have a flag, or all repeat the first.
+        If too many frames, but for short repeats, have a flag.
     """
     flags = np.where(loose & (flags == 0), int(FrameFlag.UNMATCHED), flags)
-    own = flags[flags != FrameFlag.FROZEN]
+    own = flags[~short_repeats(flags)]
     count = np.count_nonzero(own)
-    if count > LARGEST_LOSS * own.size or own.size < min(2, flags.size):
+    if count > LARGEST_LOSS * own.size:
         raise InsufficientDataError(
             f"expected frames with speckle in common, got {count} of {own.size} that cannot be placed: "
             f"{'; '.join(describe(flags))}"

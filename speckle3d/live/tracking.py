@@ -30,7 +30,7 @@ from speckle3d.core.threads import on_one_thread
 from speckle3d.matching.frames import FrameByFrame, ImageSink
 from speckle3d.matching.intensity import Echo
 from speckle3d.matching.matcher import FrameMatcher
-from speckle3d.matching.quality import FrameFeatures, FrameFlag, flag_frames
+from speckle3d.matching.quality import FrameFeatures, FrameFlag, flag_frames, short_repeats
 from speckle3d.matching.schedule import PairSchedule
 from speckle3d.matching.table import CorrelationTable
 from speckle3d.matching.texture import FRAMES, Texture
@@ -259,7 +259,7 @@ class LiveTracker:
         sound = table.joins((flags[begin:] & ~FrameFlag.UNMATCHED) == 0)
         if not sound.any():
             return
-        repeats = np.flatnonzero(flags[begin:] & FrameFlag.FROZEN)
+        repeats = np.flatnonzero(short_repeats(flags[begin:]))
         problem = replace(self._problem, frames=count - begin, repeats=repeats)
         try:
             motion = estimate_motion(problem, table.where(sound))

@@ -11,7 +11,7 @@ from speckle3d.core.sweep import Sweep
 from speckle3d.core.threads import ahead
 from speckle3d.kernels.inplane import Frame
 from speckle3d.matching.matcher import FrameMatcher, compose, inverse
-from speckle3d.matching.quality import FrameFeatures, FrameFlag, flag_frames
+from speckle3d.matching.quality import FrameFeatures, FrameFlag, flag_frames, short_repeats
 from speckle3d.matching.schedule import KnownSchedule, PairSchedule
 from speckle3d.matching.table import CorrelationTable
 from speckle3d.matching.texture import FRAMES, Texture
@@ -47,8 +47,8 @@ class MatchedSweep:
 
     @property
     def repeats(self) -> IntArray:
-        """Frames with the image of the one before."""
-        return np.flatnonzero(self.flags & FrameFlag.FROZEN)
+        """Frames with the image of the one before, by a recorder that is faster than the scanner."""
+        return np.flatnonzero(short_repeats(self.flags))
 
     @property
     def sound(self) -> BoolArray:

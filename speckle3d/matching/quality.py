@@ -21,12 +21,18 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
+from scipy.ndimage import label
 
 from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from speckle3d.matching.patches import PatchGrid
 
 _SAMPLES = 40
 """Samples in depth of which a patch's statistics are taken at least, where it has more: speckle has four."""
+
+
+LONGEST_REPEAT = 4
+"""Repeats of a frame in a row by a recorder that is faster than the scanner, as 60 frames/s for 12. While
+more are written the probe may be anywhere."""
 
 
 class FrameFlag(enum.IntFlag):
@@ -164,6 +170,12 @@ def _clipping(frame: npt.NDArray[Any], is_bmode: bool, settings: QualitySettings
     if is_bmode:  # Black is no echo: it is neither clipped nor counted.
         return count / np.count_nonzero(samples) / settings.clipped_bmode
     return (count + np.count_nonzero(samples == low)) / samples.size / settings.clipped_rf
+
+
+def short_repeats(flags: IntArray) -> BoolArray:
+    """Frames with the image of the one before, in short runs, shape (n,)."""
+    run, _ = label(flags & FrameFlag.FROZEN)
+    return np.asarray((run > 0) & (np.bincount(run) <= LONGEST_REPEAT)[run])
 
 
 def flag_frames(features: Sequence[FrameFeatures], settings: QualitySettings | None = None) -> IntArray:

@@ -205,13 +205,14 @@ def _cut_off(axis: FloatArray, least: float) -> Any:
     """Rows at the end of an axis's range, if it stays there as no smooth peak does, whatever noise is added.
 
     A peak that stays within a band of its height is a parabola, and eight bands lower as many rows away.
-    Noise of the usual bend from row to row keeps no reading within such a band for long.
+    Noise of the usual bend from row to row keeps no reading within such a band for long, unless it is lost
+    in the last digit.
     """
     size, steps, bends = np.abs(axis), np.diff(axis), np.abs(np.diff(axis, 2))
     bends, end = bends[np.isfinite(bends)], np.fmax.reduce(size)
-    if not (bends.size and end >= least):
+    band = np.median(bends) if bends.size else 0.0
+    if not (end >= least and band > _digit(steps)):
         return np.zeros(size.size, dtype=bool)
-    band = max(np.median(bends), _digit(steps))
     inside = size >= end - band
     first, after = np.flatnonzero(np.diff(np.pad(inside, 1))).reshape(-1, 2).T
     count = after - first
