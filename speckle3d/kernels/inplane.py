@@ -20,14 +20,13 @@ _HUBER, _ROUNDS = 1.5, 3
 """Robust standard deviations at which a patch begins to lose weight, and times that it is weighed anew."""
 _NOWHERE = np.iinfo(np.int64).max
 _LEAST_PATCHES = 6
-"""From which the scatter of their shifts about an affine field says how far these are wrong."""
+"""Patches from which the scatter of shifts about an affine field tells their error."""
 _COLLINEAR = 1e-10
 """Determinant of the normal equations over the product of their diagonal, below which patches lie on a line;
 on a grid of a hundred by a hundred patches that do not it is above 1e-5."""
-
-
 _SLOPES = np.array([0.0, 1.0, 1.0, 0.0, 1.0, 1.0]) / HELD[5] ** 2
-"""Information on the field's slopes: a hand's roll between two frames."""
+"""Inverse variance of the field's offsets and slopes, rad^-2, where patches do not tell slopes: of offsets
+nothing is known, slopes are those of a hand's roll between two frames."""
 
 
 class Frame(NamedTuple):
@@ -176,8 +175,8 @@ def _fit(
     """Fit an affine field, shape (2, 3), to the patches' shifts across and along their vectors, shape (2, p).
 
     Least squares with Huber weights; either shift has its own robust standard deviation: along vectors it is
-    far smaller. Where the places do not determine the slopes these are expected to be what they are, as far
-    as a hand turns between frames. False, and nothing changed, with too few peaks.
+    far smaller. Where patches do not determine the slopes (on a line, or few), those of `field` are taken as
+    expected, within a hand's roll between two frames. False, and nothing changed, with too few peaks.
 
     Parameters
     ----------

@@ -29,7 +29,6 @@ from speckle3d.matching.patches import PatchGrid
 _SAMPLES = 40
 """Samples in depth of which a patch's statistics are taken at least, where it has more: speckle has four."""
 
-
 LONGEST_REPEAT = 4
 """Repeats of a frame in a row by a recorder that is faster than the scanner, as 60 frames/s for 12. While
 more are written the probe may be anywhere."""
