@@ -110,21 +110,26 @@ class HDF5Slices:
         return self._frame_of_growing
 
     def _reader(self, file: h5py.File) -> ReadFrame:
-        sets = [require_dataset(file, name) for name in self.names]
-        return lambda i: self.turn(*(_slice(data, self.axis, i) for data in sets))
+        parts = [_slicer(require_dataset(file, name), self.axis) for name in self.names]
+        return lambda i: self.turn(*(part(i) for part in parts))
 
     def _frame_of_growing(self, i: int) -> AnyArray:
         with open_hdf5(self.path) as file:
             return self._reader(file)(i)
 
 
-def _slice(data: h5py.Dataset, axis: int | None, i: int) -> AnyArray:
-    """Slice along an axis; a plain chunk as it lies in the file, twice as fast as by h5py."""
+def _slicer(data: h5py.Dataset, axis: int | None) -> ReadFrame:
+    """Slices along an axis; plain chunks as they lie in the file, twice as fast as by h5py."""
     if axis is None:
-        return np.asarray(data[()])
-    is_plain = data.dtype.kind in "iuf" and data.dtype.isnative and data.chunks == (1, *data.shape[1:])
+        return lambda i: np.asarray(data[()])
+    shape, kind = data.shape[1:], data.dtype
+    is_plain = kind.kind in "iuf" and kind.isnative and data.chunks == (1, *shape)
     if axis or not is_plain or data.id.get_create_plist().get_nfilters():
-        return np.asarray(data[(*(slice(None),) * axis, i)])
-    values = np.empty(data.shape[1:], data.dtype)
-    data.id.read_direct_chunk((i, *(0,) * values.ndim), out=values.reshape(-1).view(np.uint8))
-    return values
+        return lambda i: np.asarray(data[(*(slice(None),) * axis, i)])
+
+    def read_chunk(i: int) -> AnyArray:
+        values = np.empty(shape, kind)
+        data.id.read_direct_chunk((i, *(0,) * values.ndim), out=values.reshape(-1).view(np.uint8))
+        return values
+
+    return read_chunk

@@ -86,7 +86,8 @@ def _append_frame(node: h5py.Dataset, frame: AnyArray) -> None:
         If its shape or type is another, or it holds NaN.
     """
     count, *shape = node.shape
-    kind = np.dtype(np.complex64) if node.name == "/iq" else node.dtype
+    stored = node.dtype
+    kind = np.dtype(np.complex64) if len(shape) > 2 else stored
     if frame.shape != (*shape[:2],) or not np.can_cast(frame.dtype, kind, "same_kind"):
         raise InvalidInputError(
             f"frame {count}: expected {kind}, shape {shape[:2]}, got {frame.dtype}, {frame.shape}"
@@ -94,8 +95,8 @@ def _append_frame(node: h5py.Dataset, frame: AnyArray) -> None:
     if frame.dtype.kind in "fc":
         require_finite(frame, f"frame {count}")
     samples = np.ascontiguousarray(frame, kind)
-    if kind != node.dtype:  # pairs of int16, as which they were read
-        samples = samples.view(np.float32).reshape(shape).astype(node.dtype)
+    if kind != stored:  # pairs of int16, as which they were read
+        samples = samples.view(np.float32).reshape(shape).astype(stored)
     reserve(h5py.h5i.get_file_id(node.id), samples.nbytes)
     node.id.set_extent((count + 1, *shape))
     if node.compression is None:
