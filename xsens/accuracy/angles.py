@@ -20,7 +20,7 @@ from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
 from speckle3d.core.files import PathLike, open_regular
 from speckle3d.core.streams import TimedRotations
-from speckle3d.core.text import shown, text_table
+from speckle3d.core.text import shown
 
 ANGLES = ("roll", "yaw", "tilt")
 """Turns about the image's z, y and x, in this order everywhere."""
@@ -72,20 +72,6 @@ class PairErrors:
             "largest": np.abs(errors).max(axis=0),
             "standard deviation with the calibration": np.sqrt(self.error_rad.var(axis=0).mean(axis=0)),
         }
-
-    def text(self, name: str) -> str:
-        """Mean and standard deviation in degrees as an aligned table."""
-        mean, deviation, *_ = np.rad2deg(list(self.statistics().values()))
-        cells = (f"{error:+.4f} ± {sd:.4f}" for error, sd in zip(mean, deviation, strict=True))
-        return text_table([["degrees", *map(str.capitalize, ANGLES)], [name, *cells]]).rstrip("\n")
-
-    def values(self, name: str) -> tuple[tuple[str, float, str], ...]:
-        """All statistics as rows of description, value, unit."""
-        return tuple(
-            (f"{name}: {angle} error, {statistic}", float(value), "degrees")
-            for statistic, radians in self.statistics().items()
-            for angle, value in zip(ANGLES, np.rad2deg(radians), strict=True)
-        )
 
 
 def pair_errors(
@@ -174,8 +160,8 @@ def common_readings(
     if common.size < 2:
         raise InsufficientDataError(
             f"expected at least 2 samples of the reference covered by the sensor's, got {common.size}: the "
-            f"reference spans {span(reference.time_s)}, the sensor with an offset of {sensor_offset_s:g} s "
-            f"{span(sensor.time_s + sensor_offset_s)}"
+            f"reference spans {reference.time_s[0]:.3f} to {reference.time_s[-1]:.3f} s, the sensor "
+            f"{sensor.time_s[0]:.3f} to {sensor.time_s[-1]:.3f} s and {sensor_offset_s:g} s later"
         )
     sample = common[np.unique(np.linspace(0, common.size - 1, frames).round().astype(int))]
     return sensor.at(times_s[sample]), reference.world_from_sensor[sample]
@@ -226,11 +212,6 @@ def _turns(measured: Rotation, reference: Rotation) -> tuple[FloatArray, FloatAr
     first, second = np.triu_indices(n, 1)
     turns, truth = ((poses[first].inv() * poses[second]).as_rotvec() for poses in (measured, reference))
     return turns, truth
-
-
-def span(time_s: FloatArray) -> str:
-    """First and last of some times, in words."""
-    return f"{time_s[0]:.3f} to {time_s[-1]:.3f} s"
 
 
 # -- a mechanism as the reference
@@ -304,8 +285,9 @@ def read_mechanism_csv(path: PathLike, turns: str = "roll, yaw, tilt") -> Mechan
     start_s, end_s = table.get("time"), table.get("until")
     if start_s is not None and end_s is not None and (less := end_s < start_s).any():
         k = less.argmax()
-        expected = f"expected until_s no less than time_s, {start_s[k]:g} s"
-        raise InvalidInputError(f"{path}: setting {k + 1}: {expected}, got {end_s[k]:g} s")
+        raise InvalidInputError(
+            f"{path}: setting {k + 1}: expected until_s from time_s on, {start_s[k]:g} s, got {end_s[k]:g} s"
+        )
     return MechanismSettings(rotation, start_s, end_s)
 
 

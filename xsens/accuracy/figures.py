@@ -6,8 +6,6 @@ Drawn without pyplot: no window system, no global state. Only this module of the
 from typing import NamedTuple
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from speckle3d.core.arrays import FloatArray
@@ -33,8 +31,7 @@ class Turn(NamedTuple):
     the angle measured, likewise.
     """
 
-    name: str
-    angle: str
+    calibration: int
     reference_rad: FloatArray
     error_rad: FloatArray
 
@@ -48,8 +45,7 @@ def turns_about(angle: str, errors: PairErrors) -> list[Turn]:
         frames = np.flatnonzero(alone[start] & (angles >= 0))
         frames = frames[np.argsort(angles[frames], kind="stable")]
         if frames.size >= FEWEST_FRAMES and angles[frames[-1]] > 0:
-            for k, row in enumerate(error[:, start, frames]):
-                turns.append(Turn(f"calibration {k + 1}", angle, angles[frames], row))
+            turns += [Turn(k, angles[frames], row) for k, row in enumerate(error[:, start, frames], 1)]
     longest = max((turn.reference_rad[-1] for turn in turns), default=0.0)
     return [turn for turn in turns if turn.reference_rad[-1] >= _SHORTEST * longest]
 
@@ -85,29 +81,24 @@ def figure_turns(errors: PairErrors, title: str = "") -> Figure:
     ----------
     .. [1] Housden et al., BioMedical Engineering OnLine 7:5, 2008, figure 5.
     """
-    panels_of_turns = [turns for angle in ANGLES if (turns := turns_about(angle, errors))]
-    if not panels_of_turns:
+    turns_of = {angle: turns for angle in ANGLES if (turns := turns_about(angle, errors))}
+    if not turns_of:
         raise InsufficientDataError(
             f"expected at least {FEWEST_FRAMES} frames that differ in one angle only, to within "
             f"{np.rad2deg(OFF_AXIS_RAD):g} degrees, got none: there is no turn to draw"
         )
-    figure = Figure(figsize=(9.0, 2.8 * len(panels_of_turns)), layout="constrained")
-    FigureCanvasAgg(figure)
-    panels = figure.subplots(len(panels_of_turns), 2, squeeze=False)
-    for row, turns in zip(panels, panels_of_turns, strict=True):
+    figure = Figure(figsize=(9.0, 2.8 * len(turns_of)), layout="constrained")
+    panels = figure.subplots(len(turns_of), 2, squeeze=False)
+    for row, (angle, turns) in zip(panels, turns_of.items(), strict=True):
         for axes, rank, choose in zip(row, ("worst", "best"), (max, min), strict=True):
-            _draw(axes, rank, choose(turns, key=lambda turn: np.abs(turn.error_rad).max()))
+            turn = choose(turns, key=lambda turn: np.abs(turn.error_rad).max())
+            reference = np.rad2deg(turn.reference_rad)
+            axes.plot(reference, color="black", label="reference")
+            axes.plot(reference + np.rad2deg(turn.error_rad), "o--", label="sensor")
+            axes.set_title(f"{rank} {angle}: calibration {turn.calibration}", fontsize="medium")
+            axes.set_xlabel("orientation in the turn")
+            axes.set_ylabel(f"{angle} / degrees")
+            axes.grid(visible=True)
     panels[0, 0].legend()
     figure.suptitle(printable(title), parse_math=False)
     return figure
-
-
-def _draw(axes: Axes, rank: str, turn: Turn) -> None:
-    reference = np.rad2deg(turn.reference_rad)
-    sensed = reference + np.rad2deg(turn.error_rad)
-    axes.plot(reference, color="black", label="reference")
-    axes.plot(sensed, "o--", label="sensor")
-    axes.set_title(f"{rank} {turn.angle}: {turn.name}", fontsize="medium", parse_math=False)
-    axes.set_xlabel("orientation in the turn")
-    axes.set_ylabel(f"{turn.angle} / degrees")
-    axes.grid(visible=True)

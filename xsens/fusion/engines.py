@@ -61,9 +61,9 @@ class Filter:
         self.last = np.zeros(0, kernel.STEP)  # whole increment
 
     @property
-    def start_force_m_s2(self) -> FloatArray:
+    def start_force_m_s2(self) -> Any:
         """Mean accelerometer's reading by which up was found, shape (1, 3)."""
-        return np.asarray(self._filter["start_force"] / self._filter["start_s"][:, None])
+        return self._filter["start_force"] / self._filter["start_s"][:, None]
 
     def steps(
         self, samples: Samples, to_end: bool, covariances: bool = False

@@ -1,20 +1,14 @@
 """Judge whether the magnetometer can be trusted, by the field found in the fusion."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from speckle3d.core.arrays import FloatArray
 from xsens.fusion.orient import Orientation, orient
 from xsens.logs.samples import ImuLog, row_norms
-
-if TYPE_CHECKING:
-    from xsens.fusion.online import OnlineState  # which loads numba
 
 HELD_RAD, LOST_RAD = math.radians(3.0), math.radians(10.0)
 """A heading's standard deviation up to which it is held, as the sensors' makers state it for movement, and
@@ -138,12 +132,6 @@ def field_of(log: ImuLog, orientation: Orientation) -> FieldFound:
         drift_rad=float(alone.standard_deviation_rad[-1, 2]),
         duration_s=log.duration_s,
     )
-
-
-def field_now(state: OnlineState, disbelieved: float) -> FieldFound:
-    """What a filter finds of the field while samples arrive, with the share it disbelieved lately."""
-    sd_rad = float(state.standard_deviation_rad[2])
-    return FieldFound(sd_rad, disbelieved, state.field_stray, state.field_iron)
 
 
 def dip_rad(field_in_world: FloatArray) -> FloatArray:

@@ -34,11 +34,6 @@ class Method(StrEnum):
         """Whether readings after a sample tell of its orientation."""
         return self in (Method.smoother, Method.vqf)
 
-    @property
-    def is_vqf(self) -> bool:
-        """Whether VQF finds the orientation, not this package's filter."""
-        return self in (Method.vqf, Method.vqf_online)
-
 
 @shown
 @dataclass(frozen=True)
@@ -175,6 +170,6 @@ def _estimate(
         estimate = (
             smooth(stretch, Filter(magnetic, *gyroscope)) if offline else online.run(stretch, to_end=True)
         )
-        estimates.append(by_vqf(stretch, estimate, offline, magnetic) if method.is_vqf else estimate)
+        estimates.append(by_vqf(stretch, estimate, offline, magnetic) if "vqf" in method else estimate)
     columns = zip(*(vars(estimate).values() for estimate in estimates), strict=True)
     return Estimate(*map(np.concatenate, columns))

@@ -102,22 +102,6 @@ class LiveState:
             return None
         return fused.disturbed or fused.field_stray > ROUGH
 
-    def line(self) -> str:
-        """The state in one line of text."""
-        parts = [f"{self.elapsed_s:6.1f} s", f"{self.samples} samples", f"{self.lost} lost"]
-        parts.append(f"{self.rate_hz:.1f} Hz" if self.connected else "NOT CONNECTED")
-        if self.interruptions:
-            parts.append(f"{self.interruptions} interruptions")
-        if self.world_from_sensor is not None:
-            yaw, pitch, roll = self.world_from_sensor.as_euler("ZYX", degrees=True)
-            parts.append(f"roll {roll:+.1f} pitch {pitch:+.1f} yaw {yaw:+.1f}")
-        if np.isfinite(self.field):
-            verdict = {None: "", True: " DISTURBED", False: " clear"}[self.disturbed]
-            parts.append(f"field {self.field:.2f} dip {np.rad2deg(self.dip_rad):.0f}{verdict}")
-        if self.note and not self.connected:
-            parts.append(self.note)
-        return " | ".join(parts)
-
 
 class Monitor:
     """Gather what a recording thread receives; decode it when another thread asks for the state."""

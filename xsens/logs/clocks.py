@@ -69,10 +69,10 @@ class Stamps:
 class Timeline:
     """Times of the samples that are kept (of those sent twice, one), with their counter made to rise.
 
-    `rows` are the indices of those samples in order of time; all of them as a slice.
+    `rows` are the indices of those samples in order of time.
     """
 
-    rows: IntArray | slice
+    rows: IntArray
     time_s: FloatArray
     counter: IntArray | None
     gaps: tuple[Gap, ...]
@@ -126,14 +126,14 @@ def timeline(stamps: Stamps, readings: Sequence[FloatArray] = ()) -> Timeline:
             f"the sensor started anew {anew.sum()} times; the pause is by the computer's clock "
             f"{certain.sum()} times, else not known and taken as {UNKNOWN_PAUSE_S:g} s"
         )
-    rows: Any = np.argsort(values, kind="stable")
+    rows = np.argsort(values, kind="stable")
     rank = np.argsort(rows)
     if late := (rank < np.maximum.accumulate(rank)).sum():
         notes.append(f"{late} samples came out of order and were sorted")
     distinct = np.append(True, np.diff(values[rows]) > 0.0)
     if left_out := (~distinct).sum():
         notes.append(f"{left_out} samples at the time of another were left out")
-    rows = rows[distinct] if late or left_out else slice(None)
+    rows = rows[distinct]
     time_s, anew = values[rows], np.diff(np.cumsum(anew)[rows]) > 0
     counter, numbers = (None if part is None else part[rows] for part in (stamps.counter, numbers))
     counter, gaps, more = _gaps(time_s, counter, numbers, anew, stamps.period_s)

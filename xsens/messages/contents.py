@@ -57,7 +57,7 @@ DATA = (MessageId.MT_DATA, MessageId.MT_DATA2)
 
 def rate_of(period: int) -> float:
     """Rate in Hz by a period in ticks; NaN if it is zero."""
-    return BASE_RATE_HZ / period if period else float("nan")
+    return BASE_RATE_HZ / period if period else np.nan
 
 
 _HEAD = struct.Struct(">4xHH88xH")
@@ -103,13 +103,13 @@ def utc_message(moment: datetime | None = None) -> Message:
 def utc_time_s(message: Message) -> float:
     """Seconds since 1970 of a UTC message; NaN if it holds no valid date."""
     if len(message.payload) != _UTC.size:
-        return float("nan")
+        return np.nan
     nanosecond, year, month, day, hour, minute, second, _ = _UTC.unpack(message.payload)
     try:
         whole = datetime(year, month, day, hour, minute, second, tzinfo=UTC)
         return float(whole.timestamp() + nanosecond * 1e-9)
     except (ValueError, OverflowError):
-        return float("nan")
+        return np.nan
 
 
 # -- calibration of raw counts

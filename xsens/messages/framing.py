@@ -8,7 +8,6 @@ holds; of two that overlap, the one that another message follows directly.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -87,7 +86,7 @@ def decode(data: bytes) -> list[Message]:
     >>> decode(bytes.fromhex("0000 faff3000d1 00"))
     [Message(mid=48, payload=b'', bid=255)]
     """
-    return list(find_frames(data).messages())
+    return find_frames(data).messages()
 
 
 @dataclass(frozen=True)
@@ -137,9 +136,9 @@ class Frames:
         payload = self.data[self.payload_start[index] : self.end[index] - 1].tobytes()
         return Message(int(self.mid[index]), payload, int(self.bid[index]))
 
-    def messages(self) -> Iterator[Message]:
+    def messages(self) -> list[Message]:
         """All messages, in order."""
-        return (self.message(i) for i in range(len(self)))
+        return [self.message(i) for i in range(len(self))]
 
     def gaps(self) -> list[tuple[int, int]]:
         """Runs of bytes that belong to no message, as (first byte, length)."""
@@ -185,7 +184,7 @@ class Framer:
         array = np.frombuffer(data, dtype=np.uint8)
         start, end, stop = _scan(array)
         self._rest = data[stop:]
-        return list(Frames(array, start, end)[start < stop].messages())
+        return Frames(array, start, end)[start < stop].messages()
 
 
 def _scan(data: ByteArray) -> tuple[IntArray, IntArray, int]:

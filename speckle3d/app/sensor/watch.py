@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 import xsens
 from speckle3d.app.sensor.log import COLUMNS, NORMAL_95, Columns, angles, heading_rad
 from speckle3d.core.errors import Speckle3DError
-from xsens.fusion.field import Trust, field_now
+from xsens.fusion.field import FieldFound, Trust
 
 INTERVAL_S = 0.1
 """Between two states: a display follows a hand, and the filter takes a percent of it."""
@@ -105,8 +105,10 @@ class SensorWatch:
         doubts = [
             state.fused.disturbed for state in states if state.fused is not None and state.fused.started
         ]
-        judgement = field_now(last.fused, float(np.mean(doubts)))
-        return judgement.trust, judgement.sentence()
+        fused, disbelieved = last.fused, float(np.mean(doubts))
+        sd_rad = float(fused.standard_deviation_rad[2])
+        field = FieldFound(sd_rad, disbelieved, fused.field_stray, fused.field_iron)
+        return field.trust, field.sentence()
 
     def orientation_at(self, time_s: float) -> Rotation | None:
         """World from sensor now."""

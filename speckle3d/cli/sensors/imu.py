@@ -256,9 +256,12 @@ def accuracy(
     --------
     $ speckle3d imu accuracy log.mtb --optical tracker.tum --calibration imu.h5
     """
+    import numpy as np
     from scipy.spatial.transform import Rotation
 
+    from speckle3d.core.text import text_table
     from speckle3d.study.figures import save_figure
+    from xsens.accuracy.angles import ANGLES
 
     log = read(log_file, rate_hz, world)
     note_gaps(log)
@@ -280,8 +283,17 @@ def accuracy(
         errors = xsens.pair_errors(readings, truth, mountings)
     if figure is not None:
         save_figure(xsens.figure_turns(errors, log_file.name), figure)
+    statistics_deg = {name: np.rad2deg(values) for name, values in errors.statistics().items()}
+    rows = [
+        (f"{log_file.stem}: {angle} error, {statistic}", float(value), "degrees")
+        for statistic, values in statistics_deg.items()
+        for angle, value in zip(ANGLES, values, strict=True)
+    ]
+    mean, deviation, *_ = statistics_deg.values()
+    cells = (f"{error:+.4f} ± {sd:.4f}" for error, sd in zip(mean, deviation, strict=True))
+    table = text_table([["degrees", *map(str.capitalize, ANGLES)], [log_file.stem, *cells]])
     how = f"{len(errors)} errors: pairs of {errors.frames} orientations, {len(mountings)} calibrations"
-    return rows_of(errors.values(log_file.stem))[0], f"{errors.text(log_file.stem)}\n{how}"
+    return rows_of(rows)[0], table + how
 
 
 def _optical(path: Path) -> xsens.TimedRotations:
@@ -337,10 +349,26 @@ def record(
         with status_line() as show:
             show("connecting")
             for state in xsens.record(port, out, settings, append, duration_s=duration_s):
-                show(state.line())
+                show(_line(state))
     except KeyboardInterrupt:
         note("stopped")
     if state is not None:
         note(
             f"{state.samples} samples, {state.lost} lost, {state.interruptions} interruptions; bytes in {out}"
         )
+
+
+def _line(state: xsens.LiveState) -> str:
+    parts = [f"{state.elapsed_s:6.1f} s", f"{state.samples} samples", f"{state.lost} lost"]
+    parts.append(f"{state.rate_hz:.1f} Hz" if state.connected else "NOT CONNECTED")
+    if state.interruptions:
+        parts.append(f"{state.interruptions} interruptions")
+    if state.world_from_sensor is not None:
+        yaw, pitch, roll = state.world_from_sensor.as_euler("ZYX", degrees=True)
+        parts.append(f"roll {roll:+.1f} pitch {pitch:+.1f} yaw {yaw:+.1f}")
+    if math.isfinite(state.field):
+        verdict = {None: "", True: " DISTURBED", False: " clear"}[state.disturbed]
+        parts.append(f"field {state.field:.2f} dip {math.degrees(state.dip_rad):.0f}{verdict}")
+    if state.note and not state.connected:
+        parts.append(state.note)
+    return " | ".join(parts)

@@ -18,7 +18,7 @@ SETTLED_S = 12.0
 """VQF averages the first fields over 9 s."""
 
 EVERY = pytest.mark.parametrize(
-    "method", [method for method in Method if find_spec("vqf") or not method.is_vqf]
+    "method", [method for method in Method if find_spec("vqf") or "vqf" not in method]
 )
 OURS = pytest.mark.parametrize("method", ["filter", "smoother"])
 
