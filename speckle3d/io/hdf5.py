@@ -255,7 +255,7 @@ def read_transforms(group: h5py.Group, name: str, count: int) -> RigidTransform:
     return transforms_from_matrices(read_array(group, name, (count, 4, 4)), locate(group, name))
 
 
-def read_texts(group: h5py.Group, name: str, shape: tuple[int, ...]) -> Any:
+def read_texts(group: h5py.Group, name: str, shape: tuple[int, ...] | None) -> Any:
     """Read a data set of texts of a known shape, as nested lists."""
     node = require_dataset(group, name, shape)
     with reading(locate(group, name), TypeError):  # h5py refuses what are no texts

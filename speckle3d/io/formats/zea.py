@@ -199,7 +199,7 @@ def _tracker(file: h5py.File, left_mm: float | None) -> tuple[Tracker | None, li
     if (node := find_member(file, _POSES)) is None:
         return None, []
     word = "rotation_representation"
-    kind = read_texts(node, word, ()) if has_member(node, word) else ""
+    kind = "".join(np.ravel(read_texts(node, word, None))) if has_member(node, word) else ""
     if kind not in _ROTATIONS:
         return None, [f"{_POSES}: not read: expected a {word} among {', '.join(_ROTATIONS)}"]
     is_euler, places_m = kind == "euler_xyz", read_array(node, "translation", ("pose", 3))

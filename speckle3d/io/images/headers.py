@@ -280,6 +280,8 @@ def read_header(path: PathLike) -> SequenceHeader:
             own, place = {os.path.abspath(folder), os.path.realpath(folder)}, Path(os.path.abspath(data))
             if own.isdisjoint(map(str, place.parents)):
                 raise InvalidInputError(f"expected pixels in the header's folder or below it, got {file}")
+        if data.exists() and count > (room := data.stat().st_size):
+            raise InvalidInputError(f"expected {count} frames, got {room} bytes in {data.name}")
         if lines := words.get("line skip", 0):
             with open_regular(data) as pixels:
                 pixels.seek(start)

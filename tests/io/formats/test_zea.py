@@ -97,7 +97,7 @@ def test_probe_poses_are_the_tracker(tmp_path, kind):
     with h5py.File(path, "a") as file:
         group = file.create_group("metadata/probe_pose")
         group["translation"], group["rotation"] = places.astype("f4"), rotation.astype("f4")
-        group["rotation_representation"] = kind
+        group["rotation_representation"] = [kind] if kind.startswith("euler") else kind
         group["start_time_offset"], group["sampling_frequency"] = np.float32(-0.1), np.float32(20.0)
     recording = open_recording(path, ImportSettings(dynamic_range_db=60.0))
     tracker = recording.sweep.tracker
