@@ -129,3 +129,11 @@ def image_corners(grid: ImageGrid, world_from_image: RigidTransform) -> FloatArr
     """Corners of all images in the world, clockwise from the top left, shape (n, 4, 3), mm."""
     require_poses(world_from_image)
     return np.stack([world_from_image.apply(corner) for corner in grid.corners_mm], axis=1)
+
+
+def image_outline(grid: ImageGrid) -> FloatArray:
+    """Closed line around an image in its plane, a fan's along its arcs, shape (m, 3), mm."""
+    last, deepest = grid.vectors - 1, grid.samples - 1
+    across = np.array([0, last]) if grid.fan is None else np.arange(last + 1)
+    line = np.concatenate([grid.mm(across, 0), grid.mm(across[::-1], deepest), grid.mm([0], [0])])
+    return np.pad(line, ((0, 0), (0, 1)))

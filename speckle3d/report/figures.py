@@ -17,6 +17,7 @@ from speckle3d.core.arrays import FloatArray
 from speckle3d.core.grid import ImageGrid
 from speckle3d.core.images import spread_frames
 from speckle3d.core.reconstruction import FramePairs
+from speckle3d.imaging.images import image_outline
 from speckle3d.scoring.references import SweepCurves
 from speckle3d.study.figures import CURVE_LABELS, colour_of, label_of, new_figure
 from speckle3d.study.overall import Row, words_of
@@ -121,7 +122,7 @@ def plot_outlines(poses: Mapping[str, RigidTransform], grid: ImageGrid) -> go.Fi
     Modes come and go by the legend; the truth is broad, so that the others lie on it.
     """
     figure = go.Figure(layout=_LAYOUT)
-    outline, breaks = grid.corners_mm[[0, 1, 2, 3, 0]], np.full((1, 3), np.nan)
+    outline, breaks = image_outline(grid), np.full((1, 3), np.nan)
     for mode in sorted(poses, key=lambda name: name != "truth"):
         path = poses[mode][0].inv() * poses[mode]
         frames = spread_frames(len(path), OUTLINES)

@@ -20,8 +20,7 @@ from speckle3d.core.reconstruction import MODES
 from speckle3d.core.sweep import BModeSettings, Sweep
 from speckle3d.core.text import printable
 from speckle3d.core.volume import STATE_SEGMENTS
-from speckle3d.imaging.cuts.outlines import frame_outlines
-from speckle3d.imaging.images import PosedImages
+from speckle3d.imaging.images import PosedImages, image_outline
 from speckle3d.imaging.voxels.settings import CompoundingSettings
 from speckle3d.io.fileset import FileSet
 from speckle3d.io.plus.transforms import pixel_matrix
@@ -126,8 +125,8 @@ def _write_mode(
     volume, state, deviation = files["volume"], files["state"], files.get("deviation")
     report = write_voxels(posed, settings, volume, None, region, state, deviation)
     sweep, poses = slicer_sequence(posed, settings.dynamic_range_db)
-    outlines = frame_outlines(sweep.grid, posed.world_from_image)
-    write_polylines(files["outlines"], outlines, posed.frames)
+    lines = [posed.world_from_image.apply(point) for point in image_outline(posed.sweep.grid)]
+    write_polylines(files["outlines"], np.stack(lines, axis=1), posed.frames)
     write_transform(files["first"], posed.world_from_image[0])
     if "images" in files:
         write_sequence(files["images"], sweep, None, True, poses)

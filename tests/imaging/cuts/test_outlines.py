@@ -5,6 +5,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.grid import ImageGrid
 from speckle3d.imaging.cuts.outlines import crossings, frame_outlines, within_fan
+from speckle3d.imaging.images import image_outline
 
 GRID = ImageGrid(11, 21, 0.4, 0.5, 1.0)
 
@@ -36,6 +37,8 @@ def test_crossings_are_on_the_plane_and_on_the_outline():
 def test_lines_end_with_the_fan():
     """10 mm below the apex a sector of 60 degrees is 20 tan(30) mm wide."""
     fan = ImageGrid.of_fan(31, 61, 0.5, 0.0, (-np.pi / 6, np.pi / 6))
+    radii_mm = np.linalg.norm(image_outline(fan)[:, :2] - fan.fan.apex_mm, axis=1)
+    np.testing.assert_allclose(radii_mm, [0.0] * 31 + [30.0] * 31 + [0.0], atol=1e-9)
     lines = fan.fan.apex_mm + np.array([[[-20.0, 10.0], [20.0, 10.0]]])
     (x,) = within_fan(lines, RigidTransform.identity(1), fan)[..., 0]
     assert abs(np.nanmax(x) - np.nanmin(x) - 20.0 / 3**0.5) < 0.4
