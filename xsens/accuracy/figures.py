@@ -31,7 +31,6 @@ class Turn(NamedTuple):
     the angle measured, likewise.
     """
 
-    calibration: int
     reference_rad: FloatArray
     error_rad: FloatArray
 
@@ -45,7 +44,7 @@ def turns_about(angle: str, errors: PairErrors) -> list[Turn]:
         frames = np.flatnonzero(alone[start] & (angles >= 0))
         frames = frames[np.argsort(angles[frames], kind="stable")]
         if frames.size >= FEWEST_FRAMES and angles[frames[-1]] > 0:
-            turns += [Turn(k, angles[frames], row) for k, row in enumerate(error[:, start, frames], 1)]
+            turns += [Turn(angles[frames], row) for row in error[:, start, frames]]
     longest = max((turn.reference_rad[-1] for turn in turns), default=0.0)
     return [turn for turn in turns if turn.reference_rad[-1] >= _SHORTEST * longest]
 
@@ -95,7 +94,7 @@ def figure_turns(errors: PairErrors, title: str = "") -> Figure:
             reference = np.rad2deg(turn.reference_rad)
             axes.plot(reference, color="black", label="reference")
             axes.plot(reference + np.rad2deg(turn.error_rad), "o--", label="sensor")
-            axes.set_title(f"{rank} {angle}: calibration {turn.calibration}", fontsize="medium")
+            axes.set_title(f"{rank} {angle}", fontsize="medium")
             axes.set_xlabel("orientation in the turn")
             axes.set_ylabel(f"{angle} / degrees")
             axes.grid(visible=True)

@@ -1,6 +1,5 @@
 """`OnlineFilter`: orientation while samples arrive, one by one or in pieces."""
 
-import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -75,8 +74,8 @@ class OnlineFilter:
         self._pending: list[tuple[Any, ...]] = []  # since the filter ran: once in an increment is enough
         self._rate: FloatArray | None = None
         self._force = np.full(3, np.nan)
-        self._skipped_s, self._forceless_s = 0.0, math.inf
-        self._usual_s = math.nan
+        self._skipped_s, self._forceless_s = 0.0, np.inf
+        self._usual_s = np.nan
 
     def push(
         self,
@@ -159,7 +158,7 @@ class OnlineFilter:
 
 def _require_readings(step_s: ArrayLike, *vectors: ArrayLike | None) -> list[FloatArray]:
     """Steps and readings; what is no measurement, zeros or out of range, is NaN."""
-    step = np.atleast_1d(np.asarray(step_s, dtype=float))
+    step = np.array(step_s, dtype=float, ndmin=1)
     if not (np.isfinite(step) & (step > 0.0)).all():
         raise InvalidInputError("step_s: expected positive numbers, got one that is not")
     shape = (step.size, 3)

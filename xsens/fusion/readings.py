@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
@@ -79,9 +78,10 @@ class Estimate:
 
 def turn_about_up(angles_rad: FloatArray | float, xyzw: FloatArray) -> FloatArray:
     """Quaternions, shape (k, 4), turned about up."""
-    return (
-        Rotation.from_rotvec(np.multiply.outer(angles_rad, [0.0, 0.0, 1.0])) * Rotation.from_quat(xyzw)
-    ).as_quat()
+    x, y, z, w = xyzw.T
+    turn = np.exp(0.5j * np.asarray(angles_rad))
+    first, last = turn * (x + 1j * y), turn * (w + 1j * z)
+    return np.column_stack([first.real, first.imag, last.imag, last.real])
 
 
 def usable_samples(log: ImuLog) -> tuple[IntArray, Samples, list[str], float]:

@@ -179,8 +179,7 @@ def connect(port_name: str, baud: int | None = None) -> Device:
             return device
         except DeviceError:
             device.close()
-    rates_text = ", ".join(map(str, rates))
-    raise DeviceError(f"{port_name}: expected a sensor, got no answer at {rates_text} baud")
+    raise DeviceError(f"{port_name}: expected a sensor, got no answer at {', '.join(map(str, rates))} baud")
 
 
 def prepare(device: Device, settings: DeviceSettings) -> DeviceInfo:

@@ -8,7 +8,6 @@ which a reader can tell how long the sensor was disconnected.
 
 from __future__ import annotations
 
-import math
 import os
 import threading
 import time
@@ -345,7 +344,7 @@ def record(
     path: PathLike,
     settings: DeviceSettings | None = None,
     append: bool = False,
-    duration_s: float = math.inf,
+    duration_s: float = np.inf,
 ) -> Iterator[LiveState]:
     """Record a sensor and yield its state, until the time is over or the iteration is left.
 

@@ -61,19 +61,6 @@ _CALM = 0.1
 _FEWEST = 8
 
 
-class Consistency(NamedTuple):
-    """What a log's sensors say of each other.
-
-    `sentences` are on what is contradicted, by what contradicts it; empty where that agrees with the
-    gyroscope. What tells nothing, as an accelerometer of a sensor that turns about the vertical alone, is
-    left out.
-    `scale_error` is the share of its turns by which the gyroscope is off; 0 if it is as foreseen.
-    """
-
-    sentences: dict[str, str | None]
-    scale_error: float
-
-
 class _Turns(NamedTuple):
     """Turns of a direction from each of n windows to the next, shape (n, 3).
 
@@ -93,8 +80,17 @@ class _Turns(NamedTuple):
     coherence: float
 
 
-def contradictions(log: ImuLog) -> Consistency:
-    """Compare a log's sensors with its gyroscope."""
+def contradictions(log: ImuLog) -> tuple[dict[str, str | None], float]:
+    """Compare a log's sensors with its gyroscope.
+
+    Returns
+    -------
+    dict of str to str, or None
+        Sentences on what is contradicted, by what contradicts it; empty where that agrees with the gyroscope.
+        What tells nothing, as an accelerometer of a sensor that turns about the vertical alone, is left out.
+    float
+        Share of its turns by which the gyroscope is off; 0 if it is as foreseen.
+    """
     rate, force, field = log.gyroscope_rad_s, log.accelerometer_m_s2, log.magnetometer_au
     directions = {"accelerometer": force, "magnetometer": field, "own orientation": log.own_direction}
     sentences: dict[str, str | None] = {"gyroscope": ""}
@@ -130,7 +126,7 @@ def contradictions(log: ImuLog) -> Consistency:
                 "the field points up, as south of the magnetic equator: if this is north of it, magnetometer "
                 "or accelerometer are negated, and the heading is off by half a turn"
             )
-    return Consistency(sentences, scale_error)
+    return sentences, scale_error
 
 
 def not_in_metres(force: FloatArray) -> str:
@@ -158,11 +154,11 @@ def _turns(time_s: FloatArray, rate: FloatArray, direction: FloatArray) -> _Turn
     norms = np.nan_to_num(np.linalg.norm(readings, axis=2))
     length = norms.sum(axis=1) / np.maximum((norms > 0.0).sum(axis=1), 1)
     # Sums in each window's first axes, of the direction and of what rests in the sensor's axes.
-    turn, mean, carried = Rotation.identity(count), np.zeros((count, 3)), np.zeros((count, 3, 3))
+    turn, mean, carried = np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3)), np.zeros((count, 3, 3))
     for k in range(width):
-        mean += turn.apply(np.where(norms[:, k, None] > 0.0, readings[:, k], 0.0))
-        carried += turn.as_matrix() / width
-        turn *= Rotation.from_rotvec(rates[:, k] * spans_s[:, k])
+        mean += np.einsum("nij,nj->ni", turn, np.nan_to_num(readings[:, k]))
+        carried += turn / width
+        turn = turn @ Rotation.from_rotvec(rates[:, k] * spans_s[:, k]).as_matrix()
     mean *= (length / np.maximum(norms.sum(axis=1), 1e-9))[:, None]
     usual = max(np.median(length), 1e-9)
     calm = (np.abs(length / usual - 1.0) < _CALM) & ~(spans_s > 2.0 * usual_s).any(axis=(1, 2))
@@ -171,13 +167,11 @@ def _turns(time_s: FloatArray, rate: FloatArray, direction: FloatArray) -> _Turn
         return None
     coherence = float(np.median(row_norms(mean)[1:][calm] / length[1:][calm]))
     turn, mean = turn[:-1], mean / usual
-    ahead = turn.inv().apply(mean[:-1])
+    ahead = np.einsum("nji,nj->ni", turn, mean[:-1])
     arms = np.cross(0.5 * (ahead + mean[:-1]), np.eye(3)[:, None])[:, calm]
-    by_axis = arms * turn.as_rotvec()[calm].T[:, :, None]
-    iron = np.moveaxis(carried[1:] - turn.inv().as_matrix() @ carried[:-1], 2, 0)[:, calm]
-    expected, missed, *by_axis = _without(
-        arms, [(ahead - mean[:-1])[calm], (mean[1:] - ahead)[calm], *by_axis]
-    )
+    turns = arms * Rotation.from_matrix(turn[calm]).as_rotvec().T[:, :, None]
+    iron = np.moveaxis(carried[1:] - turn.swapaxes(1, 2) @ carried[:-1], 2, 0)[:, calm]
+    expected, missed, *by_axis = _without(arms, [(ahead - mean[:-1])[calm], (mean[1:] - ahead)[calm], *turns])
     (unlike_iron,) = _without(np.concatenate([arms, iron]), [missed])
     same = (rates == rates[:, :1]).all(axis=1)[:-1][calm].T
     same &= ~same.all(axis=0)
@@ -194,11 +188,12 @@ def _without(columns: FloatArray, parts: Sequence[FloatArray]) -> FloatArray:
 def _dead_axis(rate: FloatArray, direction: FloatArray) -> str:
     """Axis in which a direction never changes, although it turns in the sensor's axes; empty if none."""
     valid = finite_rows(rate) & finite_rows(direction)
-    rows, change = direction[valid], np.cross(direction[valid], rate[valid])
-    for axis, column, turned in zip("xyz", rows.T, change.T, strict=True):
-        still = len(rows) > _FEWEST and (column == column[0]).all()
-        if still and _rms(turned[:, None]) > 2.0 * _MOVING_RAD_S * median_norm(rows):
-            return axis
+    rows = direction[valid]
+    for k in range(3):
+        if len(rows) > _FEWEST and (rows[:, k] == rows[0, k]).all():
+            turned = np.cross(rows, rate[valid])[:, k : k + 1]
+            if _rms(turned) > 2.0 * _MOVING_RAD_S * median_norm(rows):
+                return "xyz"[k]
     return ""
 
 

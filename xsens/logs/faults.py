@@ -136,7 +136,7 @@ def _bad(name: str, rows: FloatArray, force: FloatArray, rate: FloatArray) -> di
         "with an axis that stands still": stuck_axes(rows, _SLOW_RAD_S if name == VECTORS[1] else 0.0),
         "at the end of the range": np.any([_cut_off(axis, limits.least_end) for axis in rows.T], axis=0),
         "single spikes": _spikes(rows, limits.spike * unit),
-        "beyond a jump from end to end of the range": _wrapped(rows) & (name == VECTORS[1]),
+        "beyond a jump from end to end of the range": _wrapped(rows[:, : 3 * (name == VECTORS[1])]),
     }
 
 

@@ -47,7 +47,7 @@ def note_gaps(log: xsens.ImuLog) -> None:
 
     note(
         *log.notes,
-        contradictions(log).sentences.get("gravity"),
+        contradictions(log)[0].get("gravity"),
         log.losses and f"{log.losses}; nothing filled in",
     )
 
@@ -63,7 +63,7 @@ def orientation_of(
         note("no gyroscope and no accelerometer: the orientation is the sensor's own")
         method = "sensor"
     if method == "sensor":
-        against = contradictions(log).sentences
+        against = contradictions(log)[0]
         if against.get("own orientation") and against.get("accelerometer") == "":
             raise InvalidInputError(
                 f"{against['own orientation']} The accelerometer agrees with the gyroscope"
@@ -105,7 +105,7 @@ def info(log_file: Path, rate_hz: MaybeNumber = None, world: World = None) -> Re
         values, noun = getattr(log, name), name.split("_")[0]
         norm = math.nan if values is None else median_norm(values)
         rows.append((f"{noun}, median norm", f"{norm:.4f}", unit) if norm == norm else (noun, "none", ""))
-    notes = [*log.notes, *filter(None, contradictions(log).sentences.values())]
+    notes = [*log.notes, *filter(None, contradictions(log)[0].values())]
     return rows_of([*rows, *(("note", text, "") for text in notes)])
 
 
