@@ -77,9 +77,15 @@ def curve_errors(error: FloatArray, has_reading: BoolArray) -> FloatArray:
 
 
 def tracker_errors(
-    poses: RigidTransform, centre_mm: FloatArray, time_s: FloatArray, errors: FusedSettings
+    poses: RigidTransform, centre_mm: FloatArray, time_s: FloatArray, errors: FusedSettings, wander_mm: float
 ) -> FloatArray:
-    """Covariance by the errors of a tracker's scale, mounting and clock."""
+    """Covariance by the errors of a tracker's scale, mounting and clock, and by its slow errors.
+
+    Parameters
+    ----------
+    wander_mm : float
+        Standard deviation of its places' slow errors along each axis; curves follow them.
+    """
     from_first = poses[0].inv() * poses
     path, rotation = from_first.apply(centre_mm) - centre_mm, from_first.rotation.as_matrix() - np.eye(3)
     drift = np.gradient(path, time_s, axis=0)
@@ -91,6 +97,7 @@ def tracker_errors(
         + errors.clock_sigma_s**2 * drift[:, :, None] * drift[:, None, :]
         + errors.mounting_sigma_rad**2 * across @ across.transpose(0, 2, 1)
         + errors.mounting_sigma_mm**2 * rotation @ rotation.transpose(0, 2, 1)
+        + wander_mm**2 * _growth(time_s, errors) * np.eye(3)
     )
     covariance[:, 3:, 3:] = errors.mounting_sigma_rad**2 * rotation @ rotation.transpose(0, 2, 1)
     return covariance
@@ -109,9 +116,13 @@ def orientation_errors(
     sigma = np.array([errors.inclination_sigma_rad, errors.inclination_sigma_rad, errors.heading_sigma_rad])
     to_first = poses[0].rotation.as_matrix().T
     slow = to_first @ np.diag(sigma**2) @ to_first.T
-    grown = 2.0 * (1.0 - np.exp(-(time_s - time_s[0]) / errors.wander_s))
     path = (poses[0].inv() * poses).apply(centre_mm) - centre_mm
     # An angle that grows evenly along the way moves its end by half as much as one that is there throughout.
     lever = -0.5 * skew(path)
     slopes = np.concatenate([lever, np.broadcast_to(np.eye(3), lever.shape)], axis=1)
-    return np.asarray(grown[:, None, None] * slopes @ slow @ slopes.transpose(0, 2, 1))
+    return np.asarray(_growth(time_s, errors) * slopes @ slow @ slopes.transpose(0, 2, 1))
+
+
+def _growth(time_s: FloatArray, errors: FusedSettings) -> FloatArray:
+    """Variance of the change of a slow error of unit variance since the first frame, shape (n, 1, 1)."""
+    return np.asarray(2.0 * (1.0 - np.exp((time_s[0] - time_s) / errors.wander_s)))[:, None, None]

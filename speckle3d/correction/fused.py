@@ -177,5 +177,6 @@ def fuse(
         length_sigma=length_sigma(from_first, covariance, centre_mm),
         rests_on=("images", *(sensor.name for sensor in sensors), *["crossing"] * (evidence is not None)),
         evidence=evidence,
-        details={f"{s.name} jitter": float(s.jitter[int(s.places)]) for s in problem.sensors},
+        details={f"{s.name} jitter": float(s.jitter[int(s.places)]) for s in problem.sensors}
+        | {f"{s.name} wander": float(s.wander.max()) for s in problem.sensors if s.places},
     )

@@ -81,6 +81,7 @@ def correct_mode(
     settings: DriftSettings,
     image_covariance: FloatArray,
     errors: FusedSettings,
+    wander_mm: float,
 ) -> DriftCorrection:
     """Correct image-based poses by the sensor that a mode stands for; see `require_modes`.
 
@@ -95,6 +96,8 @@ def correct_mode(
         are.
     errors : FusedSettings
         Errors of the sensors that their readings do not show.
+    wander_mm : float
+        Of a tracker's places, as mode `fused` finds it.
     """
     sensor = sensor_of(sweep, mode)
     assert sensor is not None
@@ -106,7 +109,9 @@ def correct_mode(
             correction = correct_pose(
                 world_from_image, reference, has_reading, sweep.grid.corners_mm, settings
             )
-            covariance = correction.covariance + tracker_errors(correction.poses, centre_mm, time_s, errors)
+            covariance = correction.covariance + tracker_errors(
+                correction.poses, centre_mm, time_s, errors, wander_mm
+            )
         else:
             rotation = image_orientation(sensor, time_s[has_reading])
             correction = correct_orientation(world_from_image, rotation, has_reading, centre_mm, settings)
