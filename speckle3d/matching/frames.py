@@ -6,7 +6,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
-from speckle3d.core.images import spread_frames
 from speckle3d.core.sweep import Sweep
 from speckle3d.core.threads import ahead
 from speckle3d.kernels.inplane import Frame
@@ -14,7 +13,7 @@ from speckle3d.matching.matcher import FrameMatcher, compose, inverse
 from speckle3d.matching.quality import FrameFeatures, FrameFlag, flag_frames, short_repeats
 from speckle3d.matching.schedule import KnownSchedule, PairSchedule
 from speckle3d.matching.table import CorrelationTable
-from speckle3d.matching.texture import FRAMES, Texture
+from speckle3d.matching.texture import Texture, leave_out_standing
 
 ImageSink = Callable[[int, Float32Array], None]
 """Called with each frame's number and intensity image (vector, sample), in order."""
@@ -73,8 +72,7 @@ def match_sweep(
         Called with every intensity image.
     """
     pairing, texture = FrameByFrame(matcher, schedule), Texture(matcher)
-    texture_frames = spread_frames(len(sweep), FRAMES).tolist()
-    matcher.leave_out([matcher.extractor.echo(sweep.frames[number]) for number in texture_frames])
+    texture_frames = leave_out_standing(sweep, matcher)
     features, tables = [], []
     frames = ahead(lambda number: matcher.ready(sweep.frames[number]), range(len(sweep)))
     for number, ready in enumerate(frames):

@@ -106,10 +106,8 @@ class IntensityExtractor:
     def _analytic(self, frame: npt.NDArray[Any]) -> Complex64Array:
         """Band-passed analytic signal about the band's centre, resampled in depth."""
         plan, are_complex = self._plan, np.iscomplexobj(frame)
-        padded = np.zeros((len(frame), plan.length), "c8" if are_complex else "f4")
-        padded[:, : frame.shape[1]] = frame
         transform: Any = fft.fft if are_complex else fft.rfft
-        spectrum = transform(padded, axis=1, overwrite_x=True)
+        spectrum = transform(frame.astype("c8" if are_complex else "f4"), plan.length, axis=1)
         band = np.zeros((len(frame), plan.out_length), np.complex64)
         band[:, plan.destination] = spectrum.take(plan.bins, axis=1) * plan.weights
         return np.ascontiguousarray(fft.ifft(band, axis=1, overwrite_x=True)[:, : self.grid.samples])
@@ -126,14 +124,12 @@ class IntensityExtractor:
         counted : ndarray of bool, shape (vector, grid.samples)
             Samples that are not left out.
         """
-        gain = self._gain(echo.intensity, counted)
+        gain, parts = self._gain(echo.intensity, counted), np.empty((2, 0, 0), np.float32)
         gain[~counted] = 0.0
-        if echo.analytic is None:
-            image, parts = echo.intensity * gain, np.empty((2, 0, 0), np.float32)
-        else:
-            parts = np.sqrt(gain) * np.stack([echo.analytic.real, echo.analytic.imag])
-            image = np.square(parts).sum(axis=0)
+        image = echo.intensity * gain
         image[~counted] = 1.0
+        if echo.analytic is not None:
+            parts = np.sqrt(gain) * np.stack([echo.analytic.real, echo.analytic.imag])
         return image, parts
 
     def _gain(self, intensity: Float32Array, counted: BoolArray) -> Float32Array:
@@ -143,12 +139,13 @@ class IntensityExtractor:
         sides = (self.grid.vector_pitch_mm, self.grid.sample_spacing_mm)
         wide, high = (2 * int(self.settings.equalise_mm / 2 / side) + 1 for side in sides)
         mean = uniform_filter(intensity * counted, (wide, high), mode="nearest")
-        share = counted.astype(np.float32)
-        if not counted.all():
-            share = uniform_filter(share, (wide, high), mode="nearest")
+        mean = np.maximum(mean, np.finfo(np.float32).tiny)
+        if counted.all():
+            return np.reciprocal(mean)
+        share = uniform_filter(counted.astype(np.float32), (wide, high), mode="nearest")
         # Less than half a sample is rounding: nothing counts near.
         share[share <= 0.5 / (wide * high)] = 0.0
-        return np.divide(share, np.maximum(mean, np.finfo(np.float32).tiny), out=share)
+        return share / mean
 
 
 def two_way_wavenumber(signal: RFSettings) -> float:

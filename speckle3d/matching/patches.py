@@ -82,10 +82,10 @@ class PatchGrid:
         by_column = values.reshape(*values.shape[:-1], -1, self.row_depth_mm.size)
         return np.asarray(by_column.swapaxes(-1, -2))
 
-    def tiles(self, image: npt.NDArray[Any]) -> npt.NDArray[Any]:
-        """Cut an image, shape (..., vector, sample), into its patches, shape (p, ..., v, s)."""
-        wide, high = self.size
-        return np.stack([image[..., v : v + wide, s : s + high] for v, s in self.first])
+    def tiles(self, image: npt.NDArray[Any], step: int = 1) -> npt.NDArray[Any]:
+        """Patches of an image, shape (..., vector, sample), as (p, ..., v, s), of every step-th sample."""
+        windows = np.lib.stride_tricks.sliding_window_view(image, self.size, axis=(-2, -1))[..., ::step]
+        return np.moveaxis(windows[..., self.first[:, 0], self.first[:, 1], :, :], -3, 0)
 
     def between(self, depth_mm: FloatArray) -> PatchGrid:
         """Keep the rows whose centres lie between the first and the last of some depths, or half a patch off.

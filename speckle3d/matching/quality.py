@@ -127,7 +127,7 @@ def inspect_frame(
     """
     s = settings or QualitySettings()
     inside, step = patches.inside, max(1, int(patches.size[1]) // _SAMPLES)
-    tiles = patches.tiles(intensity)[..., ::step]
+    tiles = patches.tiles(intensity, step)
     wide, high = tiles.shape[1] // 2, tiles.shape[2] // 2
     with np.errstate(divide="ignore", invalid="ignore"):  # Of flat patches.
         tiles = tiles / tiles.mean(axis=(1, 2), keepdims=True) - np.float32(1.0)
@@ -147,7 +147,7 @@ def inspect_frame(
     usable, spread = echo & together & inside, np.full(len(patches), np.nan)
     if is_bmode:
         with np.errstate(divide="ignore"):  # Black patches have none.
-            spread = np.log(patches.tiles(frame)[..., :: 4 * step].std(axis=(1, 2), dtype=np.float64))
+            spread = np.log(patches.tiles(frame, 4 * step).std(axis=(1, 2), dtype=np.float64))
     shares = share(together & fine), share(~together)
     return FrameFeatures(contrast, alike, _clipping(frame, is_bmode, s), *shares, spread, usable)
 

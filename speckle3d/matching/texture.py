@@ -140,11 +140,17 @@ class Texture:
         return np.ma.masked_invalid(self._patches.rows_of(values))
 
 
-def measured_texture(sweep: Sweep, matcher: FrameMatcher) -> Texture:
-    """Read some frames of a sweep, leave out what stands still in them, and measure their texture."""
-    texture, numbers = Texture(matcher), spread_frames(len(sweep), FRAMES).tolist()
+def leave_out_standing(sweep: Sweep, matcher: FrameMatcher) -> list[int]:
+    """Leave out what stands still in some frames of a sweep, whose numbers are returned."""
+    numbers: list[int] = spread_frames(len(sweep), FRAMES).tolist()
     matcher.leave_out([matcher.extractor.echo(sweep.frames[number]) for number in numbers])
-    for number in numbers:
+    return numbers
+
+
+def measured_texture(sweep: Sweep, matcher: FrameMatcher) -> Texture:
+    """Texture of some frames of a sweep, without what stands still in them."""
+    texture = Texture(matcher)
+    for number in leave_out_standing(sweep, matcher):
         texture.keep(number, matcher.ready(sweep.frames[number]))
     return texture
 

@@ -121,25 +121,28 @@ class _Binning:
     amplitude: FloatArray
 
     def log_likelihood(
-        self, log_scale: float, power: float, share: FloatArray
+        self, log_scale: float, powers: FloatArray, share: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Log-likelihood of each patch at its likeliest gain, and that gain, shape (q, c).
+        """Log-likelihood of each patch at its likeliest gain, and that gain, shape (a, q, c).
 
         Parameters
         ----------
-        log_scale, power : float
-            ln s and a.
+        log_scale : float
+            ln s.
+        powers : ndarray, shape (a,)
         share : ndarray, shape (c,)
         """
         row, position = np.indices(self.mean.shape)[0], self.distance * np.exp(log_scale)
         amplitude = map_coordinates(self.amplitude, [row, position], order=1, mode="nearest")
         speckle = np.maximum(amplitude, 1e-6)
+        structure = np.exp(powers[:, None, None] * np.log(speckle))
         # The squared echo is a sum of three terms, whatever the share.
-        terms = np.stack([speckle**2, 2.0 * speckle ** (1.0 + power), speckle ** (2.0 * power)], axis=1)
+        squares = np.broadcast_arrays(speckle**2, 2.0 * speckle * structure, structure**2)
+        terms = np.stack(squares, axis=2)
         parts = np.stack([(1.0 - share) ** 2, share * (1.0 - share), share**2])
         weighted = terms * self.weight[:, None] ** 2
-        product = (weighted @ self.mean[:, :, None])[:, :, 0] @ parts
-        square = np.einsum("ic,qij,jc->qc", parts, weighted @ terms.transpose(0, 2, 1), parts)
+        product = (weighted @ self.mean[:, :, None])[..., 0] @ parts
+        square = np.tensordot(weighted @ terms.swapaxes(2, 3), parts[:, None] * parts, 2)
         # Without an echo there is nothing that noise could have taken.
         tiny = np.finfo(float).tiny
         gain = (np.maximum(product, LEAST_CORRELATION * square) + tiny) / (square + tiny)
@@ -176,10 +179,11 @@ def _bin_correlations(
     floor, cells = np.tile(floor, (pieces, 1)), np.tile(curves.cells, pieces)[:, None]
     variance = correlation_variance(np.clip(mean, 0.0, 0.995), cells, curves.of_echo) + INTERPOLATION**2
     variance *= PAIRS_PER_FACT
+    some = count.any(axis=0)
     binning = _Binning(
-        by_distance / counts / curves.step_mm,
-        (mean - floor) / (1 - floor),
-        (1 - floor) * np.sqrt(count / variance),
+        (by_distance / counts / curves.step_mm)[:, some],
+        ((mean - floor) / (1 - floor))[:, some],
+        ((1 - floor) * np.sqrt(count / variance))[:, some],
         np.tile(amplitude, (pieces, 1)),
     )
     return binning, (ends[1:] + ends[:-1]) / 2
@@ -208,10 +212,7 @@ def estimate_coherence(problem: MotionProblem, table: CorrelationTable, path: Fl
     # Curves of tissue hold its structure.
     values = values[:2] if problem.curves.of_tissue else values
     likelihood = np.stack(
-        [
-            logsumexp([binning.log_likelihood(scale, power, values)[0] for power in POWERS], axis=0)
-            for scale in LOG_SCALES
-        ],
+        [np.logaddexp.reduce(binning.log_likelihood(scale, POWERS, values)[0]) for scale in LOG_SCALES],
         axis=1,
     )
     log_prior = _share_prior(logsumexp(likelihood, axis=1), values)
@@ -224,7 +225,7 @@ def estimate_coherence(problem: MotionProblem, table: CorrelationTable, path: Fl
     scale_sigma, false_turn = _deviations(problem, by_patch, log_scale)
     if problem.curves.of_tissue:
         return replace(as_measured, scale_sigma=scale_sigma, false_turn=false_turn)
-    weight, gains = binning.log_likelihood(log_scale, 0.0, values)
+    (weight,), (gains,) = binning.log_likelihood(log_scale, np.zeros(1), values)
     weight = softmax(weight + log_prior, axis=1)
     share, gain = (v.reshape(centres.size, -1) for v in (weight @ values, (weight * gains).sum(axis=1)))
     # Rows without an echo have neither scale nor gain.
