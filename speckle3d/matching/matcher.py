@@ -191,7 +191,7 @@ class FrameMatcher:
         features = inspect_frame(
             samples, echo.intensity, patches, isinstance(self.signal, BModeSettings), self.quality
         )
-        echoing = 1.0 - patches.tiles(silent).mean(axis=(1, 2))
+        echoing = 1.0 - patches.tiles(silent).mean(axis=(1, 2)) if silent.any() else 1.0
         usable = features.usable & ~self.overlaid & (echoing >= self._least_overlap)
         frame = self.prepare(echo, usable, self._counted & ~silent)
         return ReadyFrame(samples, echo, replace(features, usable=usable), frame)
