@@ -98,8 +98,8 @@ FAULTS = {
     "tracker in centimetres": _scale(0.1),
     "tracker in inches": _scale(1 / 25.4),
     "tracker frozen": _freeze(0.0),
-    "tracker frozen from halfway": _freeze(0.5),
     "tracker frozen in the middle fifth": _freeze(0.4, 0.6),
+    "tracker without turns": _readings(lambda poses, rng: RigidTransform.from_translation(poses.translation)),
     "tracker matrices inverted": _readings(lambda poses, rng: poses.inv()),
     "tracker mount turned by 180 deg about x": _turn_mount(180, "x"),
     "tracker mount turned by 20 deg about y": _turn_mount(20, "y"),
@@ -116,6 +116,5 @@ FAULTS = {
     "orientation random": _readings(lambda rotations, rng: Rotation.random(len(rotations), rng=rng)),
     "orientation spikes of 180 deg": _readings(_flips),
     "orientation constant": _freeze(0.0),
-    "orientation frozen from halfway": _freeze(0.5),
     "orientation heading drift of 5 deg/s": _heading_drift,
 }

@@ -37,6 +37,9 @@ _SLIP = float(np.deg2rad(300.0)), 250.0
 """Rates, rad/s and mm/s, of no scan, from one reading to the next."""
 _STILL = np.sqrt(np.finfo(float).eps)
 """Readings closer than this are the same: noise moves the last digits of any sensor that is read."""
+_LEAST_JITTER = np.array([1e-4, 0.03])
+"""Jitter of turns, rad, and places, mm, that is a tracker's noise: a stage has none, an exactly measured hand
+2e-4 and 0.015 at 50 Hz by its tremor, trackers 0.1 mm and more."""
 TURN_S = 0.3
 """A hand's wobble turns round within this time; over longer ones a gyroscope's bias counts."""
 WALK_DEG, SCALE_ERROR = 0.03, 0.05
@@ -64,7 +67,10 @@ def examine_sensors(
     for sensor in (sweep.tracker, sweep.orientation):
         if sensor is not None:
             place, turn = jitter(rigid(sensor.readings.world_from_sensor), np.zeros(3))
-            odd = (*_doubt_still(sensor, sweep, image), *_doubt_jitter(sensor.label, place, turn))
+            odd = (
+                *_doubt_still(sensor, sweep, image, (turn, place)),
+                *_doubt_jitter(sensor.label, place, turn),
+            )
             if not odd and isinstance(sensor, OrientationSensor):
                 odd = (*doubts_of_gyroscope(sensor, turn), *doubts_of_gravity(sensor))
             doubts += odd
@@ -128,10 +134,22 @@ def _doubt_jumps(sensor: OrientationSensor | Tracker, frame_time_s: FloatArray) 
         yield Doubt(sensor.label, "slip, or readings lost and found elsewhere", evidence, False, where)
 
 
-def _doubt_still(sensor: OrientationSensor | Tracker, sweep: Sweep, image: RigidTransform) -> Iterator[Doubt]:
-    """Doubt identical readings while the images move."""
+def _doubt_still(
+    sensor: OrientationSensor | Tracker, sweep: Sweep, image: RigidTransform, noise: tuple[float, float]
+) -> Iterator[Doubt]:
+    """Doubt readings, or the turns or places of a tracker, that stay identical while the images move.
+
+    Parameters
+    ----------
+    noise : (float, float)
+        Jitter of turns, rad, and places, mm: turns or places that never change beside others that jitter are
+        not measured. Those of a stage do not jitter.
+    """
     poses, read_s = rigid(sensor.readings.world_from_sensor), sensor.readings.time_s
-    still = (_steps(poses[:-1], poses[1:]) < _STILL).all(axis=0)
+    parts = _steps(poses[:-1], poses[1:]) < _STILL
+    stuck = parts.all(axis=1) & (np.array(noise) > _LEAST_JITTER)[::-1] & isinstance(sensor, Tracker)
+    still = parts.all(axis=0) | stuck.any()
+    what = "turn" if stuck[0] else "place" if stuck[1] else "one"
     runs = [(read_s[first], read_s[last + 1]) for first, last in runs_of(np.flatnonzero(still))]
     begin, end = max(runs, key=np.ptp, default=(0.0, -1.0))
     time_s = sweep.frame_time_s - sensor.time_offset_s
@@ -144,7 +162,7 @@ def _doubt_still(sensor: OrientationSensor | Tracker, sweep: Sweep, image: Rigid
     # Loggers repeat a reading until the next: it is as old as one that interpolation still bridges.
     bridged_s = sensor.readings.max_gap_s
     if travel_mm > LEAST_TRAVEL_MM and same_s > bridged_s:
-        evidence = f"expected readings that change, got the same one for {same_s:.2f} of {whole_s:.2f} s"
+        evidence = f"expected readings that change, got the same {what} for {same_s:.2f} of {whole_s:.2f} s"
         where = runs_of(np.flatnonzero(during))
         most_s = max(MOST_STILL * whole_s, REFUTED * bridged_s)
         yield Doubt(sensor.label, "frozen", evidence, same_s > most_s, where)

@@ -15,8 +15,8 @@ from speckle3d.motion.sensors import settle_direction
 
 AGAINST_THEMSELVES = {
     "tracker frozen": "frozen",
-    "tracker frozen from halfway": "frozen",
     "tracker frozen in the middle fifth": "frozen",
+    "tracker without turns": "frozen",
     "tracker spikes of 30 mm": "spikes",
     "tracker noise of 3 mm": "noise",
     "tracker random": "scrambled",
@@ -27,7 +27,6 @@ AGAINST_THEMSELVES = {
     "orientation random": "scrambled",
     "orientation spikes of 180 deg": "spikes",
     "orientation constant": "frozen",
-    "orientation frozen from halfway": "frozen",
     "orientation heading drift of 5 deg/s": "drift",
 }
 """Faults of `tests/faults.py` in which a sensor contradicts itself, and a word for each."""
@@ -42,7 +41,7 @@ BESIDE_THE_IMAGES = {
 }
 """Faults that only the images contradict: both numbers are told."""
 REFUTES = (
-    *("tracker frozen", "tracker frozen from halfway", "tracker random", "orientation stored xyzw"),
+    *("tracker frozen", "tracker without turns", "tracker random", "orientation stored xyzw"),
     *("orientation inverted", "orientation random", "orientation mirrored"),
 )
 """Faults that leave nothing of a sensor to rely on."""
