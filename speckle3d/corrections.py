@@ -8,12 +8,12 @@ from contextlib import suppress
 from speckle3d.config import Config
 from speckle3d.core.errors import MismatchError, naming
 from speckle3d.core.reconstruction import SharedErrors
-from speckle3d.core.sweep import OrientationSensor, Sweep, Tracker
+from speckle3d.core.sweep import Sweep
 from speckle3d.correction.crossing.pair import CrossedPair
 from speckle3d.correction.drift import DriftCorrection
-from speckle3d.correction.fused import fuse
+from speckle3d.correction.fused import FusionProblem, fuse
 from speckle3d.correction.modes import CUBIC_MODES, correct_mode, require_modes, sensor_of
-from speckle3d.correction.scale import ScaledPoses, ScaleEvidence
+from speckle3d.correction.scale import ScaledPoses
 from speckle3d.examine.sensors import credible_sensors, repair_readings, require_credible
 from speckle3d.motion.uncertainty import shared_covariance
 from speckle3d.tracked import Tracked
@@ -81,14 +81,8 @@ def correct(
             require_credible(tracked.doubts, sensor_of(sweep, mode), f"{sweep.name}: drift mode {mode}")
     if settings.sensors.examine:
         sweep, _ = repair_readings(sweep)
-
-    def fused(
-        orientation: OrientationSensor | None, tracker: Tracker | None, evidence: ScaleEvidence | None = None
-    ) -> ScaledPoses:
-        share, centre_mm = float(tracked.coherence.share.mean()), sweep.grid.centre_mm
-        images = tracked.edges, tracked.image, share, tracked.shared, centre_mm, sweep.frame_time_s
-        return fuse(*images, orientation, tracker, evidence, settings.fused)
-
+    share, centre_mm = float(tracked.coherence.share.mean()), sweep.grid.centre_mm
+    images = tracked.edges, tracked.image, share, tracked.shared, centre_mm, sweep.frame_time_s
     corrections: dict[str, Correction] = {}
     for mode in modes:
         if mode in CUBIC_MODES:
@@ -96,11 +90,13 @@ def correct(
             start = tracked.subset if tracked.subset is not None else tracked.image
             # Turns are the sensor's, and what the images' move the path by is no error of it.
             turns = SharedErrors(0.0, 0.0, tracked.shared.turn_sigma_per_mm)
-            places = tracked.covariance - shared_covariance(tracked.image, sweep.grid.centre_mm, turns)
+            places = tracked.covariance - shared_covariance(tracked.image, centre_mm, turns)
             wander_mm = 0.0
             if mode == "pose":  # whose curves follow the tracker's slow errors: beside the images they show
                 with suppress(MismatchError):
-                    wander_mm = fused(None, sweep.tracker).details.get("tracker wander", 0.0)
+                    problem = FusionProblem.of(*images, tracker=sweep.tracker, settings=settings.fused)
+                    sizes_mm = [float(sensor.wander.max()) for sensor in problem.solve()[2].sensors]
+                    wander_mm = max(sizes_mm, default=0.0)
             corrections[mode] = correct_mode(
                 mode, start, sweep, settings.drift, places, settings.fused, wander_mm
             )
@@ -110,5 +106,7 @@ def correct(
             evidence = None if crossed is None else crossed.of(sweep.frame_time_s, sweep.name).evidence
             credible = credible_sensors(sweep, tracked.doubts)
             with naming(f"{sweep.name}: drift mode fused"):
-                corrections[mode] = fused(credible.orientation, credible.tracker, evidence)
+                corrections[mode] = fuse(
+                    *images, credible.orientation, credible.tracker, evidence, settings.fused
+                )
     return corrections

@@ -46,6 +46,36 @@ class FusionProblem:
     sensors: tuple[SensorReadings, ...]
     evidence: ScaleEvidence | None
 
+    @classmethod
+    def of(
+        cls,
+        edges: RelativePoses,
+        image: RigidTransform,
+        share: float,
+        shared: SharedErrors,
+        centre_mm: FloatArray,
+        frame_time_s: FloatArray,
+        orientation: OrientationSensor | None = None,
+        tracker: Tracker | None = None,
+        evidence: ScaleEvidence | None = None,
+        settings: FusedSettings | None = None,
+    ) -> FusionProblem:
+        """The problem of `fuse`, whose parameters and errors these are."""
+        centre = RigidTransform.from_translation(centre_mm)
+        start = centre.inv() * (image[0].inv() * image) * centre
+        path = ImagePath.of(edges, start, share, shared, frame_time_s)
+        frames = start.as_matrix(), centre_mm, frame_time_s, settings or FusedSettings()
+        readings = [SensorReadings.of(sensor, *frames) for sensor in (tracker, orientation)]
+        sensors = tuple(sensor for sensor in readings if sensor is not None)
+        for sensor in sensors:
+            ratio = sensor.travel_ratio(frames[0]) if sensor.places else 1.0
+            if not 1.0 / FARTHEST < ratio < FARTHEST:
+                raise MismatchError(
+                    f"expected a tracker that travels as far as the images, within a factor of {FARTHEST:g}, "
+                    f"got {ratio:.3g} times as far: compare modes image and pose"
+                )
+        return cls(path, sensors, evidence)
+
     @property
     def columns(self) -> list[slice]:
         """Slices of the unknowns of the path and of each sensor."""
@@ -144,22 +174,10 @@ def fuse(
         In the world of the tracker, or else of the orientation sensor with its origin at the first frame's
         image origin, or else of the first frame.
     """
-    settings = settings or FusedSettings()
-    centre = RigidTransform.from_translation(centre_mm)
-    start = centre.inv() * (image[0].inv() * image) * centre
-    path = ImagePath.of(edges, start, share, shared, frame_time_s)
-    frames = start.as_matrix(), centre_mm, frame_time_s, settings
-    readings = [SensorReadings.of(sensor, *frames) for sensor in (tracker, orientation)]
-    sensors = tuple(sensor for sensor in readings if sensor is not None)
-    for sensor in sensors:
-        ratio = sensor.travel_ratio(frames[0]) if sensor.places else 1.0
-        if not 1.0 / FARTHEST < ratio < FARTHEST:
-            raise MismatchError(
-                f"expected a tracker that travels as far as the images, within a factor of {FARTHEST:g}, got "
-                f"{ratio:.3g} times as far: compare modes image and pose"
-            )
-    problem = FusionProblem(path, sensors, evidence)
+    images = edges, image, share, shared, centre_mm, frame_time_s
+    problem = FusionProblem.of(*images, orientation, tracker, evidence, settings)
     unknowns, uncertainty, problem = problem.solve()
+    path, sensors, centre = problem.path, problem.sensors, RigidTransform.from_translation(centre_mm)
     on_path = problem.columns[0]
     coefficients = unknowns[on_path]
     poses = path.chain.poses(coefficients)
@@ -177,6 +195,5 @@ def fuse(
         length_sigma=length_sigma(from_first, covariance, centre_mm),
         rests_on=("images", *(sensor.name for sensor in sensors), *["crossing"] * (evidence is not None)),
         evidence=evidence,
-        details={f"{s.name} jitter": float(s.jitter[int(s.places)]) for s in problem.sensors}
-        | {f"{s.name} wander": float(s.wander.max()) for s in problem.sensors if s.places},
+        details={f"{s.name} jitter": float(s.jitter[int(s.places)]) for s in sensors},
     )
