@@ -84,11 +84,13 @@ class FusionProblem:
 
     def solve(self) -> tuple[FloatArray, FloatArray, FusionProblem]:
         """Best unknowns by Gauss-Newton with Huber's weights, their covariance, and the sensors' wander."""
-        problem, unknowns = self, np.zeros(self.columns[-1].stop)
+        problem, unknowns, scale = self, np.zeros(self.columns[-1].stop), self.path.scale
         for _ in range(MOST_ROUNDS):
             matrix, gradient = problem.normal_equations(unknowns)
             covariance = np.asarray(cho_solve(cho_factor(matrix), np.eye(unknowns.size)))
             step = covariance @ gradient
+            # Readings far off may pull the length through zero: a step takes half of it at most.
+            step *= min(1.0, (1.0 + unknowns[scale]) / 2.0 / max(step[scale], np.finfo(float).tiny))
             unknowns = unknowns - step
             if gradient @ step < LEAST_GAIN:
                 break

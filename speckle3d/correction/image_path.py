@@ -104,11 +104,16 @@ class ImagePath:
 
     def prior(self, coefficients: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Coefficients over their deviations, and derivatives; of the scale's rate the logarithm counts."""
-        sigma, value, scale = self.sigma.ravel(), coefficients.copy(), Z * self.sigma.shape[1]
+        sigma, value, scale = self.sigma.ravel(), coefficients.copy(), self.scale
         slope = 1.0 / sigma
         value[scale] = np.log1p(coefficients[scale])
         slope[scale] /= 1.0 + coefficients[scale]
         return value / sigma, np.diag(slope)
+
+    @property
+    def scale(self) -> int:
+        """Index of the scale's rate among the coefficients."""
+        return int(Z * self.sigma.shape[1])
 
     @property
     def outward(self) -> FloatArray:
