@@ -82,7 +82,7 @@ def track(
     )
     # What structure leaves open is told by itself.
     doubts += examine_images(matches, motion, motion.claims(error)[1], tissue.unattenuated, flags == 0)
-    doubts += sensor_doubts + disagreements(credible, motion.poses, covariance)
+    doubts += sensor_doubts + disagreements(credible, motion.poses, covariance, settings.fused)
     if sink:
         sink(frame_pairs(motion, subset.used, shared.length_sigma))
     return Tracked(

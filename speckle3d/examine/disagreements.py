@@ -11,6 +11,8 @@ from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import Doubt
 from speckle3d.core.geometry import relative_poses, rigid
 from speckle3d.core.sweep import OrientationSensor, Sweep, Tracker
+from speckle3d.correction.claims import orientation_errors
+from speckle3d.correction.settings import FusedSettings
 from speckle3d.examine.sensors import SMOOTH, jitter
 
 JOINT_CLAIMS = 3.0
@@ -20,13 +22,15 @@ UNIT_FACTOR = 1.5
 """Factor within which a path must be such a multiple: units are farther apart, paths by images nearer."""
 BY_IMAGES = {"image", "consistent-subset", "orientation"}
 """Modes that take their length from the images alone."""
-LEAST_SIGMA_MM, LEAST_SIGMA_RAD = 0.1, 0.013
-"""Errors of place and roll that sensors have beside their jitter: of a mounting off by 1 mm or a third
-of a degree while the probe turns by 5 degrees, and of a heading."""
+LEAST_SIGMA_MM, LEAST_SIGMA_RAD = 0.1, 0.006
+"""Errors of place and roll that sensors have beside jitter and slow errors of inclination and heading: of a
+mounting off by 1 mm while the probe turns by 5 degrees, and a third of a degree."""
 
 
-def disagreements(sweep: Sweep, image: RigidTransform, covariance: FloatArray) -> tuple[Doubt, ...]:
-    """Compare images with each sensor in length, in-plane motion and roll.
+def disagreements(
+    sweep: Sweep, image: RigidTransform, covariance: FloatArray, errors: FusedSettings
+) -> tuple[Doubt, ...]:
+    """Compare images with each sensor in length, in-plane motion, roll and yaw; images tell no tilt well.
 
     Parameters
     ----------
@@ -36,6 +40,8 @@ def disagreements(sweep: Sweep, image: RigidTransform, covariance: FloatArray) -
         Image-based poses, of the sign that was settled.
     covariance : ndarray, shape (n, 6, 6)
         Claimed for them.
+    errors : FusedSettings
+        Slow errors of orientation sensors.
     """
     doubts: list[Doubt] = []
     for sensor in (sweep.tracker, sweep.orientation):
@@ -43,7 +49,7 @@ def disagreements(sweep: Sweep, image: RigidTransform, covariance: FloatArray) -
             continue
         frames = np.flatnonzero(sensor.covers(sweep.frame_time_s))
         if frames.size >= SMOOTH:
-            doubts += _doubt_sensor(sensor, sweep, image[frames], covariance[frames], frames)
+            doubts += _doubt_sensor(sensor, sweep, image[frames], covariance[frames], frames, errors)
     return tuple(doubts)
 
 
@@ -53,20 +59,24 @@ def _doubt_sensor(
     image: RigidTransform,
     covariance: FloatArray,
     frames: IntArray,
+    errors: FusedSettings,
 ) -> Iterator[Doubt]:
     centre, about = sweep.grid.centre_mm, f"images and {sensor.label}"
     poses = rigid(sensor.world_from_image(sweep.frame_time_s[frames]))
     by_images, by_sensor = _motion(image, centre), _motion(poses, centre)
     travel = np.abs(by_images[:, 2])
     unit = unit_of_length(image, sensor, poses) if isinstance(sensor, Tracker) else ""
-    noise = jitter(poses, centre)
-    for axis, name in (2, "length"), (0, "x"), (1, "y"), (5, "roll"):
+    noise, slow = jitter(poses, centre), np.zeros_like(covariance)
+    if isinstance(sensor, OrientationSensor):
+        slow = orientation_errors(poses, centre, sweep.frame_time_s[frames], errors)
+    for axis, name in (2, "length"), (0, "x"), (1, "y"), (5, "roll"), (4, "yaw"):
         if axis < 3 and not isinstance(sensor, Tracker):
             continue
         image_sigma = np.sqrt(covariance[:, axis, axis])
         least = LEAST_SIGMA_MM if axis < 3 else LEAST_SIGMA_RAD
-        jitter_left = noise[int(axis > 2)] / np.sqrt(SMOOTH)
-        sensor_sigma = np.full_like(image_sigma, np.hypot(jitter_left, least))
+        # Of the difference of two medians.
+        jitter_left = noise[int(axis > 2)] * np.sqrt(np.pi / SMOOTH)
+        sensor_sigma = np.sqrt(jitter_left**2 + least**2 + slow[:, axis, axis])
         size = np.abs(by_images[:, axis] - by_sensor[:, axis]) / np.hypot(image_sigma, sensor_sigma)
         worst = int(np.argmax(travel if axis == 2 else size))
         if size[worst] > JOINT_CLAIMS or (unit and axis == 2):
