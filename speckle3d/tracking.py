@@ -94,7 +94,7 @@ def curves_beside(sweep_file: Path) -> Path:
     if not path.is_file():
         raise InvalidInputError(
             f"expected decorrelation curves: --curves CURVES.h5 or {path}, got neither "
-            "(speckle3d calibrate curves makes them from a phantom sweep)"
+            "(speckle3d calibrate curves makes them from a phantom sweep or, with --probe, a data sheet)"
         )
     return path
 

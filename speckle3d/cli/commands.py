@@ -289,7 +289,7 @@ class PlainCommand(TyperCommand):
         """Print examples, and how many options are not shown."""
         formatter.write("".join(["\nExample:\n", *(f"  {line}\n" for line in self.words.examples)]))
         if count := sum(param.hidden for param in self.params):  # type: ignore[attr-defined]
-            formatter.write(f"\n{count} other options: {ctx.command_path} --help-all\n")
+            formatter.write(f"\nOther options ({count}): {ctx.command_path} --help-all\n")
 
 
 def _output_last(args: list[str]) -> list[str]:

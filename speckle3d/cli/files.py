@@ -83,7 +83,7 @@ def convert(
     calibration
     mode
         Which poses of a reconstruction (by default those that claim the smallest error of length).
-    sampling_rate_hz, vector_pitch_mm, plus_config
+    column_pitch_mm, row_spacing_mm, frame_rate_hz, plus_config
 
     Other Parameters
     ----------------

@@ -57,7 +57,10 @@ def require_own_place(out: Path, kind: str, *inputs: Path) -> None:
     from speckle3d.io.voxels.volumes import SUFFIXES as VOLUMES
 
     target, kinds = require_target(out), kind.split()
-    suffixes = {"picture": (".png",), "surface": SURFACES, "volume": VOLUMES, "labels": (LABELS_ALONE,)}
+    suffixes = {
+        "picture": (".png",), "surface": SURFACES, "volume": VOLUMES, "labels": (LABELS_ALONE,),
+        "simulation": (".h5", ".hdf5"),
+    }  # fmt: skip
     if endings := [suffix for name in kinds for suffix in suffixes.get(name, ())]:
         require_suffix(out, endings)
     targets = [target]

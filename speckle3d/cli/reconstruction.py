@@ -217,6 +217,9 @@ def _tell(result: s3.JobResult) -> None:
         note(f"compared over the {100 * result.summary.coverage:.0f} % of frames that have a reference")
     share = details["rejected_patch_share"]
     if share == share:
-        note(f"{100 * share:.0f} % of patches contradict the sensed orientation and were left out")
+        note(
+            f"{100 * share:.0f} % of patches contradict the sensed orientation: "
+            "orientation, pose and consistent-subset leave them out"
+        )
     if (sign := _SIGNS.get(details["direction_from"])) is not None:
         note(f"the sign of the elevational motion is {sign}")

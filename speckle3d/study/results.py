@@ -206,7 +206,7 @@ def summary_text(summaries: Sequence[Summary], failures: Sequence[str] = ()) -> 
     records = [record for summary in summaries for record in summary.records()]
     names = dict.fromkeys(summary.reference for summary in summaries)
     lines = [
-        "part: f forward, r back; +- 95 %: of the length, mm, as the mode claims it, of tracker by its jitter"
+        "part: f forward, r back, all; +- 95 %: of length in mm, as the mode claims, of tracker by its jitter"
     ]
     if set(names) - {"none"}:
         lines.append(f"reference: {', '.join(names)}; errors are estimate minus reference")
