@@ -16,7 +16,7 @@ from speckle3d.correction.settings import FusedSettings
 from speckle3d.examine.sensors import SMOOTH, jitter
 
 JOINT_CLAIMS = 3.0
-"""Joint standard deviations beyond which two numbers disagree (DESIGN, Disagreement)."""
+"""Joint standard deviations beyond which two numbers disagree."""
 UNITS = {1000.0: "metres", 100.0: "decimetres", 25.4: "inches", 10.0: "centimetres"}
 UNIT_FACTOR = 1.5
 """Factor within which a path must be such a multiple: units are farther apart, paths by images nearer."""
