@@ -73,7 +73,7 @@ def track(
 
     mismatch = motion.problem.curves.mismatch(settings.curves.same_probe, tissue.attenuation.log_length_sigma)
     averaging = averaging_loss(matches.table.where(matches.sound), matches.features)
-    grey = grey_error(sweep.signal, matches.texture) if curves.origin == "data sheet" else 0.0
+    grey = grey_error(matcher.signal, matches.texture) if curves.origin == "data sheet" else 0.0
     error = float(np.linalg.norm([mismatch, averaging, grey]))
     shared, covariance = motion.claims(float(np.hypot(error, tissue.structure)))
 
