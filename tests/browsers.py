@@ -81,7 +81,7 @@ def open_page(browser, address):
     """A page with what it complained of and asked for in `complaints` and `requests`."""
     page = browser.new_page(viewport={"width": 1366, "height": 768})
     # Where no kernel has been compiled yet, that comes first.
-    page.set_default_timeout(120_000)
+    page.set_default_timeout(300_000)
     page.complaints, page.requests = [], []
     page.on(
         "console", lambda m: page.complaints.append(f"{m.text} {m.location}") if m.type == "error" else None
