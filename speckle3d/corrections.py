@@ -106,7 +106,8 @@ def correct(
             evidence = None if crossed is None else crossed.of(sweep.frame_time_s, sweep.name).evidence
             credible = credible_sensors(sweep, tracked.doubts)
             with naming(f"{sweep.name}: drift mode fused"):
-                corrections[mode] = fuse(
+                problem = FusionProblem.of(
                     *images, credible.orientation, credible.tracker, evidence, settings.fused
                 )
+                corrections[mode] = fuse(problem, centre_mm)
     return corrections

@@ -60,7 +60,33 @@ class FusionProblem:
         evidence: ScaleEvidence | None = None,
         settings: FusedSettings | None = None,
     ) -> FusionProblem:
-        """The problem of `fuse`, whose parameters and errors these are."""
+        """Set up the problem.
+
+        Parameters
+        ----------
+        edges : RelativePoses
+            Frame pairs, with covariances as if pairs were independent of each other.
+        image : RigidTransform, length n
+            Image-based poses that were solved from `edges`.
+        share : float
+            Mean share of echoes that stay from frame to frame.
+        shared : SharedErrors
+            What all distances have wrong together.
+        centre_mm : ndarray, shape (3,)
+            The image's centre.
+        frame_time_s : ndarray, shape (n,)
+        orientation : OrientationSensor, optional
+        tracker : Tracker, optional
+            Sensors without a mounting, or with too few readings over the frames, are left out.
+        evidence : ScaleEvidence, optional
+            What a crossing sweep says of the scale.
+        settings : FusedSettings, optional
+
+        Raises
+        ------
+        MismatchError
+            If images and tracker differ in length by more than a factor of two.
+        """
         centre = RigidTransform.from_translation(centre_mm)
         start = centre.inv() * (image[0].inv() * image) * centre
         path = ImagePath.of(edges, start, share, shared, frame_time_s)
@@ -131,44 +157,14 @@ class FusionProblem:
                 yield joint, residual, slope, True
 
 
-def fuse(
-    edges: RelativePoses,
-    image: RigidTransform,
-    share: float,
-    shared: SharedErrors,
-    centre_mm: FloatArray,
-    frame_time_s: FloatArray,
-    orientation: OrientationSensor | None = None,
-    tracker: Tracker | None = None,
-    evidence: ScaleEvidence | None = None,
-    settings: FusedSettings | None = None,
-) -> ScaledPoses:
+def fuse(problem: FusionProblem, centre_mm: FloatArray) -> ScaledPoses:
     """Estimate poses from images, sensors and crossing sweep together.
 
     Parameters
     ----------
-    edges : RelativePoses
-        Frame pairs, with covariances as if pairs were independent of each other.
-    image : RigidTransform, length n
-        Image-based poses that were solved from `edges`.
-    share : float
-        Mean share of echoes that stay from frame to frame.
-    shared : SharedErrors
-        What all distances have wrong together.
+    problem : FusionProblem
     centre_mm : ndarray, shape (3,)
         The image's centre.
-    frame_time_s : ndarray, shape (n,)
-    orientation : OrientationSensor, optional
-    tracker : Tracker, optional
-        Sensors without a mounting, or with too few readings over the frames, are left out.
-    evidence : ScaleEvidence, optional
-        What a crossing sweep says of the scale.
-    settings : FusedSettings, optional
-
-    Raises
-    ------
-    MismatchError
-        If images and tracker differ in length by more than a factor of two.
 
     Returns
     -------
@@ -176,10 +172,9 @@ def fuse(
         In the world of the tracker, or else of the orientation sensor with its origin at the first frame's
         image origin, or else of the first frame.
     """
-    images = edges, image, share, shared, centre_mm, frame_time_s
-    problem = FusionProblem.of(*images, orientation, tracker, evidence, settings)
     unknowns, uncertainty, problem = problem.solve()
-    path, sensors, centre = problem.path, problem.sensors, RigidTransform.from_translation(centre_mm)
+    path, sensors, evidence = problem.path, problem.sensors, problem.evidence
+    centre = RigidTransform.from_translation(centre_mm)
     on_path = problem.columns[0]
     coefficients = unknowns[on_path]
     poses = path.chain.poses(coefficients)
@@ -195,7 +190,11 @@ def fuse(
         covariance=covariance,
         log_scale=float(np.log1p(path.mean_rates()[0] @ coefficients)),
         length_sigma=length_sigma(from_first, covariance, centre_mm),
-        rests_on=("images", *(sensor.name for sensor in sensors), *["crossing"] * (evidence is not None)),
+        rests_on=(
+            "images",
+            *(sensor.name for sensor in sensors),
+            *["crossing"] * (evidence is not None),
+        ),
         evidence=evidence,
         details={f"{s.name} jitter": float(s.jitter[int(s.places)]) for s in sensors},
     )
