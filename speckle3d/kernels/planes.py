@@ -134,6 +134,9 @@ def fit_planes(
                 fitted.cost[e] = cost
                 for k in range(3):
                     fitted.coefficients[e, k] = plane[k]
+            # As good as noise alone leaves it: no other plane is asked for.
+            if not rules.sensed and misfit <= size - 3:
+                break
         information = fitted.information[e]
         for k in range(3):
             for j in range(3):
