@@ -14,6 +14,7 @@ What a patch says of s is therefore its likelihood averaged over all shares and 
 for all patches together: no patch is judged to hold structure or not.
 """
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -136,13 +137,18 @@ class _Binning:
         amplitude = map_coordinates(self.amplitude, [row, position], order=1, mode="nearest")
         speckle = np.maximum(amplitude, 1e-6)
         structure = np.exp(powers[:, None, None] * np.log(speckle))
-        # The squared echo is a sum of three terms, whatever the share.
-        squares = np.broadcast_arrays(speckle**2, 2.0 * speckle * structure, structure**2)
-        terms = np.stack(squares, axis=2)
-        parts = np.stack([(1.0 - share) ** 2, share * (1.0 - share), share**2])
-        weighted = terms * self.weight[:, None] ** 2
-        product = (weighted @ self.mean[:, :, None])[..., 0] @ parts
-        square = np.tensordot(weighted @ terms.swapaxes(2, 3), parts[:, None] * parts, 2)
+
+        def moment(order: int, weight: FloatArray) -> FloatArray:
+            """Weighted sum over bins of a power of (1 - c) r + c r^a, by its binomial, shape (a, q, c)."""
+            sums, term = [], np.ones_like(structure)
+            for k in range(order + 1):
+                of_bins = math.comb(order, k) * weight * speckle ** (order - k)
+                sums.append(np.einsum("qb,aqb->aq", of_bins, term))
+                term = term * structure
+            part = np.arange(order + 1)[:, None]
+            return np.asarray(np.stack(sums, axis=2) @ ((1.0 - share) ** (order - part) * share**part))
+
+        product, square = moment(2, self.weight**2 * self.mean), moment(4, self.weight**2)
         # Without an echo there is nothing that noise could have taken.
         tiny = np.finfo(float).tiny
         gain = (np.maximum(product, LEAST_CORRELATION * square) + tiny) / (square + tiny)
