@@ -94,10 +94,8 @@ def rows_without_tilt(motion: Motion) -> RowScales | None:
     rows, problem = motion.coherence.rows, motion.problem
     if rows is None:
         return None
-    steps = np.diff(motion.path, axis=0)
-    tilt_per_mm = float(steps[:, 2] @ steps[:, 0]) / max(float(steps[:, 0] @ steps[:, 0]), 1e-12)
     lever = np.median(problem.patches.rows_of(problem.levers.lever_mm), axis=-1)
-    by_tilt = np.log(np.maximum(np.abs(1.0 + tilt_per_mm * lever), 1e-3))
+    by_tilt = np.log(np.maximum(np.abs(1.0 + motion.turn_per_mm[1] * lever), 1e-3))
     return replace(rows, logarithm=rows.logarithm + by_tilt - np.median(by_tilt))
 
 

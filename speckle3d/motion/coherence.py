@@ -164,9 +164,7 @@ def _bin_correlations(
     travel = np.append(0.0, np.cumsum(np.abs(np.diff(path[:, 0]))))
     pieces = max(1, int(travel[-1] / PIECE_MM))
     ends = np.searchsorted(travel, np.linspace(0, travel[-1], pieces + 1))
-    motion = np.zeros((first.size, 3))
-    motion[:, : path.shape[1]] = path[second] - path[first]
-    z, yaw, tilt = motion.T[:, :, None]
+    z, yaw, tilt = (path[second] - path[first]).T[:, :, None]
     along = z + yaw * levers.lateral_mm + tilt * levers.lever_mm
     distance = np.hypot(along, tilt * levers.spread_mm)
     usable = np.isfinite(correlation) & (distance <= grid[-1])
@@ -204,8 +202,8 @@ def estimate_coherence(problem: MotionProblem, table: CorrelationTable, path: Fl
 
     Parameters
     ----------
-    path : ndarray, shape (n, 2) or (n, 3)
-        Elevational position of each frame's centre, and its slopes along x and, if known, y.
+    path : ndarray, shape (n, 3)
+        Elevational position of each frame's centre, and its slopes along x and y.
     """
     binning, centres = _bin_correlations(problem, table, path)
     patches = problem.patches

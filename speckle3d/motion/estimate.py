@@ -71,6 +71,12 @@ class Motion:
         """Elevational position of the image's centre and its slopes along x and y, shape (n, 3)."""
         return elevation_of(self.poses, self.problem.centre_mm)
 
+    @property
+    def turn_per_mm(self) -> FloatArray:
+        """Mean slopes along x and y per distance, shape (2,), rad/mm."""
+        z, *slopes = np.diff(self.path, axis=0).T
+        return np.asarray(np.stack(slopes) @ z / max(z @ z, 1e-12))
+
     def claims(self, curves_sigma: float) -> tuple[SharedErrors, FloatArray]:
         """Errors that all frames share, and the covariance of every pose; see `claimed_covariance`.
 
@@ -79,18 +85,24 @@ class Motion:
         curves_sigma : float
             Relative standard deviation of all distances by the curves' mismatch with probe and tissue.
         """
-        scale_sigma = float(np.hypot(self.coherence.scale_sigma, self.slopes.length_sigma))
-        shared = SharedErrors(scale_sigma, curves_sigma, self.slopes.deviation_per_mm)
-        structure = float(self.coherence.share.mean())
-        return shared, claimed_covariance(
-            self.poses, self.covariance, self.problem.centre_mm, shared, structure
-        )
+        coherence, slopes, problem = self.coherence, self.slopes, self.problem
+        # Without a response to tilt the focus may be anywhere in the image. A turn about another depth than
+        # is taken moves the image's centre along.
+        focus_sigma_mm = 0.0 if problem.curves.tilt else np.std(problem.patches.depth_mm)
+        by_focus = focus_sigma_mm * np.hypot(self.turn_per_mm, slopes.deviation_per_mm)
+        scale_sigma = np.linalg.norm([coherence.scale_sigma, slopes.length_sigma, by_focus[1]])
+        # The foci of a fan lie on an arc of another radius, by which it is seen.
+        by_focus *= np.std(np.sin(problem.patches.angle_rad)) / problem.width_mm
+        turn_sigma = np.hypot(slopes.deviation_per_mm, by_focus)
+        shared = SharedErrors(float(scale_sigma), curves_sigma, turn_sigma)
+        structure = float(coherence.share.mean())
+        return shared, claimed_covariance(self.poses, self.covariance, problem.centre_mm, shared, structure)
 
     def mirrored(self) -> Motion:
         """The motion with the opposite elevational sign."""
         return replace(
             self,
-            pairs=self.pairs.signed(-np.ones(len(self.pairs))),
+            pairs=self.pairs.signed(np.array([-1.0])),
             edges=self.edges.mirrored(),
             poses=mirrored(self.poses),
             covariance=MIRROR @ self.covariance @ MIRROR,
@@ -128,15 +140,22 @@ def _alternate(problem: MotionProblem, table: CorrelationTable) -> Motion:
     are repeated `ROUNDS` times.
     """
     rows = alike_pairs(problem, table, table.median)
-    _, path = _signed_planes(problem, table, rows, fully_developed(table.correlation.shape[1]))
+    first, is_fan = problem, problem.patches.step_rad > 0
+    if is_fan:
+        # Its columns show a turn, which patches' gains would take for their own.
+        first = replace(problem, curves=replace(problem.curves, tilt=None))
+    pairs, path = _signed_planes(first, table, rows, fully_developed(table.correlation.shape[1]))
+    path = path @ np.eye(2, 3)
+    if is_fan:
+        path = elevation_of(solve_planes(first, table, pairs)[1].poses, problem.centre_mm)
     coherence = estimate_coherence(problem, table, path)
     for _ in range(ROUNDS):
         apart_mm = coherence.scale * np.abs(path[table.second, 0] - path[table.first, 0])
         rows = alike_pairs(problem, table, problem.typical_correlation(apart_mm))
         pairs, _ = _signed_planes(problem, table, rows, coherence.models(table.first[rows]))
         slopes = weigh_slopes(pairs, coherence.false_turn, problem.planes, path)
-        _, trajectory = solve_planes(problem, table, slopes.applied(pairs))
-        path = elevation_of(trajectory.poses, problem.centre_mm)
+        poses = solve_planes(problem, table, slopes.applied(pairs))[1].poses
+        path = elevation_of(poses, problem.centre_mm)
         coherence = estimate_coherence(problem, table, path)
     slopes = weigh_slopes(pairs, coherence.false_turn, problem.planes, path)
     pairs = pairs.scaled(coherence.scale)

@@ -20,7 +20,7 @@ import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
 
 from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
-from speckle3d.core.curves import DecorrelationCurves
+from speckle3d.core.curves import DecorrelationCurves, TiltResponse
 from speckle3d.core.errors import DECISIVE
 from speckle3d.core.threads import in_parallel
 from speckle3d.kernels.plane_misfit import EchoModels, FitRules, Levers
@@ -108,15 +108,20 @@ class MotionProblem:
     @cached_property
     def levers(self) -> Levers:
         """Lever arms of the slopes at each patch."""
-        tilt = self.curves.at(self.patches.depth_mm).tilt
+        depth, angle = self.patches.depth_mm, self.patches.angle_rad
+        sine, cosine = np.sin(angle), np.cos(angle)
         (x, y) = (self.patches.centre_mm - self.centre_mm[:2]).T
+        tilt = self.curves.at(depth).tilt
         if tilt is None:
-            # Unknown, it is taken to turn about the focus, and the focus to be at the image's centre: all
-            # depths then see the centre's distance.
-            return Levers(np.ascontiguousarray(x), np.zeros(x.size), np.zeros(x.size))
+            # Unknown, it is taken to turn about the focus, and the focus to be as deep as the image's centre.
+            tilt = TiltResponse(depth - (depth - y)[cosine.argmax()], 0.0 * depth)
         # A vector of a fan turns about a point on itself, and by the part of the turn that is across it.
-        sine, cosine = np.sin(self.patches.angle_rad), np.cos(self.patches.angle_rad)
         return Levers(x - sine * tilt.pivot_mm, y - cosine * tilt.pivot_mm, cosine * tilt.spread_mm)
+
+    @property
+    def width_mm(self) -> float:
+        """Standard deviation of the lever arms of the slope along x."""
+        return max(float(np.std(self.levers.lateral_mm)), 1e-6)
 
     @cached_property
     def end_amplitude(self) -> FloatArray:
@@ -246,7 +251,6 @@ def pair_planes(
     settings = problem.planes
     slope_sd = SENSED_SLOPE if from_sensor else HAND_SLOPE
     rules = FitRules(from_sensor, slope_sd, 3.0 * HAND_SLOPE, settings.huber, OUTLYING, 2.0 * DECISIVE)
-    shift = _lever_shift(problem, table.inplane[rows, :2])
     fits = FittedPlanes(
         np.full((rows.size, 3), np.nan), np.tile(np.eye(3), (rows.size, 1, 1)), np.zeros(rows.size)
     )
@@ -256,7 +260,7 @@ def pair_planes(
         fit_planes(
             correlation[block],
             members[block],
-            shift[block],
+            table.inplane[rows[block], :2],
             EchoModels(*(values[block] if len(values) > 1 else values for values in models)),
             problem.levers,
             problem.at_patches,
@@ -280,21 +284,9 @@ def pair_planes(
     determined = (np.abs(coefficients[:, 0]) <= reach) & (covariance[:, 0, 0] <= reach**2)
     if not from_sensor:
         coefficients *= np.where(coefficients[:, :1] < 0, -1.0, 1.0)
-    planes = PairPlanes(
-        rows,
-        table.first[rows],
-        table.second[rows],
-        coefficients,
-        covariance,
-        members,
-        uneven_mm / max(float(np.std(problem.levers.lateral_mm)), 1e-6),
-    )
-    return planes, determined
-
-
-def _lever_shift(problem: MotionProblem, shift_mm: FloatArray) -> FloatArray:
-    """Shift of the patches' lateral positions and levers by in-plane motion, shape (e, 2)."""
-    return shift_mm * [1.0, float(problem.curves.tilt is not None)]
+    frames = table.first[rows], table.second[rows]
+    feigned_yaw = uneven_mm / problem.width_mm
+    return PairPlanes(rows, *frames, coefficients, covariance, members, feigned_yaw), determined
 
 
 def raised(problem: MotionProblem, shift_mm: FloatArray, slopes: FloatArray) -> FloatArray:
@@ -307,8 +299,8 @@ def raised(problem: MotionProblem, shift_mm: FloatArray, slopes: FloatArray) -> 
     slopes : ndarray, shape (e, 2)
         b and c.
     """
-    shift = (slopes * _lever_shift(problem, shift_mm)).sum(axis=1, keepdims=True)
-    return np.asarray(slopes @ np.stack([problem.levers.lateral_mm, problem.levers.lever_mm]) - shift)
+    arms = np.stack([problem.levers.lateral_mm, problem.levers.lever_mm])
+    return np.asarray(slopes @ arms - (slopes * shift_mm).sum(axis=1, keepdims=True))
 
 
 def patch_distances(

@@ -142,8 +142,8 @@ def weigh_slopes(
     path : ndarray, shape (n, 2) or (n, 3)
         Its first column is each frame's elevational position, mm.
     """
-    squares = np.maximum((planes.offset_mm**2).sum(), 1e-12)
-    mean_slope = (planes.coefficients[:, 1:] * planes.coefficients[:, :1]).sum(axis=0) / squares
+    offset = planes.offset_mm
+    mean_slope = offset @ planes.coefficients[:, 1:] / max(float(offset @ offset), 1e-12)
     way_mm = max(float(np.abs(np.diff(path[:, 0])).sum()), 1e-6)
     steady = way_mm / (way_mm + TURN_CHANGE_MM)
     usual = np.deg2rad(settings.turn_deg_per_mm) ** 2 / steady

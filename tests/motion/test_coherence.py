@@ -74,8 +74,7 @@ def sweep_table(path, share, noise, correlate, seed=0, steps=(1, 2, 3, 4, 6, 9, 
 
 def coherence_of(path, table, correlate="echo"):
     problem = problem_of(phantom_curves(correlate), PATCHES, GRID, len(path))
-    path = np.column_stack([path, np.zeros(len(path))])
-    return estimate_coherence(problem, table, path)
+    return estimate_coherence(problem, table, np.outer(path, [1.0, 0.0, 0.0]))
 
 
 def made_path(frames=90):

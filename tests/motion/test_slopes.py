@@ -41,7 +41,7 @@ def feigned(sigma):
 def rates(planes):
     """Yaw and tilt per distance of some planes."""
     p = planes.coefficients
-    return (p[:, 1:] * p[:, :1]).sum(axis=0) / (p[:, 0] ** 2).sum()
+    return p[:, 0] @ p[:, 1:] / (p[:, 0] @ p[:, 0])
 
 
 def planes_with(offset, slope_x):

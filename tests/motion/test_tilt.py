@@ -106,3 +106,11 @@ def test_a_degree_of_tilt_per_pair_no_longer_lengthens_the_sweep(hand_curves, st
     assert abs(with_sensor) < 0.05
     # Images alone see little of the tilt itself, and the length is better for it all the same.
     assert abs(with_response) < 0.06
+
+
+def test_without_a_response_the_foci_of_a_fan_lie_on_an_arc_at_the_centres_depth():
+    fan = ImageGrid.of_fan(200, 400, 0.1, 60.0, (-0.5, 0.5))
+    patches, arc_mm = lay_patches(fan), 60.0 + fan.depth_mm / 2
+    levers = problem_of(speckle.curves(0.45, CELLS), patches, fan).levers
+    np.testing.assert_allclose(levers.lateral_mm, arc_mm * np.sin(patches.angle_rad), rtol=1e-3)
+    np.testing.assert_allclose(levers.lever_mm, arc_mm * (np.cos(patches.angle_rad) - 1), atol=0.05)

@@ -95,5 +95,5 @@ def _report(curves: s3.DecorrelationCurves) -> Result:
     lines.append(f"lengths read with them on sweeps of a probe like this: {error}")
     if curves.tilt is None:
         why = "the phantom sweeps hardly turned" if curves.pairs_used else "no phantom was turned"
-        note(f"{why}: tilt will be taken to be about the image's centre")
+        note(f"{why}: a deliberate tilt will not be seen; add a sweep that turns to see it")
     return by_depth | tilt | about, "\n".join(lines)
