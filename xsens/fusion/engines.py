@@ -12,9 +12,10 @@ from scipy.spatial.transform import Rotation, Slerp
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.kernels.orientation import inclination as kernel
-from speckle3d.kernels.orientation.smoothing import orient_samples, smooth_steps
+from speckle3d.kernels.orientation.smoothing import orient_samples, rotate_rows, smooth_steps, turn_about_up
 from xsens.fusion.heading import STEPS_PER_BIN, UNKNOWN, HeadingFilter, averaged_bins
-from xsens.fusion.readings import BIAS_SD_RAD_S, Estimate, Samples, turn_about_up
+from xsens.fusion.readings import BIAS_SD_RAD_S, Estimate, Samples
+from xsens.logs.samples import median
 
 BLOCK_S = kernel.BLOCK_S
 """Length of the filter's increments."""
@@ -82,10 +83,9 @@ class Filter:
         most = min(m, int(2.0 * samples.step_s.sum() / BLOCK_S) + 2)
         rows, xyzw = np.zeros(most, kernel.STEP), np.empty((m, 4))
         covariance, transition = np.empty((2, most if covariances else 0, kernel.SIZE, kernel.SIZE))
-        readings: Any = map(np.ascontiguousarray, vars(samples).values())
-        state = self._filter, self._unfinished
+        readings = map(np.ascontiguousarray, vars(samples).values())
         run: Any = kernel.run_filter
-        n = run(*readings, to_end, *state, rows, covariance, transition, xyzw)
+        n = run(*readings, to_end, self._filter, self._unfinished, rows, covariance, transition, xyzw)
         return rows[:n], xyzw, covariance[:n], transition[:n]
 
     def run(self, samples: Samples, to_end: bool = False) -> Estimate:
@@ -150,8 +150,7 @@ def _at_samples(
     When in its interval a gyroscope's reading is taken is not known: half of it is claimed as well.
     """
     bias_rad_s = steps["bias"][of_sample]
-    rates = Rotation.from_quat(xyzw).apply(samples.rate_rad_s - bias_rad_s)
-    late_rad = 0.5 * np.median(samples.step_s) * rates
+    late_rad = 0.5 * median(samples.step_s) * rotate_rows(xyzw, samples.rate_rad_s - bias_rad_s)
     _, _, distrust, stray, iron = steps["north"][of_sample].T
     sd_rad = np.sqrt(np.square(sd_rad)[of_sample] + late_rad**2)
     return Estimate(xyzw, sd_rad, bias_rad_s, distrust > 0.0, steps["resting"][of_sample], stray, iron)
@@ -202,7 +201,7 @@ def by_vqf(stretch: Samples, claims: Estimate, offline: bool, magnetic: bool) ->
     rotations = Rotation.from_quat(estimate["quat9D" if magnetic else "quat6D"], scalar_first=True)
     xyzw = Slerp(grid, rotations)(np.minimum(place, grid[-1])).as_quat()
     if magnetic:  # from VQF's world, x east; without a field both engines begin by the shortest turn to up
-        xyzw = turn_about_up(-0.5 * np.pi, xyzw)
+        xyzw = turn_about_up(np.full(len(xyzw), -0.5 * np.pi), xyzw)
     difference = Rotation.from_quat(xyzw) * Rotation.from_quat(claims.xyzw).inv()
     at = np.minimum(np.rint(place).astype(np.int64), len(grid) - 1)
     disturbance = estimate["magDistDetected"][at] if magnetic else np.zeros(len(stretch), dtype=bool)

@@ -34,7 +34,7 @@ from scipy.special import softmax
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.kernels.orientation import heading as kernel
 from speckle3d.kernels.orientation.inclination import BLOCK_S, STEP
-from xsens.logs.samples import finite_rows
+from xsens.logs.samples import finite_rows, median
 
 _FILTERS = 3
 _FIRST, _BESIDE, _IRON = range(_FILTERS)
@@ -171,7 +171,7 @@ class HeadingFilter:
         bins["bias"] = 0.0  # with a smoothed bias, there is no better one to come
         rows, moving = self._run(bins), ~bins["resting"]
         best = self._weights(rows)[1][-1]
-        self._begin(max(np.median(rows["stray"][moving, best]) if moving.any() else 0.0, _STRAY))
+        self._begin(max(median(rows["stray"][moving, best], 0.0), _STRAY))
         arrays = _empty_arrays(_FILTERS, len(bins))
         rows = self._run(bins, arrays)
         weights, best = (values[-1] for values in self._weights(rows))

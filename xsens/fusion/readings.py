@@ -11,7 +11,7 @@ from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from xsens.logs.clocks import SHORTEST_S
 from xsens.logs.contradictions import contradictions
 from xsens.logs.faults import without_faults
-from xsens.logs.samples import ImuLog, finite_rows, row_norms
+from xsens.logs.samples import ImuLog, finite_rows, median, row_norms
 
 BRIDGED_S = 0.1
 """The longest pause that is integrated over: a hand's rate changes little in it (tremor: below 12 Hz)."""
@@ -76,14 +76,6 @@ class Estimate:
     field_iron: FloatArray
 
 
-def turn_about_up(angles_rad: FloatArray | float, xyzw: FloatArray) -> FloatArray:
-    """Quaternions, shape (k, 4), turned about up."""
-    x, y, z, w = xyzw.T
-    turn = np.exp(0.5j * np.asarray(angles_rad))
-    first, last = turn * (x + 1j * y), turn * (w + 1j * z)
-    return np.column_stack([first.real, first.imag, last.imag, last.real])
-
-
 def usable_samples(log: ImuLog) -> tuple[IntArray, Samples, list[str], float]:
     """Prepare a log's readings for the filter.
 
@@ -119,7 +111,7 @@ def usable_samples(log: ImuLog) -> tuple[IntArray, Samples, list[str], float]:
             f"{source}: expected two samples of gyroscope and accelerometer, got {'; '.join(problems)}"
         )
     steps_s = np.diff(log.time_s)
-    if (median_s := np.median(steps_s)) > 1.05 * BRIDGED_S or steps_s.mean() < SHORTEST_S:  # jitter at 10 Hz
+    if (median_s := median(steps_s)) > 1.05 * BRIDGED_S or steps_s.mean() < SHORTEST_S:  # jitter at 10 Hz
         raise InvalidInputError(
             f"{source}: expected samples {SHORTEST_S:g} to {BRIDGED_S:g} s apart, got a median of "
             f"{median_s:.4g} s: times in milliseconds?"
@@ -139,9 +131,9 @@ def usable_samples(log: ImuLog) -> tuple[IntArray, Samples, list[str], float]:
         notes.append("the magnetometer is left out")
     if left_out := (~rows).sum():
         notes.append(f"{left_out} samples without gyroscope or accelerometer left out")
-    time_s, usual_s = log.time_s[rows], np.median(np.diff(log.time_s[rows]))
+    time_s, usual_s = log.time_s[rows], median(np.diff(log.time_s[rows]))
     step_s, lost_rad2 = np.diff(time_s, prepend=time_s[0] - usual_s), np.zeros_like(time_s)
-    means = list[FloatArray]()
+    means = []
     for name, readings, valid in (
         ("gyroscope", rate[rows], turns[rows]),
         ("accelerometer", force[rows], pulls[rows]),
@@ -172,7 +164,8 @@ def _interpolated_means(
 
     A reading tells the last usual step alone; before that it is taken for the mean of the two.
     """
-    readings = np.column_stack([np.interp(time_s, time_s[valid], axis[valid]) for axis in readings.T])
+    if not valid.all():
+        readings = np.column_stack([np.interp(time_s, time_s[valid], axis[valid]) for axis in readings.T])
     late, means = np.flatnonzero((step_s > LOST * usual_s) & (step_s <= PAUSE_S)), readings.copy()
     share = (usual_s / step_s[late])[:, None]
     means[late] = 0.5 * ((1.0 + share) * readings[late] + (1.0 - share) * readings[late - 1])

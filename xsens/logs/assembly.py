@@ -13,11 +13,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from speckle3d.core.arrays import BoolArray, FloatArray
+from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
 from xsens.logs.clocks import Stamps, timeline
 from xsens.logs.faults import without_faults
-from xsens.logs.samples import ImuLog, row_norms
+from xsens.logs.samples import ImuLog, median, row_norms
 
 WORLDS = {
     "NWU": Rotation.identity(),
@@ -187,11 +187,11 @@ def quaternions_of(numbers: FloatArray) -> FloatArray:
     return wxyz
 
 
-def are_rotations(numbers: FloatArray) -> BoolArray:
+def are_rotations(numbers: FloatArray) -> Any:
     """Mark the matrices, shape (m, 9), that have orthonormal rows and are right-handed."""
     matrices = np.where(np.abs(numbers) < 2.0, numbers, 0.0).reshape(-1, 3, 3)
     off = np.abs(matrices @ matrices.swapaxes(1, 2) - np.eye(3)).max(axis=(1, 2), initial=0.0)
-    return np.asarray((off < _WORST_NORM) & (np.linalg.det(matrices) > 0.0))
+    return (off < _WORST_NORM) & (np.linalg.det(matrices) > 0.0)
 
 
 def rotation_vectors(wxyz: FloatArray) -> FloatArray:
@@ -254,7 +254,7 @@ def _up(log: ImuLog, wxyz: FloatArray) -> Any:
     """Vertical parts of the accelerations' directions at rest, in the orientations' world, shape (n,)."""
     vectors = _in_world(log, wxyz, log.accelerometer_m_s2)
     length = row_norms(vectors)
-    calm = np.abs(length - np.median(length)) < _AT_REST * np.median(length) if length.size else length > 0.0
+    calm = np.abs(length - median(length)) < _AT_REST * median(length)
     calm |= calm.sum() < _FEWEST
     return vectors[calm, 2] / length[calm]
 
@@ -265,7 +265,7 @@ def _world_of(claim: Claim, ups: FloatArray, north_deg: float) -> tuple[str, str
     if not ups.size:
         note = f"orientation: taken as {world}, {claim.by}: no accelerometer's reading tells"
         return world, note if claim.by_default else ""
-    up = np.median(ups)
+    up = median(ups)
     if abs(up) < _UPRIGHT:
         tilt = np.degrees(np.arccos(up))
         off = f"the orientation turns the accelerometer's reading {tilt:.0f} degrees from the vertical"

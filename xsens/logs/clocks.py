@@ -12,7 +12,7 @@ import numpy as np
 
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
-from xsens.logs.samples import Gap
+from xsens.logs.samples import Gap, median
 
 UNKNOWN_PAUSE_S = 1.0
 """Assumed pause before a new start of unknown length; longer than interpolation bridges."""
@@ -153,7 +153,7 @@ def _spread(values: FloatArray, readings: Sequence[FloatArray]) -> Any:
     last = np.flatnonzero(np.append(~together, True))
     counts, arrival_s = np.diff(last, prepend=-1), values[last]
     spans = np.diff(arrival_s) / counts[1:]
-    usual = np.median(spans)
+    usual = median(spans)
     period_s = np.append(usual, np.minimum(spans, _LONGER * usual))
     places = np.arange(values.size) - np.repeat(last, counts)
     return np.repeat(arrival_s, counts) + places * np.repeat(period_s, counts)
@@ -178,7 +178,7 @@ def _gaps(
         longest = _MUCH_LONGER
         span = f"{1e3 * seconds.min():.3g} to {1e3 * seconds.max():.3g} ms"
         notes.append(f"irregular clock, steps of {span}: single losses cannot be told")
-    medians_hz = [np.median(rates) for rates in rates_hz if running.size and stated_s > 0.0]
+    medians_hz = [median(rates) for rates in rates_hz if running.size and stated_s > 0.0]
     if medians_hz and not any(1.0 / _AGREES < hz * stated_s < _AGREES for hz in medians_hz):
         contradiction = (
             f"expected times at the stated rate, {1.0 / stated_s:g} Hz, got {medians_hz[0]:.4g} Hz by their "
@@ -198,10 +198,9 @@ def _running_sums(steps: Any) -> Any:
     return np.append(steps.dtype.type(0), np.cumsum(steps))
 
 
-def usual_step(steps: FloatArray, none: float = 1.0) -> float:
+def usual_step(steps: FloatArray, none: float = 1.0) -> Any:
     """Median of the steps forward, or what it is taken for if there is none."""
-    forward = steps[steps > 0]
-    return float(np.median(forward)) if forward.size else none
+    return median(steps[steps > 0], none)
 
 
 def _sample_numbers(counter: IntArray, extras: IntArray | None) -> FloatArray:

@@ -6,14 +6,14 @@ over a quarter of a second in axes that the gyroscope carries along, and compare
 Over shorter times a hand's acceleration, which averages to nothing over its swings, shows turns of its own.
 """
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from speckle3d.core.arrays import BoolArray, FloatArray
-from xsens.logs.samples import ImuLog, finite_rows, median_norm, row_norms
+from xsens.logs.samples import ImuLog, finite_rows, median, median_norm, row_norms
 
 FORCE_M_S2 = (4.0, 25.0)
 """Limits of the median of the accelerometer's norm if it is in m/s^2."""
@@ -64,14 +64,13 @@ _FEWEST = 8
 class _Turns(NamedTuple):
     """Turns of a direction from each of n windows to the next, shape (n, 3).
 
-    `expected` by the gyroscope in all; `by_axis`, shape (3, n, 3), about each of its axes; what is `missed`
-    of the direction's turn, and of that what iron on the sensor does not make; `arms`, what a unit turn about
-    each axis makes; `same`, shape (3, n), where an axis of the gyroscope, not all, reads the same; its RMS
-    rate; `coherence`, median length of the windows' means of a direction of length one.
+    `expected` by the gyroscope, in all and about each of its axes; what is `missed` of the direction's turn,
+    and of that what iron on the sensor does not make; `arms`, what a unit turn about each axis makes; `same`,
+    shape (3, n), where an axis of the gyroscope, not all, reads the same; its RMS rate; `coherence`, median
+    length of the windows' means of a direction of length one.
     """
 
-    expected: FloatArray
-    by_axis: FloatArray
+    expected: Sequence[FloatArray]
     missed: FloatArray
     unlike_iron: FloatArray
     arms: FloatArray
@@ -94,34 +93,35 @@ def contradictions(log: ImuLog) -> tuple[dict[str, str | None], float]:
     rate, force, field = log.gyroscope_rad_s, log.accelerometer_m_s2, log.magnetometer_au
     directions = {"accelerometer": force, "magnetometer": field, "own orientation": log.own_direction}
     sentences: dict[str, str | None] = {"gyroscope": ""}
-    scale_errors = list[float]()
+    scale_errors, readings = list[float](), dict[str, FloatArray]()
     if rate is not None and (fast := np.nanpercentile(row_norms(rate), 99.0)) > FASTEST_RAD_S:
         sentences["gyroscope"] = (
             f"expected a gyroscope in rad/s, got one in a hundred over {fast:.3g}: in deg/s?"
         )
-    for name, direction in directions.items():
-        if rate is None or direction is None:
+    for name, rows in directions.items():
+        if rate is None or rows is None:
             continue
-        if dead := _dead_axis(rate, direction):
+        if dead := _dead_axis(rate, rows):
             sentences[f"{name}'s axis"] = (
                 f"the {name}'s {dead} axis reads the same while the gyroscope turns it"
             )
-        elif turns := _turns(log.time_s, rate, direction):
-            sentences["gyroscope"] = sentences["gyroscope"] or _still_axis(name, turns)
-            sentences[name], scale_error = _against_gyroscope(name, turns)
-            if direction is not field:
-                scale_errors += [scale_error] if sentences[name] == "" else []
-            elif sentences[name] and _rms(turns.unlike_iron) < _EXPLAINED * _rms(turns.missed):
-                sentences[name] = None
+        else:
+            readings[name] = rows
+    for name, turns in _turns(log.time_s, rate, readings):
+        sentences["gyroscope"] = sentences["gyroscope"] or _still_axis(name, turns)
+        sentences[name], scale_error = _against_gyroscope(name, turns)
+        if name != "magnetometer":
+            scale_errors += [scale_error] if sentences[name] == "" else []
+        elif sentences[name] and _rms(turns.unlike_iron) < _EXPLAINED * _rms(turns.missed):
+            sentences[name] = None
     scale_error = min(scale_errors, default=0.0)
     if scale_error > 0.0:
         sentences["scale"] = f"the gyroscope's turns are off by {100.0 * scale_error:.2g} %: less is claimed"
     if force is not None:
         sentences["gravity"] = not_in_metres(force)
     if force is not None and field is not None:
-        up = np.einsum("ij,ij->i", force, field) / np.maximum(row_norms(force) * row_norms(field), 1e-12)
-        up = up[np.isfinite(up)]
-        if up.size and np.median(up) > _UPWARD:
+        up = np.einsum("ij,ij->i", force, field)
+        if median(up / np.maximum(row_norms(force) * row_norms(field), 1e-12)) > _UPWARD:
             sentences["dip"] = (
                 "the field points up, as south of the magnetic equator: if this is north of it, magnetometer "
                 "or accelerometer are negated, and the heading is off by half a turn"
@@ -138,44 +138,48 @@ def not_in_metres(force: FloatArray) -> str:
     return f"expected an accelerometer in m/s^2, with norm near 9.8, got a median of {median:.3g}{unit}"
 
 
-def _turns(time_s: FloatArray, rate: FloatArray, direction: FloatArray) -> _Turns | None:
-    """Turns of a direction that rests in the world, less those by a bias; None if it tells nothing."""
-    rows = finite_rows(rate)
-    time_s, rate, direction = time_s[rows], rate[rows], direction[rows]
-    if len(rate) <= _FEWEST:
-        return None
-    steps_s = np.diff(time_s, append=time_s[-1])
-    usual_s = np.median(steps_s)
+def _turns(time_s: FloatArray, rate: Any, directions: dict[str, FloatArray]) -> Iterator[tuple[str, _Turns]]:
+    """Turns of each direction that rests in the world and tells something, less those by a bias."""
+    rows: Any = np.flatnonzero(finite_rows(rate)) if directions else []
+    if len(rows) <= _FEWEST:
+        return
+    steps_s: Any = np.diff(time_s[rows], append=time_s[rows[-1]])
+    usual_s, rate_rad_s = median(steps_s), _rms(rate[rows])
     width = max(1, round(_WINDOW_S / usual_s))
-    count = len(rate) // width
-    spans_s, rates, readings = (
-        values[: count * width].reshape(count, width, -1) for values in (steps_s, rate, direction)
-    )
-    norms = np.nan_to_num(np.linalg.norm(readings, axis=2))
-    length = norms.sum(axis=1) / np.maximum((norms > 0.0).sum(axis=1), 1)
-    # Sums in each window's first axes, of the direction and of what rests in the sensor's axes.
-    turn, mean, carried = np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3)), np.zeros((count, 3, 3))
-    for k in range(width):
-        mean += np.einsum("nij,nj->ni", turn, np.nan_to_num(readings[:, k]))
+    # Shapes are (..., width, count): sums run over windows that lie side by side.
+    steps_s, rows = (values[: len(rows) // width * width].reshape(-1, width).T for values in (steps_s, rows))
+    rates = rate.T.take(rows, axis=1)
+    # Sums in each window's first axes, of the directions and of what rests in the sensor's axes.
+    turn = np.repeat(np.eye(3)[:, :, None], rows.shape[1], axis=2)
+    readings = np.nan_to_num([part.T for part in directions.values()])
+    carried, sums = 0.0 * turn, 0.0 * readings[..., rows[0]]
+    for k, row in enumerate(rows):
+        sums += np.einsum("ijn,djn->din", turn, readings.take(row, axis=2))
         carried += turn / width
-        turn = turn @ Rotation.from_rotvec(rates[:, k] * spans_s[:, k]).as_matrix()
-    mean *= (length / np.maximum(norms.sum(axis=1), 1e-9))[:, None]
-    usual = max(np.median(length), 1e-9)
-    calm = (np.abs(length / usual - 1.0) < _CALM) & ~(spans_s > 2.0 * usual_s).any(axis=(1, 2))
-    calm = calm[1:] & calm[:-1]
-    if calm.sum() < _FEWEST:
-        return None
-    coherence = float(np.median(row_norms(mean)[1:][calm] / length[1:][calm]))
-    turn, mean = turn[:-1], mean / usual
-    ahead = np.einsum("nji,nj->ni", turn, mean[:-1])
-    arms = np.cross(0.5 * (ahead + mean[:-1]), np.eye(3)[:, None])[:, calm]
-    turns = arms * Rotation.from_matrix(turn[calm]).as_rotvec().T[:, :, None]
-    iron = np.moveaxis(carried[1:] - turn.swapaxes(1, 2) @ carried[:-1], 2, 0)[:, calm]
-    expected, missed, *by_axis = _without(arms, [(ahead - mean[:-1])[calm], (mean[1:] - ahead)[calm], *turns])
-    (unlike_iron,) = _without(np.concatenate([arms, iron]), [missed])
-    same = (rates == rates[:, :1]).all(axis=1)[:-1][calm].T
+        step = Rotation.from_rotvec((rates[:, k] * steps_s[k]).T).as_matrix()
+        turn = np.einsum("ijn,jkn->ikn", turn, np.ascontiguousarray(np.moveaxis(step, 0, 2)))
+    turn = turn[..., :-1]
+    iron = (carried[..., 1:] - np.einsum("jin,jkn->ikn", turn, carried[..., :-1])).transpose(1, 2, 0)
+    turn_rad = Rotation.from_matrix(np.moveaxis(turn, 2, 0)).as_rotvec().T[:, :, None]
+    even, same = (steps_s <= 2.0 * usual_s).all(axis=0), (rates == rates[:, :1]).all(axis=1)[:, :-1]
     same &= ~same.all(axis=0)
-    return _Turns(expected, np.array(by_axis), missed, unlike_iron, arms, same, _rms(rate), coherence)
+    for name, direction, mean in zip(directions, readings, sums, strict=True):
+        norms = row_norms(direction.T)[rows]
+        count = np.maximum((norms > 0.0).sum(axis=0), 1)
+        length = norms.sum(axis=0) / count
+        usual = max(median(length), 1e-9)
+        calm = (np.abs(length / usual - 1.0) < _CALM) & even
+        calm = calm[1:] & calm[:-1]
+        if calm.sum() < _FEWEST:
+            continue
+        mean = mean / (usual * count)
+        ahead = np.einsum("jin,jn->in", turn, mean[:, :-1])
+        before, ahead, after = (part.T[calm] for part in (mean[:, :-1], ahead, mean[:, 1:]))
+        coherence = usual * median(row_norms(after) / length[1:][calm])
+        arms = np.cross(0.5 * (ahead + before), np.eye(3)[:, None])
+        missed, *expected = _without(arms, [after - ahead, ahead - before, *(arms * turn_rad[:, calm])])
+        (unlike_iron,) = _without(np.concatenate([arms, iron[:, calm]]), [missed])
+        yield name, _Turns(expected, missed, unlike_iron, arms, same[:, calm], rate_rad_s, coherence)
 
 
 def _without(columns: FloatArray, parts: Sequence[FloatArray]) -> FloatArray:
@@ -219,7 +223,7 @@ def _against_gyroscope(name: str, turns: _Turns) -> tuple[str | None, float]:
         doubt = "otherwise: is one noise, or the gyroscope in deg/s"
         return contradiction.format("", name, turns.rate_rad_s, doubt), 0.0
     verdict, scale_error = None, 0.0
-    for axis, turn in zip(("", " x", " y", " z"), (turns.expected, *turns.by_axis), strict=True):
+    for axis, turn in zip(("", " x", " y", " z"), turns.expected, strict=True):
         square = max((turn**2).sum(), 1e-12)
         off = (turn * turns.missed).sum() / square
         scatter = (turn * (turns.missed - off * turn)).sum(axis=1)
@@ -238,5 +242,5 @@ def _against_gyroscope(name: str, turns: _Turns) -> tuple[str | None, float]:
     return verdict, scale_error
 
 
-def _rms(vectors: FloatArray) -> float:
-    return float(np.sqrt(np.mean(row_norms(vectors) ** 2)))
+def _rms(vectors: FloatArray) -> Any:
+    return np.sqrt(np.mean(row_norms(vectors) ** 2))

@@ -12,7 +12,7 @@ import numpy as np
 from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.errors import InvalidInputError
 from xsens.logs.clocks import usual_step
-from xsens.logs.samples import VECTORS, ImuLog, finite_rows, median_norm, row_norms
+from xsens.logs.samples import VECTORS, ImuLog, finite_rows, median, median_norm, row_norms
 
 
 class _Limits(NamedTuple):
@@ -86,7 +86,7 @@ def without_faults(log: ImuLog) -> ImuLog:
         If its rows are of several sensors in turn.
     """
     readings = {name: getattr(log, name) for name in VECTORS} | {_ORIENTATION: log.own_direction}
-    readings = {name: rows for name, rows in readings.items() if rows is not None}
+    readings = {name: np.asfortranarray(rows) for name, rows in readings.items() if rows is not None}
     _require_one_sensor(readings)
     changes: dict[str, Any] = {}
     notes: list[str] = []
@@ -119,14 +119,15 @@ def _bad(name: str, rows: FloatArray, force: FloatArray, rate: FloatArray) -> di
         zero &= ~(row_norms(force) > 0.0)
     valid = ~(np.isnan(size) | zero)
     if name == VECTORS[2] and valid.any():
-        unit = np.median(size[valid])
+        unit = median(size[valid])
     beyond = size > limits.largest * unit
     if beyond.sum() > _FEW * (size >= 0.0).sum():  # another unit, which whoever uses the log refuses
         beyond = size >= _ABSURD
     valid &= ~beyond
     repeats = np.zeros_like(valid)
     if valid.any():
-        repeats[valid] = _repeats(name, limits.change * unit, rows[valid], force[valid], rate[valid])
+        parts = (part.T.compress(valid, axis=1).T for part in (rows, force, rate))
+        repeats[valid] = _repeats(name, limits.change * unit, *parts)
     valid &= ~repeats
     rows = np.where(valid[:, None], rows, np.nan)
     return {
@@ -140,7 +141,7 @@ def _bad(name: str, rows: FloatArray, force: FloatArray, rate: FloatArray) -> di
     }
 
 
-def _repeats(name: str, change: float, rows: FloatArray, force: FloatArray, rate: FloatArray) -> BoolArray:
+def _repeats(name: str, change: float, rows: FloatArray, force: FloatArray, rate: FloatArray) -> Any:
     """Rows that repeat the one before for longer than two samples of the sensor's rate, and then change.
 
     One in ten of a sensor's samples may last longer: its rate is another than that of the log.
@@ -148,6 +149,8 @@ def _repeats(name: str, change: float, rows: FloatArray, force: FloatArray, rate
     """
     start = np.flatnonzero(np.append(True, (rows[1:] != rows[:-1]).any(axis=1)))
     length = np.diff(np.append(start, len(rows)))
+    if length.max() <= 2:
+        return False
     middle, high = np.percentile(length, [50, 90]) if len(length) > 1 else (1, 1)
     usual = int(min(3.0 * middle, high))
     steps = np.diff(rows, axis=0)
@@ -208,9 +211,9 @@ def _cut_off(axis: FloatArray, least: float) -> Any:
     Noise of the usual bend from row to row keeps no reading within such a band for long, unless it is lost
     in the last digit.
     """
-    size, steps, bends = np.abs(axis), np.diff(axis), np.abs(np.diff(axis, 2))
-    bends, end = bends[np.isfinite(bends)], np.fmax.reduce(size)
-    band = np.median(bends) if bends.size else 0.0
+    steps = np.diff(axis)
+    size, band = np.abs(axis), median(np.abs(np.diff(steps)))
+    end = np.fmax.reduce(size)
     if not (end >= least and band > _digit(steps)):
         return np.zeros(size.size, dtype=bool)
     inside = size >= end - band
@@ -237,9 +240,8 @@ def _wrapped(rows: FloatArray) -> BoolArray:
     for axis in rows.T:
         steps = np.diff(axis, prepend=axis[:1])
         size = np.abs(steps)
-        jump = size > max(
-            _END_TO_END * np.fmax.reduce(np.abs(axis), initial=0.0), _NOISY * usual_step(size, np.inf)
-        )
+        jump = size > _END_TO_END * np.fmax.reduce(np.abs(axis), initial=0.0)
+        jump &= size > _NOISY * usual_step(size, np.inf)
         rough = np.pad(~jump & (size > 0.1 * np.fmax.reduce(size)), 1)
         jump &= ~(rough[:-2] | rough[2:])
         turns = np.cumsum(np.where(jump, np.sign(steps), 0.0)).astype(np.int64)

@@ -182,10 +182,10 @@ class RawCalibration:
             np.concatenate((block["inertial"], block["magnetic"][None])) / 2.0**14,
         )
 
-    def to_units(self, sensor: int, counts: FloatArray) -> FloatArray:
+    def to_units(self, sensor: int, counts: FloatArray) -> Any:
         """Acceleration in m/s², rate in rad/s or field in arbitrary units, of counts, shape (n, 3)."""
         axes = (np.linalg.inv(self.misalignments[sensor]) / self.gains[sensor]).T
-        return np.asarray((counts - self.offsets[sensor]) @ axes)
+        return (counts - self.offsets[sensor]) @ axes
 
 
 # -- data messages

@@ -123,8 +123,7 @@ class Frames:
     @cached_property
     def payload_start(self) -> IntArray:
         """First bytes of the payloads, shape (n,)."""
-        head = np.where(self.data[self.start + 3] == _LONG_LENGTH, 6, 4)
-        return self.start + head
+        return self.start + np.where(self.data[self.start + 3] == _LONG_LENGTH, 6, 4)
 
     @cached_property
     def payload_size(self) -> IntArray:

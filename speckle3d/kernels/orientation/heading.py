@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from speckle3d.core.arrays import FloatArray
-from speckle3d.kernels.orientation.rotations import compiled, inverse, norm
+from speckle3d.kernels.orientation.rotations import compiled, inverse, norm, transported
 
 ROOM, BIAS, IRON, PLACE, STRAY, LAG, SIZE = 0, 3, 6, 9, 12, 15, 16
 """Places in the state: the room's field (level axes), what is left of the gyroscope's bias (sensor axes), the
@@ -215,7 +215,7 @@ def _predict(s: Any, b: Any, m: Any, f: FloatArray, q: FloatArray) -> None:
     q[ROOM, ROOM + 1] = q[ROOM + 1, ROOM] = -b.slip_rad2 * across * along
     s.changing_s = max(s.changing_s - span, 0.0)
     s.x[:] = f @ s.x
-    s.p[:] = f @ s.p @ f.T + q
+    s.p[:] = transported(f, s.p) + q
 
 
 @compiled

@@ -35,7 +35,9 @@ from speckle3d.kernels.orientation.rotations import (
     quaternion,
     quaternion_of,
     rotate,
+    subtract_product,
     three,
+    transported,
     turn_by,
 )
 
@@ -322,7 +324,7 @@ def _predict(s: Any, step: Any, f: FloatArray) -> None:
     step.noise[:3] = noise * duration + step.lost_rad2
     step.noise[3:6] = _BIAS_WALK_RAD_S_SQRT_S**2 * duration
     step.noise[6:] = _FORCE_NOISE_M_S_SQRT_S**2 * duration + shock**2
-    s.p[:] = f @ s.p @ f.T
+    s.p[:] = transported(f, s.p)
     for i in range(SIZE):
         s.p[i, i] += step.noise[i]
     s.speed += np.array(rotate(level, three(step.force)))
@@ -354,16 +356,15 @@ def _correct(p: FloatArray, first: int, variance: float, up: FloatArray) -> Floa
 
     The heading is found elsewhere, and corrected by nothing; nor is the bias about `up`.
     """
-    cross = p[first : first + 3].copy()
-    total = cross[:, first : first + 3] + variance * np.eye(3)
-    gain = cross.T.copy() @ inverse(total)[0]
+    cross = p[:, first : first + 3].copy()
+    gain = cross @ inverse(cross[first : first + 3] + variance * np.eye(3))[0]
     gain[2] = 0.0
     for j in range(3):
         about_up = up[0] * gain[3, j] + up[1] * gain[4, j] + up[2] * gain[5, j]
         for i in range(3):
             gain[3 + i, j] -= about_up * up[i]
-    remainder = p - gain @ cross
-    p[:] = remainder - (remainder[:, first : first + 3] - variance * gain) @ gain.T
+    subtract_product(p, gain, cross)
+    subtract_product(p, p[:, first : first + 3] - variance * gain, gain)
     return gain
 
 

@@ -90,6 +90,32 @@ def rotate(q: Quaternion, v: Vector) -> Vector:
 
 
 @compiled
+def transported(f: FloatArray, p: FloatArray) -> FloatArray:
+    """Covariance `p` after a transition `f`, ``f @ p @ f.T``; most entries of `f` are zero."""
+    n = p.shape[0]
+    half, out = np.zeros((n, n)), np.zeros((n, n))
+    for i in range(n):
+        for j in range(n):
+            if f[i, j] != 0.0:
+                for k in range(n):
+                    half[k, i] += p[k, j] * f[i, j]
+    for i in range(n):
+        for j in range(n):
+            if f[i, j] != 0.0:
+                for k in range(n):
+                    out[i, k] += f[i, j] * half[j, k]
+    return out
+
+
+@compiled
+def subtract_product(p: FloatArray, a: FloatArray, b: FloatArray) -> None:
+    """Subtract ``a @ b.T`` from `p`; both have three columns."""
+    for i in range(p.shape[0]):
+        for j in range(p.shape[1]):
+            p[i, j] -= a[i, 0] * b[j, 0] + a[i, 1] * b[j, 1] + a[i, 2] * b[j, 2]
+
+
+@compiled
 def inverse(m: FloatArray) -> tuple[FloatArray, float]:
     """Inverse of a symmetric matrix, shape (3, 3), and its determinant."""
     out = np.empty((3, 3))

@@ -26,6 +26,24 @@ from speckle3d.kernels.orientation.rotations import (
 
 
 @compiled
+def turn_about_up(angles_rad: FloatArray, xyzw: FloatArray) -> FloatArray:
+    """Quaternions, shape (m, 4), turned about up."""
+    out = np.empty_like(xyzw)
+    for k in range(xyzw.shape[0]):
+        out[k] = product(quaternion_of(0.0, 0.0, angles_rad[k]), quaternion(xyzw[k]))
+    return out
+
+
+@compiled
+def rotate_rows(xyzw: FloatArray, vectors: FloatArray) -> FloatArray:
+    """Vectors, shape (m, 3), each turned by a quaternion."""
+    out = np.empty_like(vectors)
+    for k in range(vectors.shape[0]):
+        out[k] = rotate(quaternion(xyzw[k]), three(vectors[k]))
+    return out
+
+
+@compiled
 def smooth_steps(
     steps: Any,
     covariance: FloatArray,
