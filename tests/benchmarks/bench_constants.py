@@ -61,7 +61,7 @@ def results(sweeps, curves):
         try:
             tracked = pipeline.track(sweep, curves)
             fused = correct(tracked, sweep, "fused")["fused"]
-        except Speckle3DError as error:
+        except (Speckle3DError, ValueError) as error:
             doubts.add(str(error))
             continue
         doubts |= {f"{doubt.about}: {doubt.suspect}" for doubt in tracked.doubts}
