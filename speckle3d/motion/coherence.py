@@ -142,11 +142,11 @@ class _Binning:
             """Weighted sum over bins of a power of (1 - c) r + c r^a, by its binomial, shape (a, q, c)."""
             sums, term = [], np.ones_like(structure)
             for k in range(order + 1):
-                of_bins = math.comb(order, k) * weight * speckle ** (order - k)
-                sums.append(np.einsum("qb,aqb->aq", of_bins, term))
+                at_bins = weight * math.comb(order, k) * speckle ** (order - k)
+                sums.append(np.einsum("qb,aqb->aq", at_bins, term))
                 term = term * structure
             part = np.arange(order + 1)[:, None]
-            return np.asarray(np.stack(sums, axis=2) @ ((1.0 - share) ** (order - part) * share**part))
+            return np.stack(sums, axis=2) @ ((1.0 - share) ** (order - part) * share**part)
 
         product, square = moment(2, self.weight**2 * self.mean), moment(4, self.weight**2)
         # Without an echo there is nothing that noise could have taken.
@@ -207,8 +207,7 @@ def estimate_coherence(problem: MotionProblem, table: CorrelationTable, path: Fl
     """
     binning, centres = _bin_correlations(problem, table, path)
     patches = problem.patches
-    speckle = fully_developed(len(patches))
-    as_measured = Coherence(np.zeros(1), *speckle, 1.0, PHANTOM_SIGMA, np.ones(2))
+    as_measured = Coherence(np.zeros(1), *fully_developed(len(patches)), 1.0, PHANTOM_SIGMA, np.ones(2))
     # Scale, gain, share and power are four numbers.
     if (binning.weight > 0.0).sum(axis=1).max() < 4:
         return as_measured

@@ -90,7 +90,8 @@ class Motion:
         # is taken moves the image's centre along.
         focus_sigma_mm = 0.0 if problem.curves.tilt else np.std(problem.patches.depth_mm)
         by_focus = focus_sigma_mm * np.hypot(self.turn_per_mm, slopes.deviation_per_mm)
-        scale_sigma = np.linalg.norm([coherence.scale_sigma, slopes.length_sigma, by_focus[1]])
+        by_turns = slopes.lever_mm * slopes.deviation_per_mm
+        scale_sigma = np.linalg.norm([coherence.scale_sigma, *by_turns, by_focus[1]])
         # The foci of a fan lie on an arc of another radius, by which it is seen.
         by_focus *= np.std(np.sin(problem.patches.angle_rad)) / problem.width_mm
         turn_sigma = np.hypot(slopes.deviation_per_mm, by_focus)
@@ -102,7 +103,7 @@ class Motion:
         """The motion with the opposite elevational sign."""
         return replace(
             self,
-            pairs=self.pairs.signed(np.array([-1.0])),
+            pairs=self.pairs.scaled(-1.0),
             edges=self.edges.mirrored(),
             poses=mirrored(self.poses),
             covariance=MIRROR @ self.covariance @ MIRROR,
@@ -140,10 +141,9 @@ def _alternate(problem: MotionProblem, table: CorrelationTable) -> Motion:
     are repeated `ROUNDS` times.
     """
     rows = alike_pairs(problem, table, table.median)
-    first, is_fan = problem, problem.patches.step_rad > 0
-    if is_fan:
-        # Its columns show a turn, which patches' gains would take for their own.
-        first = replace(problem, curves=replace(problem.curves, tilt=None))
+    # A fan's columns show a turn, which patches' gains would take for their own.
+    is_fan = problem.patches.step_rad > 0
+    first = replace(problem, curves=replace(problem.curves, tilt=None)) if is_fan else problem
     pairs, path = _signed_planes(first, table, rows, fully_developed(table.correlation.shape[1]))
     path = path @ np.eye(2, 3)
     if is_fan:
@@ -154,8 +154,8 @@ def _alternate(problem: MotionProblem, table: CorrelationTable) -> Motion:
         rows = alike_pairs(problem, table, problem.typical_correlation(apart_mm))
         pairs, _ = _signed_planes(problem, table, rows, coherence.models(table.first[rows]))
         slopes = weigh_slopes(pairs, coherence.false_turn, problem.planes, path)
-        poses = solve_planes(problem, table, slopes.applied(pairs))[1].poses
-        path = elevation_of(poses, problem.centre_mm)
+        _, trajectory = solve_planes(problem, table, slopes.applied(pairs))
+        path = elevation_of(trajectory.poses, problem.centre_mm)
         coherence = estimate_coherence(problem, table, path)
     slopes = weigh_slopes(pairs, coherence.false_turn, problem.planes, path)
     pairs = pairs.scaled(coherence.scale)

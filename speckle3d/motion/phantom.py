@@ -89,7 +89,7 @@ def fit_curves(
         for name in ("depth_mm", "offset_mm", "tilt_rad", "correlation")
     )
     (rows, row), grid = np.unique(np.round(depth, 6), return_inverse=True), np.linspace(0, s.largest_mm, 251)
-    of_echo, response, distance = key.correlation_of == "echo", None, np.abs(offset)
+    of_echo, distance = key.correlation_of == "echo", np.abs(offset)
     fair = np.ones(depth.size, dtype=bool)
     # Turning distorts the curves a little and is itself read from them: estimate both in turn.
     for _ in range(TILT_ROUNDS):

@@ -198,10 +198,6 @@ class PairPlanes:
         """Return the same planes with all distances multiplied by a factor."""
         return replace(self, coefficients=self.coefficients * factor, covariance=self.covariance * factor**2)
 
-    def signed(self, sign: FloatArray) -> PairPlanes:
-        """Return the planes multiplied by signs of shape (e,)."""
-        return replace(self, coefficients=self.coefficients * sign[:, None])
-
 
 def fully_developed(patches: int) -> EchoModels:
     """Model of a phantom's speckle, for all pairs."""
@@ -247,7 +243,7 @@ def pair_planes(
     start = problem.typical_distance(np.sqrt(np.maximum(table.median[rows], 0.0)))
     from_sensor = slopes is not None
     start_slopes = np.zeros((rows.size, 2)) if slopes is None else np.ascontiguousarray(slopes)
-    side = np.zeros(rows.size, dtype=bool) | either_side
+    side = np.full(rows.size, either_side)
     settings = problem.planes
     slope_sd = SENSED_SLOPE if from_sensor else HAND_SLOPE
     rules = FitRules(from_sensor, slope_sd, 3.0 * HAND_SLOPE, settings.huber, OUTLYING, 2.0 * DECISIVE)
@@ -319,8 +315,8 @@ def patch_distances(
         columns = zip(np.where(amplitude > least, amplitude, np.nan).T, curves.amplitude, strict=True)
         return np.stack([np.interp(-a, -row, problem.curves.distance_mm) for a, row in columns], axis=1)
 
-    variance = correlation_variance(np.clip(correlation, 0.0, 0.999), curves.cells, curves.of_echo)
-    noise = np.sqrt(variance + INTERPOLATION**2)
+    limited = np.clip(correlation, 0.0, 0.999)
+    noise = np.sqrt(correlation_variance(limited, curves.cells, curves.of_echo) + INTERPOLATION**2)
     nearer, distance, farther = (distances(correlation - side * noise) for side in (-1.0, 0.0, 1.0))
     sigma = np.where(np.isfinite(farther), (farther - nearer) / 2.0, distance - nearer)
     return distance, np.maximum(sigma, np.finfo(float).eps)

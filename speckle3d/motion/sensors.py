@@ -69,8 +69,8 @@ def settle_direction(
             continue
         frames = np.flatnonzero(sensor.covers(time_s))
         if isinstance(sensor, Tracker) and frames.size > 1:
-            sensor_poses = sensor.world_from_image(time_s[frames])
-            return _same_way(sensor_poses, image[frames], sweep.grid.centre_mm), sensor.label
+            poses = sensor.world_from_image(time_s[frames])
+            return _same_way(poses, image[frames], sweep.grid.centre_mm), sensor.label
         if isinstance(sensor, OrientationSensor) and frames.size >= LEAST_FRAMES:
             rotations = sensor.world_from_image(time_s[frames]), image[frames].rotation
             turns, image_turns = ((turn[0].inv() * turn).as_rotvec() for turn in rotations)
@@ -89,7 +89,7 @@ def settle_direction(
 def _same_way(poses: RigidTransform, image: RigidTransform, centre_mm: FloatArray) -> int:
     """Sign of the correlation of two records of poses along the first frame's normal."""
     z, image_z = ((path[0].inv() * path).apply(centre_mm)[:, 2] for path in (poses, image))
-    return 1 if (z - z.mean()) @ (image_z - image_z.mean()) >= 0 else -1
+    return 1 if np.cov(z, image_z)[0, 1] >= 0 else -1
 
 
 def same_turns(sensor_turns: FloatArray, image_turns: FloatArray) -> int | None:

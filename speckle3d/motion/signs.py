@@ -5,6 +5,7 @@ agrees with all the offsets and slopes. Where a pause or a turn leaves more than
 are followed until the frames that come later tell them apart.
 """
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -107,4 +108,5 @@ def on_path(planes: PairPlanes, path: FloatArray) -> PairPlanes:
     relative, moved = path[planes.second] - path[planes.first], planes.coefficients[:, :2]
     weight = np.linalg.inv(planes.sign_covariance)
     agreement = np.einsum("ei,eij,ej->e", relative, weight, moved)
-    return planes.signed(np.where(agreement >= 0.0, 1.0, -1.0))
+    sign = np.where(agreement >= 0.0, 1.0, -1.0)
+    return replace(planes, coefficients=planes.coefficients * sign[:, None])

@@ -111,11 +111,6 @@ class SlopeWeights:
     deviation_per_mm: FloatArray
     lever_mm: FloatArray
 
-    @property
-    def length_sigma(self) -> float:
-        """Relative standard deviation of the centre's distances that errors of the slopes leave."""
-        return float(np.linalg.norm(self.lever_mm * self.deviation_per_mm))
-
     def applied(self, planes: PairPlanes) -> PairPlanes:
         """Multiply planes' slopes by their weights and adjust the offsets by the fits' covariance."""
         covariance = planes.covariance

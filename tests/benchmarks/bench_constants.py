@@ -19,7 +19,6 @@ import bench
 import numpy as np
 
 from speckle3d import pipeline
-from speckle3d.core.errors import Speckle3DError
 from speckle3d.correction.claims import length_sigma
 from speckle3d.corrections import correct
 from speckle3d.io.family.curves import read_curves
@@ -61,7 +60,7 @@ def results(sweeps, curves):
         try:
             tracked = pipeline.track(sweep, curves)
             fused = correct(tracked, sweep, "fused")["fused"]
-        except (Speckle3DError, ValueError) as error:
+        except Exception as error:
             doubts.add(str(error))
             continue
         doubts |= {f"{doubt.about}: {doubt.suspect}" for doubt in tracked.doubts}
