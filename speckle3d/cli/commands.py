@@ -31,7 +31,7 @@ from typing import (
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from speckle3d.cli.common import common_options, emit
+from speckle3d.cli.common import common_options, emit, note
 from speckle3d.cli.outputs import require_own_places
 from speckle3d.core.errors import FileError, InvalidInputError
 
@@ -127,6 +127,7 @@ def command_of(name: str, function: Command) -> TyperCommand:
     options: dict[str, inspect.Parameter] = {}
     groups: dict[str, tuple[str, list[str]]] = {}
     places: dict[str, str] = {}
+    targets: list[str] = []
     for parameter in inspect.signature(function).parameters.values():
         kind, info = hints[parameter.name], None
         if get_origin(kind) is Annotated:
@@ -134,6 +135,8 @@ def command_of(name: str, function: Command) -> TyperCommand:
             info = copy(info)
             if writes:
                 places[parameter.name] = writes[0]
+            if getattr(info, "writable", False):
+                targets.append(parameter.name)
         if isinstance(info, Fields):
             members = {name: option for name, option in info.options(words).items() if name not in hints}
             groups[parameter.name] = info.model, list(members)
@@ -164,6 +167,7 @@ def command_of(name: str, function: Command) -> TyperCommand:
             members = {name: values.pop(name) for name in names}
             values[group] = _make(_load(model), {k: v for k, v in members.items() if v is not None})
         as_json = prints and values.pop("as_json")
+        old = {path: _stamps(path) for name in targets if (path := values[name]) and not values.get("append")}
         try:
             numbers, text = function(**values) or (None, "")
         except InvalidInputError as error:  # of a parameter: the option is named as it was typed
@@ -177,6 +181,9 @@ def command_of(name: str, function: Command) -> TyperCommand:
             text = json_text(numbers)
         if text:
             emit(text)
+        for path, stamps in old.items():
+            if {*stamps.items()} - {*_stamps(path).items()}:
+                note(f"replaced what was in {path}")
 
     run.__signature__ = inspect.Signature(list(options.values()))  # type: ignore[attr-defined]
     run.__annotations__ = {option.name: option.annotation for option in options.values()}
@@ -189,6 +196,12 @@ def command_of(name: str, function: Command) -> TyperCommand:
 
 
 _COMMON = Words.of(common_options).options
+
+
+def _stamps(path: Path) -> dict[Path, int]:
+    """When a file, or those in a folder, were written; without empty ones."""
+    files = [*path.iterdir()] if path.is_dir() else [path]
+    return {file: file.stat().st_mtime_ns for file in files if file.is_file() and file.stat().st_size}
 
 
 def _make(model: Any, values: Mapping[str, Any]) -> Any:
