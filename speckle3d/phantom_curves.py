@@ -61,7 +61,7 @@ def calibrate_curves(
     for sweep in sweeps:
         matcher = FrameMatcher(sweep, settings)
         keys.append(matcher.key)
-        keys[0].require_same(matcher.key, "the phantom sweeps do not match each other")
+        keys[0].require_same(matcher.key, "the first phantom sweep's images")
         poses = known_positions(sweep)
         pairs = phantom_pairs(sweep, poses, settings.curves)
         matches = match_sweep(sweep, matcher, KnownSchedule(pairs), after(progress, before, total))

@@ -36,7 +36,8 @@ _IMU: Table = {
 _COMMANDS: Table = {
     "reconstruct": "speckle3d.cli.reconstruction:reconstruct",
     "calibrate": (
-        "Calibrate what a reconstruction needs: curves of a probe, mountings of sensors.",
+        "Calibrate what a reconstruction needs: curves of a probe, mountings of sensors.\n\n"
+        "Example: speckle3d calibrate plane bath.h5 -o tracker.h5 --reflector bar",
         _CALIBRATE,
     ),
     "volume": "speckle3d.cli.look.volumes:volume",
@@ -47,9 +48,16 @@ _COMMANDS: Table = {
     "scene": "speckle3d.cli.look.volumes:scene",
     "info": "speckle3d.cli.files:info",
     "convert": "speckle3d.cli.files:convert",
-    "trajectory": ("Trajectories as TUM text, and scores of them.", _TRAJECTORY),
+    "trajectory": (
+        "Trajectories as TUM text, and scores of them.\n\n"
+        "Example: speckle3d trajectory export out/reconstruction.h5 -o poses.tum --mode pose",
+        _TRAJECTORY,
+    ),
     "compare": "speckle3d.cli.reconstruction:compare",
-    "imu": ("The orientation sensor: logs, live data, orientation.", _IMU),
+    "imu": (
+        "The orientation sensor: logs, live data, orientation.\n\nExample: speckle3d imu info log.mtb",
+        _IMU,
+    ),
     "live": "speckle3d.cli.stream:live",
     "play": "speckle3d.cli.stream:play",
     "simulate": "speckle3d.cli.files:simulate",

@@ -57,14 +57,17 @@ class CurveKey:
     array_radius_mm: float = 0.0
     line_step_rad: float = 0.0
 
-    def require_same(self, other: CurveKey, what: str = "the curves do not match the sweep") -> None:
+    def require_same(self, other: CurveKey, own: str = "the curves") -> None:
         """Raise `MismatchError` naming the first setting in which `other` (a sweep's key) differs."""
         others = _settings(other)
         for name, value in _settings(self).items():
             theirs = others.get(name, value)
             if theirs != value if isinstance(value, str) else not np.allclose(value, theirs, 1e-3, 1e-9):
                 advice = BAND_ADVICE if name == "bandwidth_hz" else ""
-                raise MismatchError(f"{what}: {name} is {value!r} and {theirs!r}{advice}")
+                raise MismatchError(
+                    f"{own} do not match the sweep: {name} of {own} is {value!r}, "
+                    f"of the sweep {theirs!r}{advice}"
+                )
 
 
 @dataclass(frozen=True)

@@ -329,15 +329,20 @@ class Sweep:
         """
         read = ImageFrames(frames if hasattr(frames, "shape") else np.asarray(frames))
         n, columns, rows = read.shape
-        if frame_time_s is None and frame_rate_hz is not None:
+        if frame_time_s is None and frame_rate_hz is not None and frame_rate_hz > 0.0:
             frame_time_s = np.arange(n) / frame_rate_hz
         across, down = np.broadcast_to(USUAL_PIXEL_MM if pitch_mm is None else pitch_mm, (2,)).tolist()
         kind: Any = signal
         if signal is None and read.dtype == np.uint8:
-            range_db = (dynamic_range_db, 0.0) if dynamic_range_db is not None else None
-            range_db = range_db or estimate_dynamic_range(read, across, down)
+            range_db: Any = dynamic_range_db, 0.0
+            if dynamic_range_db is None:
+                range_db = estimate_dynamic_range(read, across, down)
             kind = range_db and BModeSettings(range_db[0], dynamic_range_sigma_db=range_db[1])
-        stated = {"pitch_mm": pitch_mm, "frame_rate_hz": frame_time_s, "dynamic_range_db or signal": kind}
+        stated = {
+            "pitch_mm": pitch_mm,
+            "frame_rate_hz above zero": frame_time_s,
+            "dynamic_range_db or signal": kind,
+        }
         missing = ", ".join(name for name, value in stated.items() if value is None)
         if missing:
             raise InvalidInputError(f"arrays do not say, so give {missing}: see docs/howto/pictures.md")

@@ -128,5 +128,7 @@ def read_places(path: PathLike, columns: Sequence[str] = WORLD) -> FloatArray:
 
 def parse_places(texts: Sequence[str], columns: Sequence[str] = WORLD, option: str = "--point") -> FloatArray:
     """Points given as ``X,Y,Z``, or ``X,Y``, each; shape (k, number of columns)."""
-    places = [numbers(text.replace(",", " "), len(columns), option) for text in texts]
+    places = [
+        numbers(text.replace(",", " "), len(columns), f"{option}: {','.join(columns)}") for text in texts
+    ]
     return np.array(places, dtype=float).reshape(-1, len(columns))

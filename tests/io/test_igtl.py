@@ -135,7 +135,7 @@ def test_a_connection_waits_for_its_server_and_reconnects():
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
     with Connection("127.0.0.1", port) as connection:
-        until(lambda: "Connect call failed" in connection.last_failure)
+        until(lambda: "nothing listens" in connection.last_failure)
         assert not connection.peers
         for _ in range(2):
             with Server(port) as server:

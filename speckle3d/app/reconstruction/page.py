@@ -19,6 +19,7 @@ from speckle3d.app.reconstruction.cut_plot import CutPlot
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import Speckle3DError
 from speckle3d.report.figures import plot_outlines
+from speckle3d.scoring.modes import length_claims
 from speckle3d.scoring.references import find_reference
 from speckle3d.study.figures import RANGE_DB, label_of
 from speckle3d.study.pose_errors import PICKING, caution, how_measured
@@ -87,6 +88,9 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
     def __init__(self, page: ReconstructionPage) -> None:
         self._page = page
         grid = self._grid = page.reconstruction.grid
+        trust, poses = page.reconstruction.trust, page.reconstruction.poses
+        claims = {} if trust is None else length_claims(poses, trust, grid.centre_mm)
+        self._errors = {mode: f", +- {1.96 * sigma:.2f} mm (95 %)" for mode, (_, sigma) in claims.items()}
         modes = {label_of(mode): mode for mode in page.modes}
         self.param.mode.objects, self.param.overlay.objects = modes, {"(nothing)": "", **modes}
         self.param.frame.bounds = (0, len(page.reconstruction.frame_time_s) - 1)
@@ -181,7 +185,10 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
             plot.plot.title.text = str(error).split(";")[0]
             return
         plot.show_cut(picture, *self._pair)
-        lengths = {mode: text.replace("\n", ", ") for mode, text in picture.lengths.items()}
+        lengths = {
+            mode: text.replace("\n", ", ") + self._errors.get(mode, "")
+            for mode, text in picture.lengths.items()
+        }
         words = "".join(f"length, {label_of(mode)}: {text}<br>" for mode, text in lengths.items())
         if self._pair[1]:
             words += "green: this mode alone, magenta: the other alone, grey: both"

@@ -180,7 +180,11 @@ class Connection(End):
                     streams = await asyncio.open_connection(*self._address, limit=_PIECE_BYTES)
                 await self._talk(*streams)
             except (OSError, UnicodeError) as error:  # Unicode: a host that cannot be a name
-                self.last_failure = str(error)
+                failure = str(error)
+                is_refused = "Connect call failed" in failure
+                self.last_failure = (
+                    "nothing listens there: start it, or give its port" if is_refused else failure
+                )
             await asyncio.sleep(_PAUSE_S)
 
 
