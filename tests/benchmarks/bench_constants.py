@@ -60,7 +60,7 @@ def results(sweeps, curves):
         try:
             tracked = pipeline.track(sweep, curves)
             fused = correct(tracked, sweep, "fused")["fused"]
-        except Exception as error:  # noqa: BLE001 -- whatever a changed constant breaks is its result.
+        except Exception as error:  # noqa: BLE001 (what a changed constant breaks is its result)
             doubts.add(str(error))
             continue
         doubts |= {f"{doubt.about}: {doubt.suspect}" for doubt in tracked.doubts}
