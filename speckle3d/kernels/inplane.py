@@ -183,36 +183,61 @@ def _fit(
     usable : int
         Number of patches that could have a peak.
     """
-    rows, few = np.flatnonzero(weight > 0.0), usable < _LEAST_PATCHES
-    if rows.size < (2 if few else _LEAST_PATCHES):
+    count, few = 0, usable < _LEAST_PATCHES
+    for p in range(weight.size):
+        count += weight[p] > 0.0
+    if count < (2 if few else _LEAST_PATCHES):
         return False
-    design, turn, own = geometry.design[rows], geometry.turn[rows], weight[rows]
-    normal = (design * own.reshape(-1, 1)).T @ design
+    # Loops: each expression over whole arrays compiles for a second.
+    own, design, data = np.empty(count), np.empty((count, 3)), np.empty((2, count))
+    terms, total, weighted, n = np.empty((2, count, 6)), np.empty((2, count)), np.empty((count, 6)), 0
+    for p in range(weight.size):
+        if weight[p] > 0.0:
+            own[n], data[0, n], data[1, n] = weight[p], shift[0, p], shift[1, p]
+            total[0, n] = total[1, n] = weight[p]
+            sine, cosine = geometry.turn[p, 0], geometry.turn[p, 1]
+            for k in range(3):
+                term = design[n, k] = geometry.design[p, k]
+                terms[0, n, k], terms[0, n, 3 + k] = cosine * term, -sine * term
+                terms[1, n, k], terms[1, n, 3 + k] = sine * term, cosine * term
+                weighted[n, k] = weight[p] * term
+            n += 1
+    normal = weighted[:, :3].copy().T @ design
     determined = np.linalg.det(normal) > _COLLINEAR * normal[0, 0] * normal[1, 1] * normal[2, 2]
-    prior = np.zeros(6) if determined and not few else _SLOPES
-    sine, cosine = turn[:, :1].copy(), turn[:, 1:].copy()
-    terms = (np.hstack((cosine * design, -sine * design)), np.hstack((sine * design, cosine * design)))
-    data, total, scale = (shift[0][rows], shift[1][rows]), (own.copy(), own.copy()), np.ones(2)
-    if few:
-        for i in range(2):
-            away = data[i] - (own * data[i]).sum() / own.sum()
-            scale[i] = np.sqrt((own * away**2).sum() / (rows.size - 1)) + 1e-12
+    scale, before, size = np.ones(2), np.ones(2), np.empty(count)
+    for i in range(2 if few else 0):
+        mean, spread, whole = 0.0, 0.0, 0.0
+        for n in range(count):
+            mean, whole = mean + own[n] * data[i, n], whole + own[n]
+        for n in range(count):
+            spread += own[n] * (data[i, n] - mean / whole) ** 2
+        scale[i] = np.sqrt(spread / (count - 1)) + 1e-12
     for _ in range(1 if few else _ROUNDS):
-        joint, right = np.diag(prior), prior * field.copy().ravel()
+        joint, right = np.zeros((6, 6)), np.zeros(6)
+        for k in range(0 if determined and not few else 6):
+            joint[k, k], right[k] = _SLOPES[k], _SLOPES[k] * field[k // 3, k % 3]
         for i in range(2):
-            weighted = terms[i] * (total[i] / scale[i] ** 2).reshape(-1, 1)
+            for n in range(count):
+                for k in range(6):
+                    weighted[n, k] = terms[i, n, k] * (total[i, n] / scale[i] ** 2)
             joint += weighted.T @ terms[i]
             right += weighted.T @ data[i]
         inverse = np.linalg.inv(joint)
-        solution, before = inverse @ right, scale.copy()
+        solution = inverse @ right
+        for i in range(2):
+            before[i] = scale[i]
         for i in range(0 if few else 2):
-            size = np.abs(data[i] - terms[i] @ solution) * np.sqrt(own)
+            model = terms[i] @ solution
+            for n in range(count):
+                size[n] = abs(data[i, n] - model[n]) * np.sqrt(own[n])
             scale[i] = MAD_TO_SIGMA * np.median(size) + 1e-12
-            copy_into(total[i], own * (_HUBER / np.maximum(size / scale[i], _HUBER)))
+            for n in range(count):
+                total[i, n] = own[n] * (_HUBER / max(size[n] / scale[i], _HUBER))
     for i in range(2):
-        part = slice(3 * i, 3 * i + 3)
-        copy_into(field[i], solution[part])
-        copy_into(covariance[i], inverse[part, part] * (scale[i] / before[i]) ** 2)
+        for j in range(3):
+            field[i, j] = solution[3 * i + j]
+            for k in range(3):
+                covariance[i, j, k] = inverse[3 * i + j, 3 * i + k] * (scale[i] / before[i]) ** 2
     return True
 
 
