@@ -70,7 +70,7 @@ def sheet_spectrum(
     pulse = 2.0 ** -(((frequency_hz - centre) / half) ** 2)
     scattered = (frequency_hz / centre) ** (backscatter_exponent - 2.0)
     lost_db = 2e-7 * attenuation_db_cm_mhz * depth_mm[..., None] * frequency_hz
-    return np.asarray(pulse**2 * scattered * 10.0 ** (-lost_db / 10.0))
+    return pulse**2 * scattered * 10.0 ** (-lost_db / 10.0)
 
 
 def speckle_correlation(

@@ -96,8 +96,9 @@ class Motion:
         by_focus *= np.std(np.sin(problem.patches.angle_rad)) / problem.width_mm
         turn_sigma = np.hypot(slopes.deviation_per_mm, by_focus)
         shared = SharedErrors(float(scale_sigma), curves_sigma, turn_sigma)
-        structure = float(coherence.share.mean())
-        return shared, claimed_covariance(self.poses, self.covariance, problem.centre_mm, shared, structure)
+        return shared, claimed_covariance(
+            self.poses, self.covariance, problem.centre_mm, shared, float(coherence.share.mean())
+        )
 
     def mirrored(self) -> Motion:
         """The motion with the opposite elevational sign."""

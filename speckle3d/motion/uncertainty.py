@@ -45,7 +45,7 @@ def claimed_covariance(
     turn[:, :3, :3] = turn[:, 3:, 3:] = poses.rotation.as_matrix()
     grown = SHARED * (1.0 + STRUCTURE * structure)
     pair_covariance = turn @ (independent * np.outer(grown, grown)) @ turn.transpose(0, 2, 1)
-    covariance = np.asarray(pair_covariance + shared_covariance(poses, centre_mm, shared))
+    covariance = pair_covariance + shared_covariance(poses, centre_mm, shared)
     along = poses.apply(centre_mm)[:, 2:] - poses[0].apply(centre_mm)[2]
     covariance[:, [0, 1], [0, 1]] += ((SIDEWAYS + SIDEWAYS_BY_SHARE * structure) * along) ** 2
     return covariance
@@ -139,10 +139,15 @@ def weigh_slopes(
     """
     offset = planes.offset_mm
     mean_slope = offset @ planes.coefficients[:, 1:] / max(float(offset @ offset), 1e-12)
-    way_mm = max(float(np.abs(np.diff(path[:, 0])).sum()), 1e-6)
+    way_mm = max(np.abs(np.diff(path[:, 0])).sum(), 1e-6)
     steady = way_mm / (way_mm + TURN_CHANGE_MM)
     usual = np.deg2rad(settings.turn_deg_per_mm) ** 2 / steady
-    expected = np.maximum(usual, mean_slope**2 - (BEYOND_DOUBT * false_turn) ** 2)
-    share = expected / (expected + false_turn**2)
+    # What is seen may be a turn although not beyond doubt: the mean square less what is feigned.
+    feigned = false_turn**2
+    share, likely = (
+        1.0 / (1.0 + feigned / np.maximum(usual, mean_slope**2 - doubt * feigned))
+        for doubt in (BEYOND_DOUBT**2, 1.0)
+    )
+    variance = steady * (likely * feigned + ((likely - share) * mean_slope) ** 2)
     information = np.linalg.inv(planes.covariance).sum(axis=0)
-    return SlopeWeights(share, np.sqrt(share * steady) * false_turn, information[0, 1:] / information[0, 0])
+    return SlopeWeights(share, np.sqrt(variance), information[0, 1:] / information[0, 0])
