@@ -19,7 +19,7 @@ class PathRules(NamedTuple):
     trend_mm: float
     same_mm: float
     apart_mm: float
-    apart_slope: float
+    width_mm: float
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
@@ -136,9 +136,9 @@ def follow_paths(
             if (candidates[n, 0] - paths[h, earlier[latest], 0]) * trend[h] < 0.0:
                 total[n] += rules.turning_cost
             for stranger in unlike[unlike_start[f] : unlike_start[f + 1]]:
-                off = abs(candidates[n, 0] - paths[h, stranger, 0])
-                turn = abs(candidates[n, 1] - paths[h, stranger, 1])
-                if off < rules.apart_mm and turn < rules.apart_slope:
+                off = candidates[n, 0] - paths[h, stranger, 0]
+                turned = rules.width_mm * (candidates[n, 1] - paths[h, stranger, 1])
+                if np.hypot(off, turned) < rules.apart_mm:
                     total[n] += rules.cap
             if not moving and candidates[n, 0] < 0.0:
                 # The overall sign is open: of two mirror images one is enough.

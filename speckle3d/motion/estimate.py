@@ -183,9 +183,9 @@ def alike_pairs(problem: MotionProblem, table: CorrelationTable, correlation: Fl
         As measured, or of fully developed speckle as far apart.
     """
     _, begin, count = np.unique(table.second, return_index=True, return_counts=True)
-    is_best = correlation >= np.repeat(np.fmax.reduceat(correlation, begin), count)
-    alike = correlation >= problem.trajectory.least_correlation
-    return np.flatnonzero((alike | is_best) & (table.median >= LEAST_CORRELATION))
+    is_used = correlation >= np.repeat(np.fmax.reduceat(correlation, begin), count)
+    is_used |= correlation >= problem.trajectory.least_correlation
+    return np.flatnonzero(is_used & (table.median >= LEAST_CORRELATION))
 
 
 def _signed_planes(
@@ -214,7 +214,12 @@ def strangers(problem: MotionProblem, table: CorrelationTable) -> Strangers:
     """
     least = problem.trajectory.least_correlation
     far = table.median < least
-    return Strangers(table.first[far], table.second[far], float(problem.typical_distance(np.sqrt(least))) / 2)
+    return Strangers(
+        table.first[far],
+        table.second[far],
+        float(problem.typical_distance(np.sqrt(least))) / 2,
+        problem.width_mm,
+    )
 
 
 def elevation_of(poses: RigidTransform, centre_mm: FloatArray) -> FloatArray:

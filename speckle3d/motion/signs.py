@@ -29,9 +29,6 @@ TURNING_COST = 2.0
 steps of those wobbles get the wrong sign."""
 SAME_MM = 0.05
 """Paths that end this close to each other at all frames still of use are one."""
-APART_SLOPE = 0.01
-"""Frames that turn more than this against each other may differ although their centres meet. Such as turn
-less and do not resemble each other are a pair that disagrees altogether."""
 
 
 class Strangers(NamedTuple):
@@ -42,12 +39,15 @@ class Strangers(NamedTuple):
     first, second : ndarray of int, shape (u,)
         The earlier and the later frame; sorted by the later.
     apart_mm : float
-        How far they are from each other at least.
+        How far their patches are from each other at least, RMS.
+    width_mm : float
+        Standard deviation of the patches' lateral places.
     """
 
     first: IntArray
     second: IntArray
     apart_mm: float
+    width_mm: float
 
 
 def likeliest_path(
@@ -76,16 +76,7 @@ def likeliest_path(
     ndarray, shape (n, 2)
         Position and slope of every frame on the best path.
     """
-    rules = PathRules(
-        HYPOTHESES,
-        RELATIVE_ERROR,
-        OUTLYING,
-        TURNING_COST,
-        TREND_MM,
-        SAME_MM,
-        strangers.apart_mm,
-        APART_SLOPE,
-    )
+    rules = PathRules(HYPOTHESES, RELATIVE_ERROR, OUTLYING, TURNING_COST, TREND_MM, SAME_MM, *strangers[2:])
     path, every = np.zeros((frames, 2)), np.arange(frames + 1)
     start = path[:1] if start is None else start
     path[: len(start)] = start

@@ -10,7 +10,7 @@ from speckle3d.motion.signs import Strangers, likeliest_path, on_path
 
 REACH_MM, KEY_MM, TURN_MM = 0.85, 0.2, 8.0
 """Pairs share speckle up to the first; the second apart, a key frame is kept; a slope's worth in travel."""
-NO_STRANGERS = Strangers(np.zeros(0, int), np.zeros(0, int), 0.0)
+NO_STRANGERS = Strangers(np.zeros(0, int), np.zeros(0, int), 0.0, 0.0)
 
 
 def planes_of(first, second, steps, covariance):
@@ -168,7 +168,7 @@ def wobble_errors(seed, with_strangers):
     first, second, read = np.array(pairs).T
     steps = np.column_stack([read, np.zeros(read.size)])
     covariance = np.tile(np.diag([0.03**2, 1e-8]), (read.size, 1, 1))
-    unlike = Strangers(*np.array(strangers).T, 0.3) if with_strangers else NO_STRANGERS
+    unlike = Strangers(*np.array(strangers).T, 0.3, 5.0) if with_strangers else NO_STRANGERS
     planes = planes_of(first.astype(int), second.astype(int), steps, covariance)
     path = likeliest_path(planes, z.size, unlike)
     step, true = np.diff(path[:, 0]), np.diff(z)
