@@ -138,7 +138,7 @@ def follow_paths(
             for stranger in unlike[unlike_start[f] : unlike_start[f + 1]]:
                 off = candidates[n, 0] - paths[h, stranger, 0]
                 turned = rules.width_mm * (candidates[n, 1] - paths[h, stranger, 1])
-                if np.hypot(off, turned) < rules.apart_mm:
+                if off**2 + turned**2 < rules.apart_mm**2:
                     total[n] += rules.cap
             if not moving and candidates[n, 0] < 0.0:
                 # The overall sign is open: of two mirror images one is enough.
