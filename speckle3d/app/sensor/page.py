@@ -40,7 +40,7 @@ _PLOTS = {
     "heading, °": ("heading",),
 }
 Source = LogReadings | SensorWatch
-_REFRESH_MS, _STEP_S = 125, 0.1
+_REFRESH_MS, _STEP_S = 500, 0.1
 _LEFT_PX = 350
 _KEY = (
     '<span style="color:#6b7780">rate: <span style="color:#b3261e">&mdash; x</span> '
