@@ -41,7 +41,7 @@ class Strangers(NamedTuple):
     apart_mm : float
         How far their patches are from each other at least, RMS.
     width_mm : float
-        Standard deviation of the patches' lateral places.
+        Standard deviation of the lever arms of the slope, which adds to the distance in quadrature.
     """
 
     first: IntArray

@@ -157,26 +157,27 @@ def wobble_errors(seed, with_strangers):
     time_s = np.arange(60) / 25.0
     z = 0.3 * np.sin(2.0 * np.pi * 3.0 * time_s + rng.uniform(0.0, 2.0 * np.pi)) + 2.5 * time_s
     z = (z - z[0]) * np.sign(z[1] - z[0])
+    yaw = 0.02 * np.sin(2.0 * np.pi * time_s)
     pairs, strangers = [], []
     for frame in range(1, z.size):
         before = np.arange(max(0, frame - 8), frame)
         apart = np.abs(z[frame] - z[before])
         near = sorted({frame - 1, *before[apart < 0.35]})
-        read = np.abs(z[frame] - z[near]) * (1.0 + 0.05 * rng.standard_normal(len(near))) + 0.005
-        pairs += [(i, frame, d) for i, d in zip(near, read, strict=True)]
+        move = z[frame] - z[near]
+        read = np.abs(move) * (1.0 + 0.05 * rng.standard_normal(move.size)) + 0.005
+        turn = np.sign(move) * (yaw[frame] - yaw[near])
+        pairs += zip(near, [frame] * move.size, read, turn, strict=True)
         strangers += [(i, frame) for i in before[apart > 0.6]]
-    first, second, read = np.array(pairs).T
-    steps = np.column_stack([read, np.zeros(read.size)])
-    covariance = np.tile(np.diag([0.03**2, 1e-8]), (read.size, 1, 1))
+    first, second, *steps = np.array(pairs).T
     unlike = Strangers(*np.array(strangers).T, 0.3, 5.0) if with_strangers else NO_STRANGERS
-    planes = planes_of(first.astype(int), second.astype(int), steps, covariance)
+    planes = planes_of(*np.array([first, second], int), np.transpose(steps), np.diag([0.03, 0.02]) ** 2)
     path = likeliest_path(planes, z.size, unlike)
     step, true = np.diff(path[:, 0]), np.diff(z)
     return int(((np.sign(step) != np.sign(true)) & (np.abs(true) > 0.05)).sum())
 
 
 def test_frames_that_do_not_resemble_each_other_are_apart():
-    """Measured: 3, and 132 where nothing is said of strangers."""
+    """Measured: 3, and 138 where nothing is said of strangers; 93 without those that turn by 0.01 rad."""
     with_strangers, without = (sum(wobble_errors(seed, w) for seed in range(6)) for w in (True, False))
     assert with_strangers <= 4
     assert without > 80
