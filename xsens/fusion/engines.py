@@ -105,8 +105,8 @@ class Filter:
         rows["north"] = self._heading.follow(rows, to_end) if self.magnetic else UNKNOWN
         step_of_sample = np.searchsorted(rows["last"], np.arange(1, len(samples) + 1), side="right")
         step_of_sample = np.maximum(step_of_sample + len(self.last) - 1, 0)
-        steps = np.concatenate([self.last, rows])
-        self.last = steps[-1:]
+        steps = np.concatenate([self.last, rows]) if len(self.last) else rows
+        self.last = steps[-1:].copy()
         if not len(steps):
             steps = np.zeros(1, kernel.STEP)
             steps["north"] = UNKNOWN
@@ -149,10 +149,10 @@ def _at_samples(
 
     When in its interval a gyroscope's reading is taken is not known: half of it is claimed as well.
     """
-    bias_rad_s = steps["bias"][of_sample]
+    bias_rad_s = steps["bias"].take(of_sample, axis=0)
     late_rad = 0.5 * median(samples.step_s) * rotate_rows(xyzw, samples.rate_rad_s - bias_rad_s)
-    _, _, distrust, stray, iron = steps["north"][of_sample].T
-    sd_rad = np.sqrt(np.square(sd_rad)[of_sample] + late_rad**2)
+    distrust, stray, iron = steps["north"][:, 2:].T.take(of_sample, axis=1)
+    sd_rad = np.sqrt(np.square(sd_rad).take(of_sample, axis=0) + late_rad**2)
     return Estimate(xyzw, sd_rad, bias_rad_s, distrust > 0.0, steps["resting"][of_sample], stray, iron)
 
 

@@ -146,10 +146,10 @@ class HeadingFilter:
     def follow(self, rows: Any, to_end: bool = False) -> FloatArray:
         """Values as in `UNKNOWN` after each step by the last whole bin; `to_end` what is left is one."""
         before, north = len(self._rows), self._north
-        rows = np.concatenate([self._rows, rows])
+        rows = np.concatenate([self._rows, rows]) if before else rows
         bin_of_row = (np.arange(before, len(rows)) + 1) // STEPS_PER_BIN + len(north) - 1
         whole = len(rows) if to_end else len(rows) // STEPS_PER_BIN * STEPS_PER_BIN
-        self._rows = rows[whole:]
+        self._rows = rows[whole:].copy()
         if whole:
             bins = averaged_bins(rows[:whole])
             estimates = self._run(bins)

@@ -153,8 +153,10 @@ def lost_variance(time_s: FloatArray, rate_rad_s: FloatArray, usual_s: float) ->
     Its shape is (m - 1,). The rate may change as much as it did from the sample before to the one after.
     """
     step_s = np.diff(time_s)
-    gap = (step_s > LOST * usual_s) & (step_s <= PAUSE_S)
-    return gap * (step_s * row_norms(np.diff(rate_rad_s, axis=0))) ** 2
+    gap = np.flatnonzero((step_s > LOST * usual_s) & (step_s <= PAUSE_S))
+    variance = np.zeros_like(step_s)
+    variance[gap] = (step_s[gap] * row_norms(rate_rad_s[gap + 1] - rate_rad_s[gap])) ** 2
+    return variance
 
 
 def _interpolated_means(

@@ -143,41 +143,37 @@ def _turns(time_s: FloatArray, rate: Any, directions: dict[str, FloatArray]) -> 
     rows: Any = np.flatnonzero(finite_rows(rate)) if directions else []
     if len(rows) <= _FEWEST:
         return
+    from speckle3d.kernels.orientation.windows import window_sums  # which loads numba
+
     steps_s: Any = np.diff(time_s[rows], append=time_s[rows[-1]])
-    usual_s, rate_rad_s = median(steps_s), _rms(rate[rows])
+    usual_s, rates = median(steps_s), rate[rows]
     width = max(1, round(_WINDOW_S / usual_s))
-    # Shapes are (..., width, count): sums run over windows that lie side by side.
-    steps_s, rows = (values[: len(rows) // width * width].reshape(-1, width).T for values in (steps_s, rows))
-    rates = rate.T.take(rows, axis=1)
-    # Sums in each window's first axes, of the directions and of what rests in the sensor's axes.
-    turn = np.repeat(np.eye(3)[:, :, None], rows.shape[1], axis=2)
-    readings = np.nan_to_num([part.T for part in directions.values()])
-    carried, sums = 0.0 * turn, 0.0 * readings[..., rows[0]]
-    for k, row in enumerate(rows):
-        sums += np.einsum("ijn,djn->din", turn, readings.take(row, axis=2))
-        carried += turn / width
-        step = Rotation.from_rotvec((rates[:, k] * steps_s[k]).T).as_matrix()
-        turn = np.einsum("ijn,jkn->ikn", turn, np.ascontiguousarray(np.moveaxis(step, 0, 2)))
-    turn = turn[..., :-1]
-    iron = (carried[..., 1:] - np.einsum("jin,jkn->ikn", turn, carried[..., :-1])).transpose(1, 2, 0)
-    turn_rad = Rotation.from_matrix(np.moveaxis(turn, 2, 0)).as_rotvec().T[:, :, None]
-    even, same = (steps_s <= 2.0 * usual_s).all(axis=0), (rates == rates[:, :1]).all(axis=1)[:, :-1]
+    readings = np.stack([part[rows] for part in directions.values()])
+    turn, carried, sums = window_sums(steps_s, rates, readings, width)
+    rotations = Rotation.from_quat(turn[:-1])
+    back, turns_rad = rotations.inv().as_matrix(), rotations.as_rotvec()
+    # What rests in the sensor's axes makes so much of a direction's turn.
+    iron = np.moveaxis(carried[1:] - back @ carried[:-1], 2, 0)
+    windows, rate_rad_s = len(turn) * width, _rms(rates)
+    even = (steps_s[:windows].reshape(-1, width) <= 2.0 * usual_s).all(axis=1)
+    rates = rates[:windows].reshape(-1, width, 3)
+    same = (rates == rates[:, :1]).all(axis=1)[:-1].T
     same &= ~same.all(axis=0)
-    for name, direction, mean in zip(directions, readings, sums, strict=True):
-        norms = row_norms(direction.T)[rows]
-        count = np.maximum((norms > 0.0).sum(axis=0), 1)
-        length = norms.sum(axis=0) / count
+    for name, window in zip(directions, sums, strict=True):
+        count = np.maximum(window[:, 4], 1.0)
+        length = window[:, 3] / count
         usual = max(median(length), 1e-9)
         calm = (np.abs(length / usual - 1.0) < _CALM) & even
         calm = calm[1:] & calm[:-1]
         if calm.sum() < _FEWEST:
             continue
-        mean = mean / (usual * count)
-        ahead = np.einsum("jin,jn->in", turn, mean[:, :-1])
-        before, ahead, after = (part.T[calm] for part in (mean[:, :-1], ahead, mean[:, 1:]))
+        mean = window[:, :3] / (usual * count)[:, None]
+        before, after = mean[:-1][calm], mean[1:][calm]
+        ahead = (back[calm] @ before[:, :, None])[:, :, 0]
         coherence = usual * median(row_norms(after) / length[1:][calm])
         arms = np.cross(0.5 * (ahead + before), np.eye(3)[:, None])
-        missed, *expected = _without(arms, [after - ahead, ahead - before, *(arms * turn_rad[:, calm])])
+        turned = arms * turns_rad[calm].T[:, :, None]
+        missed, *expected = _without(arms, [after - ahead, ahead - before, *turned])
         (unlike_iron,) = _without(np.concatenate([arms, iron[:, calm]]), [missed])
         yield name, _Turns(expected, missed, unlike_iron, arms, same[:, calm], rate_rad_s, coherence)
 
@@ -191,13 +187,12 @@ def _without(columns: FloatArray, parts: Sequence[FloatArray]) -> FloatArray:
 
 def _dead_axis(rate: FloatArray, direction: FloatArray) -> str:
     """Axis in which a direction never changes, although it turns in the sensor's axes; empty if none."""
-    valid = finite_rows(rate) & finite_rows(direction)
-    rows = direction[valid]
-    for k in range(3):
-        if len(rows) > _FEWEST and (rows[:, k] == rows[0, k]).all():
-            turned = np.cross(rows, rate[valid])[:, k : k + 1]
-            if _rms(turned) > 2.0 * _MOVING_RAD_S * median_norm(rows):
-                return "xyz"[k]
+    for k in np.flatnonzero(np.fmin.reduce(direction) == np.fmax.reduce(direction)):
+        valid = finite_rows(rate) & finite_rows(direction)
+        rows = direction[valid]
+        turned = np.cross(rows, rate[valid])[:, k : k + 1]
+        if len(rows) > _FEWEST and _rms(turned) > 2.0 * _MOVING_RAD_S * median_norm(rows):
+            return "xyz"[k]
     return ""
 
 

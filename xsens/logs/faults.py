@@ -126,8 +126,7 @@ def _bad(name: str, rows: FloatArray, force: FloatArray, rate: FloatArray) -> di
     valid &= ~beyond
     repeats = np.zeros_like(valid)
     if valid.any():
-        parts = (part.T.compress(valid, axis=1).T for part in (rows, force, rate))
-        repeats[valid] = _repeats(name, limits.change * unit, *parts)
+        repeats[valid] = _repeats(name, limits.change * unit, valid, rows, force, rate)
     valid &= ~repeats
     rows = np.where(valid[:, None], rows, np.nan)
     return {
@@ -141,16 +140,20 @@ def _bad(name: str, rows: FloatArray, force: FloatArray, rate: FloatArray) -> di
     }
 
 
-def _repeats(name: str, change: float, rows: FloatArray, force: FloatArray, rate: FloatArray) -> Any:
-    """Rows that repeat the one before for longer than two samples of the sensor's rate, and then change.
+def _repeats(
+    name: str, change: float, valid: BoolArray, rows: FloatArray, force: FloatArray, rate: FloatArray
+) -> Any:
+    """Valid rows that repeat the one before, longer than two samples of the sensor's rate, and then change.
 
     One in ten of a sensor's samples may last longer: its rate is another than that of the log.
     Where readings before and after change by many of their last digits, none is repeated by chance.
     """
+    rows = rows.T.compress(valid, axis=1).T
     start = np.flatnonzero(np.append(True, (rows[1:] != rows[:-1]).any(axis=1)))
     length = np.diff(np.append(start, len(rows)))
     if length.max() <= 2:
         return False
+    force, rate = force[valid], rate[valid]
     middle, high = np.percentile(length, [50, 90]) if len(length) > 1 else (1, 1)
     usual = int(min(3.0 * middle, high))
     steps = np.diff(rows, axis=0)
@@ -225,10 +228,13 @@ def _cut_off(axis: FloatArray, least: float) -> Any:
 
 def _spikes(rows: FloatArray, height: float) -> BoolArray:
     """Single rows far from both neighbours, which are near each other."""
-    neighbours = np.pad(rows, ((1, 1), (0, 0)), mode="reflect")
-    before, after = neighbours[:-2], neighbours[2:]
-    away = row_norms(rows - 0.5 * (before + after))
-    return (away > height) & (row_norms(after - before) < 0.2 * away)
+    spikes = np.pad(row_norms(np.diff(rows, axis=0)) > height, 1)
+    spikes = spikes[1:] | spikes[:-1]  # where one may be
+    index = np.flatnonzero(spikes)
+    before, after = rows[abs(index - 1)], rows[len(rows) - 1 - abs(len(rows) - 2 - index)]
+    away = row_norms(rows[index] - 0.5 * (before + after))
+    spikes[index] = (away > height) & (row_norms(after - before) < 0.2 * away)
+    return spikes
 
 
 def _wrapped(rows: FloatArray) -> BoolArray:
@@ -241,6 +247,8 @@ def _wrapped(rows: FloatArray) -> BoolArray:
         steps = np.diff(axis, prepend=axis[:1])
         size = np.abs(steps)
         jump = size > _END_TO_END * np.fmax.reduce(np.abs(axis), initial=0.0)
+        if not jump.any():
+            continue
         jump &= size > _NOISY * usual_step(size, np.inf)
         rough = np.pad(~jump & (size > 0.1 * np.fmax.reduce(size)), 1)
         jump &= ~(rough[:-2] | rough[2:])

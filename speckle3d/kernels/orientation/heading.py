@@ -9,7 +9,14 @@ from typing import Any
 import numpy as np
 
 from speckle3d.core.arrays import FloatArray
-from speckle3d.kernels.orientation.rotations import compiled, inverse, norm, transported
+from speckle3d.kernels.orientation.rotations import (
+    add_product,
+    compiled,
+    inverse,
+    norm,
+    subtract_product,
+    transported,
+)
 
 ROOM, BIAS, IRON, PLACE, STRAY, LAG, SIZE = 0, 3, 6, 9, 12, 15, 16
 """Places in the state: the room's field (level axes), what is left of the gyroscope's bias (sensor axes), the
@@ -133,7 +140,7 @@ def find_headings(
     states, covariances, transitions, noises : ndarray, shapes (k, n, SIZE) and (k, n, SIZE, SIZE), or k = 0
         Filled: after each bin, and from the one before to it.
     """
-    rows, f, q = np.zeros((3, SIZE)), np.zeros((SIZE, SIZE)), np.zeros((SIZE, SIZE))
+    f, q = np.zeros((SIZE, SIZE)), np.zeros((SIZE, SIZE))
     for j in range(models.shape[0]):
         s, m = filters[j], models[j]
         for k in range(bins.shape[0]):
@@ -144,7 +151,7 @@ def find_headings(
             if s.begun:
                 _predict(s, b, m, f, q)
                 if b.seen:
-                    _correct(s, b, m, rows, f, q, out)
+                    _correct(s, b, m, f, q, out)
                 out.turn_rad, out.variance = turn_to_north(s.x, s.p)
                 if states.shape[0] > 0:
                     states[j, k], covariances[j, k], transitions[j, k], noises[j, k] = s.x, s.p, f, q
@@ -214,12 +221,14 @@ def _predict(s: Any, b: Any, m: Any, f: FloatArray, q: FloatArray) -> None:
     q[ROOM + 1, ROOM + 1] += b.slip_rad2 * across * across
     q[ROOM, ROOM + 1] = q[ROOM + 1, ROOM] = -b.slip_rad2 * across * along
     s.changing_s = max(s.changing_s - span, 0.0)
-    s.x[:] = f @ s.x
+    x = s.x.copy()
+    s.x[:] = 0.0
+    add_product(s.x, f, x)
     s.p[:] = transported(f, s.p) + q
 
 
 @compiled
-def _correct(s: Any, b: Any, m: Any, rows: FloatArray, f: FloatArray, q: FloatArray, out: Any) -> None:
+def _correct(s: Any, b: Any, m: Any, f: FloatArray, q: FloatArray, out: Any) -> None:
     """Correct by a reading, the less the less likely it is: its errors have Student's distribution.
 
     An outlier is left out: what disturbs it may last longer than a stray does.
@@ -227,12 +236,8 @@ def _correct(s: Any, b: Any, m: Any, rows: FloatArray, f: FloatArray, q: FloatAr
     Of fields only that of the room is turned by errors of the heading: place and stray have random
     directions, and turned they are as likely; a linear filter would take their turns for knowledge of it.
     """
-    for i in range(3):
-        rows[i, ROOM + i] = rows[i, PLACE + i] = rows[i, STRAY + i] = 1.0
-        rows[i, LAG] = b.field_rate[i] / s.norm
-        rows[i, IRON : IRON + 3] = b.level[i]
     for again in (False, True):
-        off, cross, total = _innovation(s, b, m, rows)
+        off, cross, total = _innovation(s, b)
         weight, determinant = inverse(total)
         misfit = float(off @ (weight @ off))
         if not (again or b.resting):
@@ -251,9 +256,11 @@ def _correct(s: Any, b: Any, m: Any, rows: FloatArray, f: FloatArray, q: FloatAr
         extra = (1.0 / out.trust - 1.0) * np.trace(total) / 3.0
         weight, _ = inverse(total + extra * np.eye(3))
     gain = cross @ weight
-    s.x[:] += gain @ off
-    p = s.p - gain @ cross.T
-    s.p[:] = 0.5 * (p + p.T)
+    add_product(s.x, gain, off)
+    subtract_product(s.p, gain, cross)
+    for i in range(SIZE):
+        for j in range(i):
+            s.p[i, j] = s.p[j, i] = 0.5 * (s.p[i, j] + s.p[j, i])
 
 
 @compiled
@@ -277,17 +284,30 @@ def _foresee_change(s: Any, m: Any, f: FloatArray, q: FloatArray, off: FloatArra
 
 
 @compiled
-def _innovation(s: Any, b: Any, m: Any, rows: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _innovation(s: Any, b: Any) -> tuple[FloatArray, FloatArray, FloatArray]:
     """The reading less what is expected, its covariance with the state, and its own.
 
     The last holds its noise, and what the level axes' tilt makes of the field.
     """
-    cross = s.p @ rows.T
-    total = rows @ cross
+    cross, total, off = np.zeros((SIZE, 3)), np.zeros((3, 3)), b.field / s.norm
+    for j in range(SIZE):
+        _add_field(s, b, s.p[j], 1.0, cross[j])
+    for i in range(3):
+        _add_field(s, b, cross[:, i], 1.0, total[i])
+    _add_field(s, b, s.x, -1.0, off)
     across, up = s.x[ROOM] ** 2 + s.x[ROOM + 1] ** 2, s.x[ROOM + 2] ** 2
     for i in range(3):
         total[i, i] += _NOISE_SQRT_S**2 / b.span_s + b.tilt_rad2 * (up if i < 2 else across)
-    return b.field / s.norm - rows @ s.x, cross, total
+    return off, cross, total
+
+
+@compiled
+def _add_field(s: Any, b: Any, x: FloatArray, factor: float, field: FloatArray) -> None:
+    """Add the field that a state has the sensor read, times a factor."""
+    for i in range(3):
+        iron = b.level[i, 0] * x[IRON] + b.level[i, 1] * x[IRON + 1] + b.level[i, 2] * x[IRON + 2]
+        late = b.field_rate[i] / s.norm * x[LAG]
+        field[i] += factor * (x[ROOM + i] + x[PLACE + i] + x[STRAY + i] + iron + late)
 
 
 @compiled

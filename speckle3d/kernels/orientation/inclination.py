@@ -27,9 +27,11 @@ import numpy as np
 from speckle3d.core.arrays import FloatArray
 from speckle3d.kernels.orientation.rotations import (
     Quaternion,
+    add_product,
     compiled,
     inverse,
     invert,
+    matrix_product,
     norm,
     product,
     quaternion,
@@ -233,9 +235,8 @@ def _complete(s: Any, step: Any, f: FloatArray) -> None:
     else:
         _correct_by_speed(s, step)
         if s.resting:
-            off = step.rate - s.bias
             gain = _correct(s.p, BIAS, _REST_BIAS_RAD**2 / step.duration_s, _LEVEL)
-            _inject(s, gain @ off)
+            _inject(s, gain, step.rate - s.bias)
     step.level[:], step.speed[:], step.bias[:] = s.level, s.speed, s.bias
     step.resting, step.started = s.resting, not s.starting
     for i in range(6):
@@ -313,9 +314,11 @@ def _predict(s: Any, step: Any, f: FloatArray) -> None:
     f[:] = np.eye(SIZE)
     span = 0.0 if s.resting else duration
     for j in range(3):
-        axis = np.array(rotate(level, three(_AXES[j])))
-        f[:BIAS, BIAS + j] = -span * axis
-        f[SPEED:, BIAS + j] = span * np.cross(axis, s.speed)
+        x, y, z = rotate(level, three(_AXES[j]))
+        u, v, w = three(s.speed)
+        f[0, BIAS + j], f[1, BIAS + j], f[2, BIAS + j] = -span * x, -span * y, -span * z
+        f[SPEED, BIAS + j], f[SPEED + 1, BIAS + j] = span * (y * w - z * v), span * (z * u - x * w)
+        f[SPEED + 2, BIAS + j] = span * (x * v - y * u)
     f[6, 1], f[7, 0] = GRAVITY_M_S2 * duration, -GRAVITY_M_S2 * duration
     shock = max(norm(step.force) - _SHOCK_M_S2 * duration, 0.0)  # a knock, whose reading may be cut off
     noise = _GYRO_NOISE_RAD_SQRT_S**2 + (s.scale_noise_sqrt_s * norm(step.rate - s.bias)) ** 2
@@ -344,7 +347,7 @@ def _correct_by_speed(s: Any, step: Any) -> None:
     speed, time_s = (_REST_SPEED_M_S, _REST_TIME_S) if s.resting else (SPEED_M_S, _SPEED_TIME_S)
     up = np.array(rotate(invert(quaternion(s.level)), (0.0, 0.0, 1.0)))
     gain = _correct(s.p, SPEED, 2.0 * speed**2 * time_s / step.duration_s, up)
-    _inject(s, -gain @ s.speed)
+    _inject(s, gain, -s.speed)
 
 
 _LEVEL, _AXES, _NO_TURN = np.zeros(3), np.eye(3), np.array([0.0, 0.0, 0.0, 1.0])
@@ -357,7 +360,10 @@ def _correct(p: FloatArray, first: int, variance: float, up: FloatArray) -> Floa
     The heading is found elsewhere, and corrected by nothing; nor is the bias about `up`.
     """
     cross = p[:, first : first + 3].copy()
-    gain = cross @ inverse(cross[first : first + 3] + variance * np.eye(3))[0]
+    total = cross[first : first + 3].copy()
+    for i in range(3):
+        total[i, i] += variance
+    gain = matrix_product(cross, inverse(total)[0])
     gain[2] = 0.0
     for j in range(3):
         about_up = up[0] * gain[3, j] + up[1] * gain[4, j] + up[2] * gain[5, j]
@@ -369,8 +375,10 @@ def _correct(p: FloatArray, first: int, variance: float, up: FloatArray) -> Floa
 
 
 @compiled
-def _inject(s: Any, error: FloatArray) -> None:
+def _inject(s: Any, gain: FloatArray, off: FloatArray) -> None:
     """Apply the estimated error to the state."""
+    error = np.zeros(SIZE)
+    add_product(error, gain, off)
     turn = quaternion_of(error[0], error[1], error[2])
     s.level[:] = product(turn, quaternion(s.level))
     s.speed[:] = rotate(turn, three(s.speed))

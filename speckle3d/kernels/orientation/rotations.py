@@ -108,6 +108,25 @@ def transported(f: FloatArray, p: FloatArray) -> FloatArray:
 
 
 @compiled
+def matrix_product(a: FloatArray, b: FloatArray) -> FloatArray:
+    """``a @ b`` of small matrices, which a library takes longer to be called for."""
+    out = np.zeros((a.shape[0], b.shape[1]))
+    for i in range(a.shape[0]):
+        for k in range(a.shape[1]):
+            for j in range(b.shape[1]):
+                out[i, j] += a[i, k] * b[k, j]
+    return out
+
+
+@compiled
+def add_product(x: FloatArray, a: FloatArray, b: FloatArray) -> None:
+    """Add ``a @ b`` to the vector `x`."""
+    for i in range(a.shape[0]):
+        for k in range(a.shape[1]):
+            x[i] += a[i, k] * b[k]
+
+
+@compiled
 def subtract_product(p: FloatArray, a: FloatArray, b: FloatArray) -> None:
     """Subtract ``a @ b.T`` from `p`; both have three columns."""
     for i in range(p.shape[0]):

@@ -13,13 +13,16 @@ import numpy as np
 from speckle3d.core.arrays import FloatArray
 from speckle3d.kernels.orientation.inclination import BIAS, SIZE, SPEED
 from speckle3d.kernels.orientation.rotations import (
+    add_product,
     compiled,
     invert,
+    matrix_product,
     product,
     quaternion,
     quaternion_of,
     rotate,
     three,
+    transported,
     turn_by,
     vector_of,
 )
@@ -69,16 +72,18 @@ def smooth_steps(
     speed, off = steps[n - 1].speed.copy(), np.empty(SIZE)
     for k in range(n - 2, first - 1, -1):
         step, after, f, p = steps[k], steps[k + 1], transition[k + 1], covariance[k]
-        ahead = f @ p
-        forecast = ahead @ f.T + np.diag(after.noise)
-        gain = np.linalg.solve(forecast, ahead).T
-        covariance[k] = p + gain @ (covariance[k + 1] - forecast) @ gain.T
+        forecast = transported(f, p)
+        for i in range(SIZE):
+            forecast[i, i] += after.noise[i]
+        gain: Any = np.linalg.solve(forecast, matrix_product(f, p)).T
+        covariance[k] = p + transported(gain, covariance[k + 1] - forecast)
         turn = product(quaternion(levels[k + 2]), invert(quaternion(after.predicted)))
         off[:3] = vector_of(turn)
         off[3:6] = biases[k + 2] - step.bias
         off[6:] = speed
         off[6:] -= np.array(rotate(turn, three(after.predicted_speed)))
-        error = gain @ off
+        error = np.zeros(SIZE)
+        add_product(error, gain, off)
         turn = quaternion_of(error[0], error[1], error[2])
         levels[k + 1] = product(turn, quaternion(step.level))
         biases[k + 1] = step.bias + error[BIAS:SPEED]
