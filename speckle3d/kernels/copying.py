@@ -4,10 +4,10 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
+from numba.extending import register_jitable
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
+@register_jitable(fastmath=False, error_model="numpy")
 def copy_into(target: npt.NDArray[Any], source: npt.NDArray[Any]) -> None:
     """Copy an array into another of its shape.
 

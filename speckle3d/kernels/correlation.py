@@ -3,7 +3,7 @@
 from typing import Any
 
 import numpy as np
-from numba import njit
+from numba.extending import register_jitable
 
 from speckle3d.core.arrays import Float32Array, FloatArray
 
@@ -21,7 +21,7 @@ Sums = tuple[float, float, float, float, float]
 """At each of `LAGS`."""
 
 
-@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+@register_jitable(fastmath=False, error_model="numpy")
 def common_window(first: Lag, size: Lag, shape: Lag, lag: Lag, least_overlap: float) -> Window:
     """Part of a patch that stays inside the other image at a lag and its neighbours; empty if too small."""
     v0, v1 = max(first[0], 1 - lag[0]), min(first[0] + size[0], shape[0] - 1 - lag[0])
@@ -31,7 +31,7 @@ def common_window(first: Lag, size: Lag, shape: Lag, lag: Lag, least_overlap: fl
     return v0, v1, s0, s1
 
 
-@njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")
+@register_jitable(fastmath=_FAST, error_model="numpy")
 def _sums(
     a: Float32Array, b: Float32Array, window: Window, lag: Lag
 ) -> tuple[float, float, Sums, Sums, Sums]:
@@ -53,7 +53,7 @@ def _sums(
     return total, square, (p0, p1, p2, p3, p4), (t0, t1, t2, t3, t4), (q0, q1, q2, q3, q4)
 
 
-@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+@register_jitable(fastmath=False, error_model="numpy")
 def correlate_patch(
     fixed: Float32Array, moving: Float32Array, window: Window, lag: Lag, out: FloatArray
 ) -> None:
@@ -76,13 +76,15 @@ def correlate_patch(
         out[k] = (products[k] - a * others[k] / n) / np.sqrt(a_variance * variance) if varies else np.nan
 
 
-@njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")
-def _added(x, y, re, im, real, imaginary, power):  # type: ignore[no-untyped-def]
+@register_jitable(fastmath=_FAST, error_model="numpy")
+def _added(
+    x: float, y: float, re: float, im: float, real: float, imaginary: float, power: float
+) -> tuple[float, float, float]:
     """Sums of conj(x + iy) (re + i im) and of its second factor's power, with one more sample."""
     return real + x * re + y * im, imaginary + x * im - y * re, power + re * re + im * im
 
 
-@njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")
+@register_jitable(fastmath=_FAST, error_model="numpy")
 def _echo_sums(
     a: Float32Array, b: Float32Array, turn: Float32Array, window: Window, lag: Lag
 ) -> tuple[float, Sums, Sums, Sums]:
@@ -106,7 +108,7 @@ def _echo_sums(
     return own, (r0, r1, r2, r3, r4), (i0, i1, i2, i3, i4), (p0, p1, p2, p3, p4)
 
 
-@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+@register_jitable(fastmath=False, error_model="numpy")
 def cohere_patch(
     fixed: Float32Array, moving: Float32Array, turn: Float32Array, window: Window, lag: Lag, out: FloatArray
 ) -> None:
@@ -127,14 +129,15 @@ def cohere_patch(
         out[k] = (real[k] ** 2 + imaginary[k] ** 2) / both if both > 0.0 else np.nan
 
 
-@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+@register_jitable(fastmath=False, error_model="numpy")
 def phase_ramp(size: Lag, lateral_rad: float, axial_rad: float) -> Float32Array:
     """Cosine and sine of a phase that rises by so much per vector and sample of a patch, shape (2, v, s)."""
-    across = np.exp(1j * lateral_rad * np.arange(size[0]))
-    along = np.exp(1j * axial_rad * np.arange(size[1]))
-    out = np.empty((2, size[0], size[1]), np.float32)
+    along, out = np.empty((2, size[1])), np.empty((2, size[0], size[1]), np.float32)
+    for s in range(size[1]):
+        along[0, s], along[1, s] = np.cos(axial_rad * s), np.sin(axial_rad * s)
     for v in range(size[0]):
+        cosine, sine = np.cos(lateral_rad * v), np.sin(lateral_rad * v)
         for s in range(size[1]):
-            phase = across[v] * along[s]
-            out[0, v, s], out[1, v, s] = phase.real, phase.imag
+            out[0, v, s] = cosine * along[0, s] - sine * along[1, s]
+            out[1, v, s] = cosine * along[1, s] + sine * along[0, s]
     return out

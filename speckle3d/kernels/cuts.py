@@ -8,6 +8,7 @@ import math
 
 import numpy as np
 from numba import njit
+from numba.extending import register_jitable
 
 from speckle3d.core.arrays import Float32Array, FloatArray
 from speckle3d.kernels.slicing import bilinear
@@ -16,8 +17,10 @@ EDGE_TOLERANCE = 1e-6
 """Fraction of a pixel by which a point may miss the border: rounding of poses."""
 
 
-@njit(cache=True, inline="always", error_model="numpy", fastmath=False)
-def _clip(first: float, last: float, start: float, step: float, low: float, high: float):  # type: ignore[no-untyped-def]
+@register_jitable(fastmath=False, error_model="numpy")
+def _clip(
+    first: float, last: float, start: float, step: float, low: float, high: float
+) -> tuple[float, float]:
     """Shrink [first, last] to where ``low <= start + step * k <= high``, rounding aside."""
     if abs(step) < 1e-12:
         inside = low - EDGE_TOLERANCE <= start <= high + EDGE_TOLERANCE
@@ -26,8 +29,8 @@ def _clip(first: float, last: float, start: float, step: float, low: float, high
     return max(first, min(a, b)), min(last, max(a, b))
 
 
-@njit(cache=True, inline="always", error_model="numpy", fastmath=False)
-def _coordinate(matrix, row, point):  # type: ignore[no-untyped-def]
+@register_jitable(fastmath=False, error_model="numpy")
+def _coordinate(matrix: FloatArray, row: int, point: FloatArray) -> tuple[float, float]:
     """One coordinate of a point of the world, and its change with the line's step."""
     start = matrix[row, 3]
     step = 0.0

@@ -4,6 +4,7 @@ from math import factorial
 
 import numpy as np
 from numba import njit
+from numba.extending import register_jitable
 
 from speckle3d.core.arrays import FloatArray
 
@@ -14,7 +15,7 @@ _QUARTER, _QUARTER_REST = 1.5707963267948966, 6.123233995736766e-17
 """A right angle, and what double precision leaves of it."""
 
 
-@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+@register_jitable(fastmath=False, error_model="numpy")
 def _cosine_and_sine(angle: float) -> tuple[float, float]:
     """Cosine and sine to a few rounding errors, without a branch, for vectorised loops.
 

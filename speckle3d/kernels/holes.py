@@ -3,6 +3,7 @@
 import numpy as np
 import numpy.typing as npt
 from numba import njit
+from numba.extending import register_jitable
 
 from speckle3d.core.arrays import ByteArray, Float32Array, FloatArray, IntArray
 from speckle3d.core.volume import EMPTY, FILLED, MEASURED
@@ -64,7 +65,7 @@ def fill_planes(voxels: Float32Array, state: ByteArray, boxes: IntArray, first: 
                             holes = True
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
+@register_jitable(fastmath=False, error_model="numpy")
 def _add_plane(voxels: Float32Array, state: ByteArray, total: FloatArray, count: CountArray) -> None:
     """Add the measured voxels of a plane to the sum and the number so far."""
     for j in range(voxels.shape[0]):

@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
+from numba.extending import register_jitable
 
 from speckle3d.core.arrays import BoolArray, Complex64Array, Float32Array, FloatArray, IntArray
 from speckle3d.core.leastsquares import MAD_TO_SIGMA
@@ -101,7 +102,7 @@ class Matches(NamedTuple):
     covariance: FloatArray
 
 
-@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+@register_jitable(fastmath=False, error_model="numpy")
 def _take_logarithms(rho: FloatArray) -> bool:
     """Replace a patch's correlations by their logarithms if all of them carry, and tell whether they do."""
     for k in range(rho.size):
@@ -112,13 +113,13 @@ def _take_logarithms(rho: FloatArray) -> bool:
     return True
 
 
-@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+@register_jitable(fastmath=False, error_model="numpy")
 def _vertex(before: float, at: float, after: float) -> float:
     curvature = before - 2.0 * at + after
     return (before - after) / (2.0 * curvature) if curvature < 0.0 else np.nan
 
 
-@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+@register_jitable(fastmath=False, error_model="numpy")
 def _peak(z: FloatArray, logarithmic: bool) -> tuple[float, float, float]:
     """Sub-sample peak of a patch from parabolas through ln(rho), with its weight."""
     lateral, axial = _vertex(z[0], z[2], z[4]), _vertex(z[1], z[2], z[3])
@@ -129,7 +130,7 @@ def _peak(z: FloatArray, logarithmic: bool) -> tuple[float, float, float]:
     return lateral, axial, peak**2 / (1.0 - peak**2)
 
 
-@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+@register_jitable(fastmath=False, error_model="numpy")
 def _read(z: FloatArray, logarithmic: bool, lateral: float, axial: float) -> float:
     """Correlation a fraction of a lag off the centre, by parabolas through ln(rho) in both directions.
 
@@ -141,15 +142,19 @@ def _read(z: FloatArray, logarithmic: bool, lateral: float, axial: float) -> flo
     return float(np.exp(value)) if logarithmic else value
 
 
-@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
-def _places(geometry: Geometry, field: FloatArray) -> FloatArray:
-    """Shift of each patch across and along its vectors, in vectors and samples."""
-    shift, sine, cosine = geometry.design @ field.T, geometry.turn[:, 0], geometry.turn[:, 1]
-    across, along = cosine * shift[:, 0] - sine * shift[:, 1], sine * shift[:, 0] + cosine * shift[:, 1]
-    return np.column_stack((across, along)) / geometry.spacing_mm
+@register_jitable(fastmath=False, error_model="numpy")
+def _place(geometry: Geometry, field: FloatArray, p: int) -> tuple[float, float]:
+    """Shift of a patch across and along its vectors, in vectors and samples."""
+    x = y = 0.0
+    for k in range(3):
+        x += geometry.design[p, k] * field[0, k]
+        y += geometry.design[p, k] * field[1, k]
+    sine, cosine = geometry.turn[p, 0], geometry.turn[p, 1]
+    across, along = cosine * x - sine * y, sine * x + cosine * y
+    return across / geometry.spacing_mm[p, 0], along / geometry.spacing_mm[p, 1]
 
 
-@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+@register_jitable(fastmath=False, error_model="numpy")
 def _ramp(geometry: Geometry, field: FloatArray, p: int, across: float) -> tuple[float, float]:
     """Phase that a field adds from vector to vector and from sample to sample of a patch.
 
@@ -163,10 +168,50 @@ def _ramp(geometry: Geometry, field: FloatArray, p: int, across: float) -> tuple
     return k * pitch * (cosine * by_x - sine * by_y + turned), k * spacing * (sine * by_x + cosine * by_y)
 
 
-@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+@register_jitable(fastmath=False, error_model="numpy")
+def _invert(matrix: FloatArray) -> float:
+    """Invert a symmetric, positive definite matrix in place; returns its determinant."""
+    determinant, size = 1.0, matrix.shape[0]
+    for k in range(size):
+        pivot = matrix[k, k]
+        determinant *= pivot
+        matrix[k, k] = 1.0
+        for j in range(size):
+            matrix[k, j] /= pivot
+        for i in range(size):
+            factor = matrix[i, k]
+            if i != k:
+                matrix[i, k] = 0.0
+                for j in range(size):
+                    matrix[i, j] -= factor * matrix[k, j]
+    return determinant
+
+
+@register_jitable(fastmath=False, error_model="numpy")
+def _median(values: FloatArray) -> float:
+    """Median by Hoare's selection, which changes the order of `values`."""
+    low, high, middle = 0, values.size - 1, values.size // 2
+    while low < high:
+        pivot, i, j = values[middle], low, high
+        while i <= j:
+            while values[i] < pivot:
+                i += 1
+            while values[j] > pivot:
+                j -= 1
+            if i <= j:
+                values[i], values[j] = values[j], values[i]
+                i, j = i + 1, j - 1
+        low, high = i if j < middle else low, j if i > middle else high
+    before = values[middle] if values.size % 2 else 0.0
+    for k in range(0 if values.size % 2 else middle):
+        before = max(before, values[k])
+    return float(before + values[middle]) / 2.0
+
+
+@register_jitable(fastmath=False, error_model="numpy")
 def _fit(
     geometry: Geometry,
-    usable: int,
+    usable: BoolArray,
     shift: FloatArray,
     weight: FloatArray,
     field: FloatArray,
@@ -180,31 +225,33 @@ def _fit(
 
     Parameters
     ----------
-    usable : int
-        Number of patches that could have a peak.
+    usable : bool, shape (p,)
+        Patches that could have a peak.
     """
-    count, few = 0, usable < _LEAST_PATCHES
+    count = n = 0
     for p in range(weight.size):
-        count += weight[p] > 0.0
+        count, n = count + (weight[p] > 0.0), n + usable[p]
+    few = n < _LEAST_PATCHES
     if count < (2 if few else _LEAST_PATCHES):
         return False
     # Loops: each expression over whole arrays compiles for a second.
-    own, design, data = np.empty(count), np.empty((count, 3)), np.empty((2, count))
-    terms, total, weighted, n = np.empty((2, count, 6)), np.empty((2, count)), np.empty((count, 6)), 0
+    own, data, terms = np.empty(count), np.empty((2, count)), np.empty((2, count, 6))
+    total, normal, n = np.empty((2, count)), np.zeros((3, 3)), 0
     for p in range(weight.size):
         if weight[p] > 0.0:
             own[n], data[0, n], data[1, n] = weight[p], shift[0, p], shift[1, p]
             total[0, n] = total[1, n] = weight[p]
             sine, cosine = geometry.turn[p, 0], geometry.turn[p, 1]
             for k in range(3):
-                term = design[n, k] = geometry.design[p, k]
+                term = geometry.design[p, k]
                 terms[0, n, k], terms[0, n, 3 + k] = cosine * term, -sine * term
                 terms[1, n, k], terms[1, n, 3 + k] = sine * term, cosine * term
-                weighted[n, k] = weight[p] * term
+                for j in range(3):
+                    normal[k, j] += weight[p] * term * geometry.design[p, j]
             n += 1
-    normal = weighted[:, :3].copy().T @ design
-    determined = np.linalg.det(normal) > _COLLINEAR * normal[0, 0] * normal[1, 1] * normal[2, 2]
-    scale, before, size = np.ones(2), np.ones(2), np.empty(count)
+    limit = _COLLINEAR * normal[0, 0] * normal[1, 1] * normal[2, 2]
+    determined = _invert(normal) > limit
+    scale, before, size = np.ones(2), np.ones(2), np.empty((2, count))
     for i in range(2 if few else 0):
         mean, spread, whole = 0.0, 0.0, 0.0
         for n in range(count):
@@ -212,27 +259,37 @@ def _fit(
         for n in range(count):
             spread += own[n] * (data[i, n] - mean / whole) ** 2
         scale[i] = np.sqrt(spread / (count - 1)) + 1e-12
+    inverse, right, solution = np.empty((6, 6)), np.empty(6), np.empty(6)
     for _ in range(1 if few else _ROUNDS):
-        joint, right = np.zeros((6, 6)), np.zeros(6)
-        for k in range(0 if determined and not few else 6):
-            joint[k, k], right[k] = _SLOPES[k], _SLOPES[k] * field[k // 3, k % 3]
+        for k in range(6):
+            right[k] = 0.0
+            for j in range(6):
+                inverse[k, j] = 0.0
+            if few or not determined:
+                inverse[k, k], right[k] = _SLOPES[k], _SLOPES[k] * field[k // 3, k % 3]
         for i in range(2):
             for n in range(count):
                 for k in range(6):
-                    weighted[n, k] = terms[i, n, k] * (total[i, n] / scale[i] ** 2)
-            joint += weighted.T @ terms[i]
-            right += weighted.T @ data[i]
-        inverse = np.linalg.inv(joint)
-        solution = inverse @ right
+                    term = terms[i, n, k] * (total[i, n] / scale[i] ** 2)
+                    right[k] += term * data[i, n]
+                    for j in range(6):
+                        inverse[k, j] += term * terms[i, n, j]
+        _invert(inverse)
+        for k in range(6):
+            solution[k] = 0.0
+            for j in range(6):
+                solution[k] += inverse[k, j] * right[j]
         for i in range(2):
             before[i] = scale[i]
         for i in range(0 if few else 2):
-            model = terms[i] @ solution
             for n in range(count):
-                size[n] = abs(data[i, n] - model[n]) * np.sqrt(own[n])
-            scale[i] = MAD_TO_SIGMA * np.median(size) + 1e-12
+                off = data[i, n]
+                for k in range(6):
+                    off -= terms[i, n, k] * solution[k]
+                size[0, n] = size[1, n] = abs(off) * np.sqrt(own[n])
+            scale[i] = MAD_TO_SIGMA * _median(size[1]) + 1e-12
             for n in range(count):
-                total[i, n] = own[n] * (_HUBER / max(size[n] / scale[i], _HUBER))
+                total[i, n] = own[n] * (_HUBER / max(size[0, n] / scale[i], _HUBER))
     for i in range(2):
         for j in range(3):
             field[i, j] = solution[3 * i + j]
@@ -256,29 +313,31 @@ def match_pair(fixed: Frame, moving: Frame, geometry: Geometry, matches: Matches
        Ultrasound Med. Biol. 32(12), 2006: sub-sample lateral motion must not read as elevation.
     """
     spacing, size = geometry.spacing_mm, (geometry.size[0], geometry.size[1])
-    motion, correlation = matches.motion[row], matches.correlation[row]
-    patches, usable = len(spacing), fixed.usable & moving.usable
-    c, s = np.cos(motion[2]), np.sin(motion[2])
+    motion, correlation, patches = matches.motion[row], matches.correlation[row], len(geometry.spacing_mm)
     # Offset and slopes of the lateral and the axial shift.
-    field = np.array(
-        [
-            [-c * motion[0] - s * motion[1], c - 1.0, s],
-            [s * motion[0] - c * motion[1], -s, c - 1.0],
-        ]
-    )
-    start, covariance, fitted = field.copy(), np.empty((2, 3, 3)), False
+    field, start, covariance, fitted = np.empty((2, 3)), np.empty((2, 3)), np.empty((2, 3, 3)), False
+    c, s = np.cos(motion[2]), np.sin(motion[2])
+    field[0, 0], field[0, 1], field[0, 2] = -c * motion[0] - s * motion[1], c - 1.0, s
+    field[1, 0], field[1, 1], field[1, 2] = s * motion[0] - c * motion[1], -s, c - 1.0
+    copy_into(start, field)
     turn = phase_ramp(size, 0.0, 0.0)
-    lag, rho = np.full((2, patches), _NOWHERE), np.full((patches, len(LAGS)), np.nan)
-    shift, weight, logarithmic = np.zeros((2, patches)), np.zeros(patches), np.zeros(patches, np.bool_)
+    lag, rho = np.empty((2, patches), np.int64), np.empty((patches, len(LAGS)))
+    shift, weight = np.empty((2, patches)), np.empty(patches)
+    usable, logarithmic = np.empty(patches, np.bool_), np.empty(patches, np.bool_)
+    for p in range(patches):
+        usable[p] = fixed.usable[p] and moving.usable[p]
+        lag[0, p], lag[1, p], weight[p], logarithmic[p] = _NOWHERE, _NOWHERE, 0.0, False
+        for k in range(len(LAGS)):
+            rho[p, k] = np.nan
     of_echo = moving.echo.size > 0
     for turned in range(PASSES + of_echo):
-        places = _places(geometry, field)
         by_echo = turned == PASSES
         for p in range(patches):
+            place = _place(geometry, field, p)
             if by_echo and (p == 0 or geometry.step_rad > 0.0):
-                ramp = _ramp(geometry, field, p, places[p, 0])
+                ramp = _ramp(geometry, field, p, place[0])
                 turn = phase_ramp(size, ramp[0], ramp[1])
-            at = int(np.rint(places[p, 0])), int(np.rint(places[p, 1]))
+            at = int(np.rint(place[0])), int(np.rint(place[1]))
             if usable[p] and (by_echo or at[0] != lag[0, p] or at[1] != lag[1, p]):
                 lag[0, p], lag[1, p] = at
                 corner, z = (geometry.first[p, 0], geometry.first[p, 1]), rho[p]
@@ -291,14 +350,17 @@ def match_pair(fixed: Frame, moving: Frame, geometry: Geometry, matches: Matches
                 lateral, axial, weight[p] = _peak(z, logarithmic[p])
                 shift[0, p], shift[1, p] = (at[0] + lateral) * spacing[p, 0], (at[1] + axial) * spacing[p, 1]
         if not by_echo:
-            fitted = _fit(geometry, usable.sum(), shift, weight, field, covariance)
+            fitted = _fit(geometry, usable, shift, weight, field, covariance)
             if not fitted:
                 copy_into(field, start)
-    places = _places(geometry, field)
     for p in range(patches):
-        away = places[p, 0] - lag[0, p], places[p, 1] - lag[1, p]
+        place = _place(geometry, field, p)
+        away = place[0] - lag[0, p], place[1] - lag[1, p]
         correlation[p] = _read(rho[p], logarithmic[p], away[0], away[1])
-    copy_into(matches.covariance[row], np.eye(3))
+    error = matches.covariance[row]
+    for k in range(3):
+        for j in range(3):
+            error[k, j] = 1.0 if k == j else 0.0
     if fitted:
         # The centre's shift is seen in the second image's axes; its displacement is told in the first's. Roll
         # comes from axial shifts alone. Off focus the wavefront is curved, so a turn in the plane moves
@@ -309,7 +371,7 @@ def match_pair(fixed: Frame, moving: Frame, geometry: Geometry, matches: Matches
         motion[0] = s * field[1, 0] - c * field[0, 0]
         motion[1] = -s * field[0, 0] - c * field[1, 0]
         motion[2] = roll
-        error = matches.covariance[row]
-        error[:] = 0.0
         error[0, 0] = covariance[0, 0, 0]
-        copy_into(error[1:, 1:], covariance[1, :2, :2])
+        for k in range(2):
+            for j in range(2):
+                error[1 + k, 1 + j] = covariance[1, k, j]

@@ -3,12 +3,11 @@
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
+from numba.extending import register_jitable
 
 from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from speckle3d.kernels.statistics import INTERPOLATION, PatchCurves, correlation_variance
 
-_variance = njit(error_model="numpy", fastmath=False)(correlation_variance)
 _FAST = {"reassoc"}
 """For sums over patches. Predictions are exact: starts of fits lie on knots of the curves, where a distance
 that is rounded otherwise has another slope. They say so, because a kernel that does not inherits its caller's
@@ -93,7 +92,7 @@ class PairPatches(NamedTuple):
     of_echo: bool
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
+@register_jitable(fastmath=False, error_model="numpy")
 def predict_correlation(
     distance_mm: float,
     amplitude: FloatArray,
@@ -126,10 +125,10 @@ def predict_correlation(
     model = gain * field * field
     derivative = 2.0 * gain * field * (1.0 - share) * (rise / step_mm)
     limited = model if model < 0.999 else 0.999
-    return model, derivative, _variance(limited, cells, of_echo) + INTERPOLATION**2
+    return model, derivative, correlation_variance(limited, cells, of_echo) + INTERPOLATION**2
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
+@register_jitable(fastmath=False, error_model="numpy")
 def _distance(plane: FloatArray, i: int, patches: PairPatches) -> tuple[float, float, float]:
     """Distance of a patch without and with the decorrelation by rotation, and its part."""
     t = patches.table
@@ -138,7 +137,7 @@ def _distance(plane: FloatArray, i: int, patches: PairPatches) -> tuple[float, f
     return z, turned, np.sqrt(z * z + turned * turned)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
+@register_jitable(fastmath=False, error_model="numpy")
 def _predict(d: float, i: int, patches: PairPatches) -> tuple[float, float, float]:
     """As `predict_correlation`, but one over the standard deviation."""
     t = patches.table
@@ -156,7 +155,7 @@ def _predict(d: float, i: int, patches: PairPatches) -> tuple[float, float, floa
     return model, derivative, 1.0 / np.sqrt(variance)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
+@register_jitable(fastmath=_FAST, error_model="numpy")
 def _evaluate(plane: FloatArray, size: int, patches: PairPatches, rules: FitRules, sums: FloatArray) -> None:
     """Fill `sums`: robust cost, capped cost, half the falling gradient, half the Hessian's upper triangle."""
     huber, outlying, table = rules.huber, rules.outlying, patches.table
@@ -192,7 +191,7 @@ def _evaluate(plane: FloatArray, size: int, patches: PairPatches, rules: FitRule
     sums[5], sums[6], sums[7], sums[8], sums[9], sums[10] = h00, h01, h02, h11, h12, h22
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
+@register_jitable(fastmath=_FAST, error_model="numpy")
 def _with_prior(plane: FloatArray, expected: FloatArray, precision: FloatArray, sums: FloatArray) -> None:
     """Add what the prior has to the sums of `_evaluate`."""
     for k in range(3):
@@ -204,7 +203,7 @@ def _with_prior(plane: FloatArray, expected: FloatArray, precision: FloatArray, 
     sums[10] += precision[2]
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
+@register_jitable(fastmath=_FAST, error_model="numpy")
 def _solve(sums: FloatArray, damping: float, step: FloatArray) -> None:
     """Step of the damped normal equations, by their triangular factors."""
     d0 = sums[5] + damping * (sums[5] + 1e-9)
@@ -220,7 +219,7 @@ def _solve(sums: FloatArray, damping: float, step: FloatArray) -> None:
     step[0] = sums[2] / d0 - l1 * step[1] - l2 * step[2]
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
+@register_jitable(fastmath=_FAST, error_model="numpy")
 def descend(
     plane: FloatArray,
     size: int,
@@ -254,7 +253,7 @@ def descend(
     return least, capped
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
+@register_jitable(fastmath=_FAST, error_model="numpy")
 def add_information(
     plane: FloatArray, size: int, patches: PairPatches, rules: FitRules, information: FloatArray
 ) -> None:
@@ -275,7 +274,7 @@ def add_information(
                 information[k, j] += weight * told * told * arm[k] * arm[j]
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
+@register_jitable(fastmath=_FAST, error_model="numpy")
 def gather(
     e: int,
     rho: Float32Array,

@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
+from numba.extending import register_jitable
 
 from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray
 from speckle3d.kernels.plane_misfit import (
@@ -40,7 +41,7 @@ class FittedPlanes(NamedTuple):
     cost: FloatArray
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
+@register_jitable(fastmath=False, error_model="numpy")
 def _list_starts(
     middle_mm: float,
     slopes: FloatArray,
@@ -55,14 +56,19 @@ def _list_starts(
     if rules.sensed:
         starts[1, 0], starts[1, 1], starts[1, 2] = -middle_mm, slopes[0], slopes[1]
         return 2 if either_side else 1
-    at = lateral[:size]
-    half, mean = (at.max() - at.min()) / 2.0, at.mean()
+    low, high, total = np.inf, -np.inf, 0.0
+    for i in range(size):
+        low, high, total = min(low, lateral[i]), max(high, lateral[i]), total + lateral[i]
+    half, mean = (high - low) / 2.0, total / size
     if not (half > 0.0 and middle_mm < rules.widest_slope * half):
         return 1
     # V-shaped distances, which no plane on one side explains, fall towards the crossing.
     for k in range(3):
         centre = mean + 0.5 * (k - 1) * half
-        slope = middle_mm / np.abs(at - centre).mean()
+        total = 0.0
+        for i in range(size):
+            total += abs(lateral[i] - centre)
+        slope = middle_mm * size / total
         starts[k + 1, 0], starts[k + 1, 1], starts[k + 1, 2] = -slope * centre, slope, 0.0
     return _STARTS
 

@@ -4,6 +4,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
+from numba.extending import register_jitable
 
 from speckle3d.core.arrays import Complex64Array, Float32Array, FloatArray, IntArray
 from speckle3d.kernels.slicing import coordinates
@@ -91,7 +92,7 @@ def _first_array(array_from_face: FloatArray, x: float, y: float, right_mm: floa
     return low
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=_SUMS)
+@register_jitable(fastmath=_SUMS, error_model="numpy")
 def _interpolate(table: Float32Array, row: int, corners: Any, weights: Any, out: Float32Array) -> None:
     """Fill `out` with a weighted sum of eight pieces of a table.
 

@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
+from numba.extending import register_jitable
 
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.kernels.copying import copy_into
@@ -22,7 +23,7 @@ class PathRules(NamedTuple):
     width_mm: float
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
+@register_jitable(fastmath=False, error_model="numpy")
 def _agree(
     place: FloatArray, reference: FloatArray, move: FloatArray, weight: FloatArray
 ) -> tuple[float, float]:
@@ -35,7 +36,7 @@ def _agree(
     return (plus, 1.0) if plus <= minus else (minus, -1.0)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
+@register_jitable(fastmath=False, error_model="numpy")
 def _invert(covariance: FloatArray, move: FloatArray, rules: PathRules, weight: FloatArray) -> None:
     """Fill the three numbers of a pair's inverse covariance."""
     # The earlier frame was placed by such pairs, too.
@@ -46,16 +47,17 @@ def _invert(covariance: FloatArray, move: FloatArray, rules: PathRules, weight: 
     weight[0], weight[1], weight[2] = c / determinant, -b / determinant, a / determinant
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
+@register_jitable(fastmath=False, error_model="numpy")
 def _refine(
-    place: FloatArray, earlier: FloatArray, moves: FloatArray, weight: FloatArray, cap: float
+    place: FloatArray, path: FloatArray, earlier: IntArray, moves: FloatArray, weight: FloatArray, cap: float
 ) -> None:
     """Move a place to the weighted mean of where the pairs that agree with it put the frame."""
     w00 = w01 = w11 = u0 = u1 = 0.0
     for e in range(len(moves)):
-        misfit, sign = _agree(place, earlier[e], moves[e], weight[e])
+        reference = path[earlier[e]]
+        misfit, sign = _agree(place, reference, moves[e], weight[e])
         if misfit < cap:
-            z, slope = earlier[e, 0] + sign * moves[e, 0], earlier[e, 1] + sign * moves[e, 1]
+            z, slope = reference[0] + sign * moves[e, 0], reference[1] + sign * moves[e, 1]
             w00 += weight[e, 0]
             w01 += weight[e, 1]
             w11 += weight[e, 2]
@@ -67,7 +69,7 @@ def _refine(
         place[1] = (w00 * u1 - w01 * u0) / determinant
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
+@register_jitable(fastmath=False, error_model="numpy")
 def _next_trend(trend: float, step: float, trend_mm: float) -> float:
     """Direction of a path after a step: averaged over travel and not time, so that a pause keeps it."""
     return float(trend + (1.0 - np.exp(-abs(step) / trend_mm)) * (np.sign(step) - trend))
@@ -106,23 +108,27 @@ def follow_paths(
         So many frames at the beginning are in `best` already, and stay.
     """
     count, frames = rules.hypotheses, start.size - 1
-    paths, cost, trend = np.zeros((count, frames, 2)), np.zeros(count), np.ones(count)
+    paths, spare = np.zeros((count, frames, 2)), np.zeros((count, frames, 2))
+    cost, trend, places = np.zeros(count), np.ones(count), np.zeros((count, 2))
     parent, new_cost, new_trend = np.zeros(count, np.int64), np.zeros(count), np.zeros(count)
-    places = np.zeros((count, 2))
-    copy_into(paths[0, :placed_frames], best[:placed_frames])
-    for f in range(1, placed_frames):
-        trend[0] = _next_trend(trend[0], best[f, 0] - best[f - 1, 0], rules.trend_mm)
+    for f in range(placed_frames):
+        paths[0, f, 0], paths[0, f, 1] = best[f, 0], best[f, 1]
+        if f > 0:
+            trend[0] = _next_trend(trend[0], best[f, 0] - best[f - 1, 0], rules.trend_mm)
     survivors, moving = 1, False
     for f in range(placed_frames, frames):
         pairs = start[f + 1] - start[f]
         if pairs == 0:
-            copy_into(paths[:survivors, f], paths[:survivors, f - 1])
+            for h in range(survivors):
+                paths[h, f, 0], paths[h, f, 1] = paths[h, f - 1, 0], paths[h, f - 1, 1]
             continue
         earlier, steps = first[start[f] : start[f + 1]], moves[start[f] : start[f + 1]]
-        weight, latest = np.empty((pairs, 3)), np.argmax(earlier)
+        weight, latest = np.empty((pairs, 3)), 0
         for e in range(pairs):
             _invert(covariance[start[f] + e], steps[e], rules, weight[e])
-        moving = moving or bool(np.any(paths[:survivors, f - 1] != 0.0))
+            latest = e if earlier[e] > earlier[latest] else latest
+        for h in range(survivors):
+            moving = moving or paths[h, f - 1, 0] != 0.0 or paths[h, f - 1, 1] != 0.0
         candidates, total = np.empty((2 * pairs * survivors, 2)), np.empty(2 * pairs * survivors)
         for n in range(total.size):
             h, e, side = n // (2 * pairs), n % pairs, 1.0 if n // pairs % 2 == 0 else -1.0
@@ -149,7 +155,7 @@ def follow_paths(
             if size == count or not np.isfinite(total[n]):
                 break
             h, place = n // (2 * pairs), candidates[n]
-            _refine(place, paths[h][earlier], steps, weight, rules.cap)
+            _refine(place, paths[h], earlier, steps, weight, rules.cap)
             is_duplicate = False
             for g in range(size):
                 off = abs(places[g, 0] - place[0])
@@ -157,17 +163,18 @@ def follow_paths(
                     off = max(off, abs(paths[parent[g], earlier[e], 0] - paths[h, earlier[e], 0]))
                 is_duplicate = is_duplicate or off < rules.same_mm
             if not is_duplicate:
-                copy_into(places[size], place)
+                places[size, 0], places[size, 1] = place[0], place[1]
                 parent[size], new_cost[size] = h, total[n]
                 step = place[0] - paths[h, earlier[latest], 0]
                 new_trend[size] = _next_trend(trend[h], step, rules.trend_mm)
                 size += 1
             total[n] = np.inf
         if size:
-            copy_into(paths[:size, :f], paths[parent[:size], :f])
-            copy_into(paths[:size, f], places[:size])
-            least = new_cost[:size].min()
             for g in range(size):
-                trend[g], cost[g] = new_trend[g], new_cost[g] - least
-            survivors = size
-    copy_into(best, paths[np.argmin(cost[:survivors])])
+                for n in range(f):
+                    spare[g, n, 0], spare[g, n, 1] = paths[parent[g], n, 0], paths[parent[g], n, 1]
+                spare[g, f, 0], spare[g, f, 1] = places[g, 0], places[g, 1]
+                # The first is the likeliest.
+                trend[g], cost[g] = new_trend[g], new_cost[g] - new_cost[0]
+            paths, spare, survivors = spare, paths, size
+    copy_into(best, paths[0])

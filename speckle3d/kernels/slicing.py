@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
+from numba.extending import register_jitable
 
 from speckle3d.core.arrays import Float32Array, FloatArray, IntArray
 
@@ -174,7 +175,7 @@ def compare_patches(
             _differentiate(a, b, norm_b, rows, out.normal[p], out.gradient[p])
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=_SUMS_IN_ANY_ORDER)
+@register_jitable(fastmath=_SUMS_IN_ANY_ORDER, error_model="numpy")
 def _images_near(
     sample: PlacedImages, source: PlacedImages, patches: PatchGrid, p: int, max_gap_mm: float, near: IntArray
 ) -> int:
@@ -195,7 +196,7 @@ def _images_near(
     return count
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=_SUMS_IN_ANY_ORDER)
+@register_jitable(fastmath=_SUMS_IN_ANY_ORDER, error_model="numpy")
 def _cut_patch(
     sample: PlacedImages,
     source: PlacedImages,
@@ -322,7 +323,7 @@ def _fill_rows(
         row[5] += bz - az
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=_SUMS_IN_ANY_ORDER)
+@register_jitable(fastmath=_SUMS_IN_ANY_ORDER, error_model="numpy")
 def _differentiate(
     f: FloatArray,
     g: FloatArray,

@@ -7,6 +7,7 @@ voxels gets exactly what it gets as part of all. Lines are cut to the voxels wan
 import numpy as np
 import numpy.typing as npt
 from numba import njit
+from numba.extending import register_jitable
 
 from speckle3d.core.arrays import Float32Array, FloatArray, IntArray
 from speckle3d.kernels.samples import POSITION_BITS, SHARE_BITS, Samples
@@ -21,7 +22,7 @@ _LEAST_SHARE = 0.125
 Tags = npt.NDArray[np.uint32]
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
+@register_jitable(fastmath=False, error_model="numpy")
 def _cut(start: int, stop: int, at: int, step: int, low: int, high: int) -> tuple[int, int]:
     """Samples of a range whose position ``at + sample * step`` is at least `low` and below `high`."""
     first, last = at + start * step, at + (stop - 1) * step
@@ -35,7 +36,7 @@ def _cut(start: int, stop: int, at: int, step: int, low: int, high: int) -> tupl
     return max(start, -((at - low) // step)), min(stop, -((at - high) // step))
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
+@register_jitable(fastmath=False, error_model="numpy")
 def cut_to_box(span: IntArray, m: IntArray, box: IntArray, reach: int) -> tuple[int, int, int, int, int, int]:
     """Part of a span of samples inside a box: its line, first and end, and where its first lies."""
     line, start, stop = span[0], span[1], span[2]
@@ -103,19 +104,19 @@ def add_nearest(samples: Samples, box: IntArray, table: FloatArray, tags: Tags) 
                 total, number = so_far[row], counts[row]
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
+@register_jitable(fastmath=False, error_model="numpy")
 def _same_cell(x: int, y: int, z: int, i: int, j: int, k: int) -> bool:
     """Whether a position is in a voxel, or between the same eight."""
     return (((x >> POSITION_BITS) ^ i) | ((y >> POSITION_BITS) ^ j) | ((z >> POSITION_BITS) ^ k)) == 0
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
+@register_jitable(fastmath=False, error_model="numpy")
 def _fraction(x: int) -> float:
     """How far a position is from the voxel below to the one above."""
     return (x >> _SHIFT & _SHARES) * _SHARE
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
+@register_jitable(fastmath=False, error_model="numpy")
 def _large(share: float) -> float:
     """Drop a share that is too small to count."""
     return share if share >= _LEAST_SHARE else 0.0

@@ -2,6 +2,8 @@
 
 from typing import Any, NamedTuple
 
+from numba.extending import register_jitable
+
 from speckle3d.core.arrays import FloatArray
 
 INTERPOLATION = 0.003
@@ -28,6 +30,7 @@ class PatchCurves(NamedTuple):
     of_echo: bool
 
 
+@register_jitable(fastmath=False, error_model="numpy")
 def correlation_variance(rho: Any, cells: Any, of_echo: bool) -> Any:
     """Variance of a correlation over so many independent cells.
 

@@ -8,6 +8,7 @@ bits: up to 255 pixels and 255/256. Positions are those of `speckle3d.kernels.sp
 import numpy as np
 import numpy.typing as npt
 from numba import njit
+from numba.extending import register_jitable
 
 from speckle3d.core.arrays import ByteArray, IntArray
 from speckle3d.kernels.samples import PLUS_BITS, POSITION_BITS, Samples
@@ -27,14 +28,14 @@ _TO_WEIGHT = PLUS_BITS - 8
 Weights = npt.NDArray[np.uint16]
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
+@register_jitable(fastmath=False, error_model="numpy")
 def _share(x: int, above: int) -> int:
     """Share, of 2^14, of a position that goes to the voxel above or below it."""
     fraction = (x & _FRACTION) >> _DROPPED
     return fraction if above else _ONE - fraction
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
+@register_jitable(fastmath=False, error_model="numpy")
 def _within(x: int, voxels: int) -> bool:
     """Whether both voxels beside a position are in the grid; one that lies on a voxel needs no other."""
     return x >= 0 and (x + _FRACTION) >> POSITION_BITS < voxels
