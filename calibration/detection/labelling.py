@@ -148,7 +148,7 @@ def label_by_calibration(
 
 
 @dataclass(frozen=True)
-class _Layer:
+class _WireLayer:
     """A layer of wires, an N, and its place relative to the first layer."""
 
     wires: IntArray
@@ -157,7 +157,7 @@ class _Layer:
     sign: float
 
 
-def _layers(phantom: WirePhantom) -> list[_Layer]:
+def _layers(phantom: WirePhantom) -> list[_WireLayer]:
     if len(phantom.n_shapes) < 2:
         raise InvalidInputError(f"phantom: expected two N of wires or more, got {len(phantom.n_shapes)}")
     shapes = np.array(phantom.n_shapes)
@@ -167,10 +167,10 @@ def _layers(phantom: WirePhantom) -> list[_Layer]:
     widths = np.linalg.norm(across, axis=1)
     axis = across[0] / widths[0]
     heights, signs = (begins - begins[0]) @ np.cross(along, axis), np.sign(across @ axis)
-    return [_Layer(*values) for values in zip(shapes, widths, heights, signs, strict=True)]
+    return [_WireLayer(*values) for values in zip(shapes, widths, heights, signs, strict=True)]
 
 
-def _triples(dots_mm: FloatArray, layer: _Layer, phantom: WirePhantom) -> IntArray:
+def _triples(dots_mm: FloatArray, layer: _WireLayer, phantom: WirePhantom) -> IntArray:
     """Dots that may be a layer's first, middle and last wire, shape (t, 3)."""
     place = dots_mm @ [1.0, 1j]
     between = place[None] - place[:, None]
@@ -201,7 +201,7 @@ def _off_by(ratio: FloatArray, limits: tuple[float, float]) -> str:
 
 
 def _combine(
-    triples: list[IntArray], dots_mm: FloatArray, score: FloatArray, layers: list[_Layer]
+    triples: list[IntArray], dots_mm: FloatArray, score: FloatArray, layers: list[_WireLayer]
 ) -> IntArray:
     """Hypotheses: parallel triples at the layers' distances, shape (h, 3 layers)."""
     hypotheses, place = triples[0], dots_mm @ [1.0, 1j]

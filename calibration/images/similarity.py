@@ -18,7 +18,7 @@ from speckle3d.core.errors import MismatchError
 from speckle3d.core.geometry import skew
 from speckle3d.core.progress import Progress
 from speckle3d.core.threads import ahead
-from speckle3d.kernels.slicing import PARAMETERS, PatchGrid, PatchScores, PlacedImages, compare_patches
+from speckle3d.kernels.slicing import PARAMETERS, ImagePatches, PatchScores, PlacedImages, compare_patches
 
 USUAL_EXTENT_MM = 40.0
 """Geometric mean of width and depth of images whose `CrossingSweeps.unit` is one."""
@@ -86,7 +86,7 @@ class Comparison:
     """Two stacks, with patches on each that are compared with the other."""
 
     stacks: tuple[Stack, Stack]
-    patches: tuple[PatchGrid, PatchGrid]
+    patches: tuple[ImagePatches, ImagePatches]
     max_gap_mm: float
     least_share: float = LEAST_SHARE
 
@@ -145,7 +145,7 @@ def spread_patches(
     spacing_mm: float,
     side: int | None = None,
     overlap: float = 0.5,
-) -> PatchGrid:
+) -> ImagePatches:
     """Patches all over some images, without those that are mostly empty.
 
     Parameters
@@ -172,7 +172,7 @@ def spread_patches(
         share = valid[across[:, :, None, None], down[None, None]].mean(axis=(1, 3))
         a, b = np.nonzero(share > LEAST_SHARE)
         corners.append(np.column_stack([np.full(len(a), image), starts[0][a], starts[1][b]]))
-    return PatchGrid(np.concatenate(corners).astype(np.int64).reshape(-1, 3), (sides[0], sides[1]), stride)
+    return ImagePatches(np.concatenate(corners).astype(np.int64).reshape(-1, 3), (sides[0], sides[1]), stride)
 
 
 @dataclass(frozen=True)

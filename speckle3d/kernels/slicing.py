@@ -39,7 +39,7 @@ class PlacedImages(NamedTuple):
     pixels: FloatArray
 
 
-class PatchGrid(NamedTuple):
+class ImagePatches(NamedTuple):
     """Rectangles of grid points on images.
 
     Attributes
@@ -122,7 +122,7 @@ _SUMS_IN_ANY_ORDER = {"reassoc", "contract", "arcp", "nsz"}
 def compare_patches(
     sample: PlacedImages,
     source: PlacedImages,
-    patches: PatchGrid,
+    patches: ImagePatches,
     max_gap_mm: float,
     least_share: float,
     out: PatchScores,
@@ -133,7 +133,7 @@ def compare_patches(
     ----------
     sample, source : PlacedImages
         The sweep with the patches, by world from image, and the one that is cut, by image from world.
-    patches : PatchGrid
+    patches : ImagePatches
         On images of `sample`.
     max_gap_mm : float
         Largest distance between two images on either side of a point.
@@ -177,7 +177,12 @@ def compare_patches(
 
 @register_jitable(fastmath=_SUMS_IN_ANY_ORDER, error_model="numpy")
 def _images_near(
-    sample: PlacedImages, source: PlacedImages, patches: PatchGrid, p: int, max_gap_mm: float, near: IntArray
+    sample: PlacedImages,
+    source: PlacedImages,
+    patches: ImagePatches,
+    p: int,
+    max_gap_mm: float,
+    near: IntArray,
 ) -> int:
     """Fill `near` with the numbers of images that pass near patch `p`; return how many."""
     pixels = sample.pixels
@@ -200,7 +205,7 @@ def _images_near(
 def _cut_patch(
     sample: PlacedImages,
     source: PlacedImages,
-    patches: PatchGrid,
+    patches: ImagePatches,
     p: int,
     max_gap_mm: float,
     near: IntArray,

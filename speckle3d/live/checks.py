@@ -39,7 +39,7 @@ def words_for(pose: LivePose, settings: TrajectorySettings) -> str:
 
 
 @dataclass
-class Words:
+class Advice:
     """Advice with a minimum display time.
 
     Attributes

@@ -17,7 +17,7 @@ RESTARTED_S = 1.0
 """A frame so long before the last one shows that the sender was started anew."""
 
 
-class Recording:
+class SweepRecorder:
     """Images and transforms written into a growing sweep file as they are received.
 
     Times are the sender's, counted from the first frame's. If its clock begins anew, they go on by what has

@@ -32,12 +32,12 @@ from speckle3d.io.family.sweep_writer import GrowingSweep
 from speckle3d.io.hdf5 import make_folder
 from speckle3d.io.igtl.messages import ImageReceived, Received, TransformReceived
 from speckle3d.io.import_settings import ImportSettings
-from speckle3d.live.checks import GOOD, NO_OVERLAP, TOO_FAST, Words, words_for
+from speckle3d.live.checks import GOOD, NO_OVERLAP, TOO_FAST, Advice, words_for
 from speckle3d.live.crossing import CrossingCheck
 from speckle3d.live.frames import ImageLayout
 from speckle3d.live.outgoing import pose_message, volume_message, word_messages
 from speckle3d.live.progress import Devices, Progress
-from speckle3d.live.recording import Recording
+from speckle3d.live.recording import SweepRecorder
 from speckle3d.live.tracking import LivePose, LiveTracker
 from speckle3d.live.volume import GrowingVolume
 
@@ -49,7 +49,7 @@ _LOOK_S = 0.1
 VOLUME_EVERY_S = 1.0
 
 
-class Source(Protocol):
+class MessageSource(Protocol):
     """Source of messages."""
 
     def receive(self, timeout_s: float) -> list[Received]:
@@ -97,7 +97,7 @@ class Session:
 
     Parameters
     ----------
-    source : Source
+    source : MessageSource
         As `speckle3d.io.igtl.link.Connection`.
     send : sequence of callable
         Each is given every message to send; none may wait.
@@ -116,7 +116,7 @@ class Session:
 
     def __init__(
         self,
-        source: Source,
+        source: MessageSource,
         send: Sequence[Callable[[bytes], None]],
         curves: DecorrelationCurves,
         settings: SessionSettings,
@@ -135,7 +135,7 @@ class Session:
         self._over = threading.Event()
         self.failure: Exception | None = None
         self._devices = Devices(settings.image, settings.transform, settings.orientation)
-        self._words, self._sent_s = Words(), 0.0
+        self._words, self._sent_s = Advice(), 0.0
 
     def end(self) -> None:
         """Ask `run` to end."""
@@ -197,7 +197,7 @@ class Session:
             with GrowingSweep(
                 path, example.grid, example.signal, example.frames.dtype, probe=example.probe
             ) as sweep:
-                recording = Recording(sweep, first.time_s, self.progress)
+                recording = SweepRecorder(sweep, first.time_s, self.progress)
                 self._take_all(waiting, recording, layout)
                 while not self._is_over(until_s):
                     self._take_all(self._source.receive(_LOOK_S), recording, layout)
@@ -214,7 +214,7 @@ class Session:
         if show:
             show(self.progress)
 
-    def _take_all(self, messages: Sequence[Received], recording: Recording, layout: ImageLayout) -> None:
+    def _take_all(self, messages: Sequence[Received], recording: SweepRecorder, layout: ImageLayout) -> None:
         """Record messages, and have frames matched."""
         for message in messages:
             self._devices.hear(message)
@@ -226,7 +226,7 @@ class Session:
                 elif message.device == self._settings.orientation:
                     recording.keep_reading(message, with_position=False)
 
-    def _take_image(self, image: ImageReceived, recording: Recording, layout: ImageLayout) -> None:
+    def _take_image(self, image: ImageReceived, recording: SweepRecorder, layout: ImageLayout) -> None:
         came_s = time.monotonic()
         try:
             frame = layout.frame(image)

@@ -25,7 +25,7 @@ from speckle3d.motion.planes import (
     patch_distances,
 )
 from speckle3d.motion.signs import Strangers, likeliest_path, on_path
-from speckle3d.motion.trajectory import Trajectory, edges_of, solve_trajectory
+from speckle3d.motion.trajectory import GraphSolution, edges_of, solve_trajectory
 from speckle3d.motion.uncertainty import SlopeWeights, claimed_covariance, weigh_slopes
 
 ROUNDS = 2
@@ -54,7 +54,7 @@ class Motion:
     poses : RigidTransform, length n
         Of either sign of the elevational motion.
     covariance : ndarray, shape (n, 6, 6)
-        Of the poses as far as the pairs' errors are independent; see `Trajectory`.
+        Of the poses as far as the pairs' errors are independent; see `GraphSolution`.
     """
 
     problem: MotionProblem
@@ -166,7 +166,7 @@ def _alternate(problem: MotionProblem, table: CorrelationTable) -> Motion:
 
 def solve_planes(
     problem: MotionProblem, table: CorrelationTable, pairs: PairPlanes
-) -> tuple[RelativePoses, Trajectory]:
+) -> tuple[RelativePoses, GraphSolution]:
     """Trajectory of some pairs, and the edges that it is solved from."""
     edges = edges_of(table, pairs)
     return edges, solve_trajectory(

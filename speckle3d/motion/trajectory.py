@@ -24,7 +24,7 @@ SAME = 1e-9
 
 
 @dataclass(frozen=True)
-class Trajectory:
+class GraphSolution:
     """Poses of all frames with the graph's covariance.
 
     Attributes
@@ -63,7 +63,7 @@ def solve_trajectory(
     centre_mm: FloatArray,
     huber: float = 2.0,
     repeats: npt.ArrayLike = (),
-) -> Trajectory:
+) -> GraphSolution:
     """Poses of all frames from all pairs: robust Gauss-Newton on the graph of relative poses.
 
     Frames that no pair joins to earlier ones lie between their neighbours.
@@ -85,7 +85,7 @@ def solve_trajectory(
         # Exponential coordinates have the rotation first.
         poses = poses * RigidTransform.from_exp_coords(np.roll(step, 3, axis=1))
     centre = RigidTransform.from_translation(centre_mm)
-    return Trajectory(centre * poses * centre.inv(), normal)
+    return GraphSolution(centre * poses * centre.inv(), normal)
 
 
 def _normal(

@@ -85,16 +85,16 @@ def _sheet(entropy: int, tile: Tile) -> FloatArray:
     return np.stack([x.ravel(), height, z.ravel()], axis=1)
 
 
-class Level(NamedTuple):
+class ImagedPlane(NamedTuple):
     """A plane in the image: ``normal @ position = offset_mm``, the normal pointing away from the probe."""
 
     normal: FloatArray
     offset_mm: float
 
-    def mirrored_in(self, mirror: Level) -> Level:
+    def mirrored_in(self, mirror: ImagedPlane) -> ImagedPlane:
         """Return the mirror image of this plane in another, its normal turned to point away as well."""
         along = 2.0 * float(self.normal @ mirror.normal)
-        return Level(along * mirror.normal - self.normal, along * mirror.offset_mm - self.offset_mm)
+        return ImagedPlane(along * mirror.normal - self.normal, along * mirror.offset_mm - self.offset_mm)
 
     @property
     def image_from_sheet(self) -> RigidTransform:
@@ -126,7 +126,9 @@ class WaterBath(TiledMedium):
 
     def scatterers(self, medium_from_image: RigidTransform, box: Box) -> list[Scatterers]:
         """Dust in a box of the image, the reflector, and its reverberations."""
-        level = Level(medium_from_image.rotation.as_matrix()[1], -float(medium_from_image.translation[1]))
+        level = ImagedPlane(
+            medium_from_image.rotation.as_matrix()[1], -float(medium_from_image.translation[1])
+        )
         strength = _STRENGTH_PER_MM2 * _SPACING_MM**2
         image_from_sheet = medium_from_image.inv()
         if self.reflector == "bar":
@@ -134,7 +136,7 @@ class WaterBath(TiledMedium):
             strength *= _BEAM_MM / _BAR_MM
             flat = level.normal * [1.0, 1.0, 0.0]
             length = float(np.linalg.norm(flat))
-            level = Level(flat / length, level.offset_mm / length)
+            level = ImagedPlane(flat / length, level.offset_mm / length)
             place = medium_from_image * level.image_from_sheet
             slid = float(place.translation @ place.rotation.as_matrix()[:, 0])
             image_from_sheet = level.image_from_sheet * RigidTransform.from_translation([-slid, 0.0, 0.0])
@@ -152,7 +154,7 @@ class WaterBath(TiledMedium):
         # Virtual reflectors of the second and later round trips. Unfolding the path, the probe's face is
         # mirrored in the floor, the floor in that, and so on: from straight above these lie at twice and
         # three times the depth; elsewhere they seem turned further too.
-        before = Level(np.array([0.0, 1.0, 0.0]), 0.0)
+        before = ImagedPlane(np.array([0.0, 1.0, 0.0]), 0.0)
         for count in range(1, _REPEATS + 1):
             before, level = level, before.mirrored_in(level)
             if level.normal[1] < _STEEPEST:

@@ -58,7 +58,7 @@ _OFF_POINT_MM = 0.15
 
 
 @dataclass(frozen=True)
-class Trajectory:
+class Movement:
     """A smooth pose of the image in the medium as a function of time.
 
     Parameters
@@ -123,7 +123,7 @@ def hand_sweep(
     world: RigidTransform,
     rng: Generator,
     number: int = 0,
-) -> Trajectory:
+) -> Movement:
     """Sweep along the starting image's elevation, as a hand would.
 
     Parameters
@@ -154,12 +154,12 @@ def hand_sweep(
     # A crossing sweep is turned about the beam axis through the middle of the first.
     centre_mm = np.array([face_mm / 2.0, 0.0, settings.length_mm / 2.0])
     start = RigidTransform.from_components(centre_mm - across.apply(centre_mm), across)
-    return Trajectory(_curves(time, slow, rng), "ZYX", np.ones(3), face_mm, world, start)
+    return Movement(_curves(time, slow, rng), "ZYX", np.ones(3), face_mm, world, start)
 
 
 def calibration_scan(
     settings: SimulationSettings, face_mm: float, world: RigidTransform, rng: Generator
-) -> Trajectory:
+) -> Movement:
     """Turn and lift the probe, all axes at once, as a hand would.
 
     Over a floor at y = 0 of the medium (`plane`), the columns are x of the point of the floor that the
@@ -178,7 +178,7 @@ def calibration_scan(
     )
     curves = _curves(time, swings, rng, _LIFT_MM)
     in_medium = np.array([1.0, 0.0, 1.0]) * over_floor
-    return Trajectory(curves, "YXZ", in_medium, face_mm, world, RigidTransform.identity())
+    return Movement(curves, "YXZ", in_medium, face_mm, world, RigidTransform.identity())
 
 
 def stepped_poses(steps: int, step_mm: float, blocks: int, gap_mm: float) -> RigidTransform:

@@ -7,7 +7,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.streams import TimedPoses, TimedRotations
 from speckle3d.core.sweep import OrientationSensor, Tracker
-from speckle3d.simulation.movement import Trajectory
+from speckle3d.simulation.movement import Movement
 
 TRACKER_FROM_IMAGE = RigidTransform.from_components(
     [12.0, -85.0, 23.0], Rotation.from_euler("ZYX", [0.35, -0.8, 1.9])
@@ -40,7 +40,7 @@ _DERIVATIVE_S = 1e-3
 
 
 def simulate_tracker(
-    trajectory: Trajectory, span_s: tuple[float, float], rng: Generator, noise: float = 1.0
+    trajectory: Movement, span_s: tuple[float, float], rng: Generator, noise: float = 1.0
 ) -> Tracker:
     """Track the probe over `span_s` of image time; `noise` multiplies all errors but the clock's.
 
@@ -56,7 +56,7 @@ def simulate_tracker(
 
 
 def simulate_orientation(
-    trajectory: Trajectory, span_s: tuple[float, float], rng: Generator, noise: float = 1.0
+    trajectory: Movement, span_s: tuple[float, float], rng: Generator, noise: float = 1.0
 ) -> OrientationSensor:
     """Orientation and raw inertial readings over `span_s` of image time; `noise` as of the tracker."""
     clock = _clock(span_s, 100.0, 1e-4, rng)

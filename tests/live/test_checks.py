@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from speckle3d.live.checks import GOOD, NO_CONTACT, NO_OVERLAP, SEEN_S, STAYS_S, TOO_FAST, Words, words_for
+from speckle3d.live.checks import GOOD, NO_CONTACT, NO_OVERLAP, SEEN_S, STAYS_S, TOO_FAST, Advice, words_for
 from speckle3d.matching.quality import FrameFlag
 from speckle3d.matching.schedule import TrajectorySettings
 
@@ -28,7 +28,7 @@ def test_a_frame_is_told_by_what_the_reconstruction_asks_of_it(flags, median, wo
 
 
 def test_words_come_when_they_are_so_for_a_while_and_stay_to_be_read():
-    words, changes = Words(), []
+    words, changes = Advice(), []
     for k in range(100):
         # One frame too fast, then two seconds of it, then good.
         latest = TOO_FAST if k == 5 or 20 <= k < 70 else GOOD

@@ -11,7 +11,7 @@ from speckle3d.core.grid import ImageGrid
 from speckle3d.io.family.sweep_writer import GrowingSweep
 from speckle3d.live import recording
 from speckle3d.live.progress import Progress
-from speckle3d.live.recording import Recording
+from speckle3d.live.recording import SweepRecorder
 
 
 @pytest.fixture
@@ -24,7 +24,7 @@ def record(tmp_path, monkeypatch):
         clock = iter([here_s[0], *here_s])
         monkeypatch.setattr(recording, "time", SimpleNamespace(monotonic=lambda: next(clock)))
         with GrowingSweep(tmp_path / "sweep.h5", grid, RF, frame.dtype) as sweep:
-            growing = Recording(sweep, sent_s[0], progress)
+            growing = SweepRecorder(sweep, sent_s[0], progress)
             for time_s in sent_s:
                 growing.keep_frame(frame, time_s)
         return s3.load_sweep(tmp_path / "sweep.h5").frame_time_s, progress

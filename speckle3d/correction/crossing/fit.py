@@ -55,7 +55,7 @@ SCALES = [RIGID, RIGID + BENDS]
 
 
 @dataclass(frozen=True)
-class Prior:
+class PathPrior:
     """Gaussian prior of the parameters.
 
     Attributes
@@ -89,7 +89,7 @@ class CrossingFit:
 
     pair: Sequence[BlurredSweep]
     placing: Placing
-    prior: Prior
+    prior: PathPrior
     independent: float
 
     @cached_property
@@ -176,7 +176,7 @@ class CrossingFit:
 
 
 @dataclass(frozen=True)
-class Parts:
+class CubeSums:
     """Gradient and curvature of the cost, summed over cubes of tissue.
 
     Attributes
@@ -195,7 +195,7 @@ class Parts:
     correlation: FloatArray
 
     @classmethod
-    def of(cls, fit: CrossingFit) -> Parts:
+    def of(cls, fit: CrossingFit) -> CubeSums:
         """Sum over the points of each part, both ways."""
         points, values = [], []
         for way in fit.ways:
@@ -248,7 +248,7 @@ def covariance(fit: CrossingFit, displacement_mm: float) -> FloatArray:
     displacement_mm : float
         RMS of each component of the tissue's displacement between the sweeps.
     """
-    parts = Parts.of(fit)
+    parts = CubeSums.of(fit)
     coupling, count = parts.coupling.reshape(-1, PARAMETERS), len(parts.pulls)
     scatter = parts.pulls.T @ parts.pulls * count / max(count - 1, 1)
     scatter += displacement_mm**2 * coupling.T @ parts.correlation @ coupling

@@ -13,7 +13,7 @@ from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError, MismatchError
 from speckle3d.core.geometry import mirrored
 from speckle3d.core.text import shown
-from speckle3d.correction.crossing.fit import CrossingFit, Parts, Prior, covariance
+from speckle3d.correction.crossing.fit import CrossingFit, CubeSums, PathPrior, covariance
 from speckle3d.correction.crossing.planes import (
     BENDS,
     ORDERS,
@@ -166,7 +166,9 @@ class _Crossing:
         blurs_mm = settings.blurs_mm
 
         @cache
-        def comparison(blur_mm: float, flips: tuple[bool, bool]) -> tuple[list[BlurredSweep], Prior, float]:
+        def comparison(
+            blur_mm: float, flips: tuple[bool, bool]
+        ) -> tuple[list[BlurredSweep], PathPrior, float]:
             sides = [side(number, flip) for number, flip in enumerate(flips)]
             return _comparison(sweeps, sides, blur_mm, settings)
 
@@ -200,7 +202,7 @@ class _Crossing:
     def pair(self) -> CrossedPair:
         """The pair, if its length may be claimed."""
         limits, so_far = self.settings, self.so_far
-        displacement_mm = Parts.of(self.coarse).displacement_mm(self.coarse.normal_equations[0])
+        displacement_mm = CubeSums.of(self.coarse).displacement_mm(self.coarse.normal_equations[0])
         most_mm = _LARGEST_SHARE * limits.blurs_mm[-2:][0]
         uncertainty = covariance(self.fit, displacement_mm)
         poses = [self._scaled_poses(number, uncertainty, displacement_mm) for number in (0, 1)]
@@ -309,7 +311,7 @@ def _comparison(
     sides: Sequence[StraightSweep],
     blur_mm: float,
     settings: CrossingSettings,
-) -> tuple[list[BlurredSweep], Prior, float]:
+) -> tuple[list[BlurredSweep], PathPrior, float]:
     """Both sweeps under one blur, the prior of how they lie, and how many comparisons they are worth."""
     volume = min(float(np.isfinite(s.texture).sum() * s.spacing_mm.prod()) for s in sides)
     # Under a Gaussian blur so much volume counts as one comparison.
@@ -320,7 +322,7 @@ def _comparison(
 
 def _prior(
     sweeps: Sequence[CrossingSweep], sides: Sequence[StraightSweep], settings: CrossingSettings
-) -> Prior:
+) -> PathPrior:
     spread = np.zeros((2 * BENDS, 2 * BENDS))
     for number, (sweep, side) in enumerate(zip(sweeps, sides, strict=True)):
         rates = np.full(2, sweep.turn_sigma_per_mm)
@@ -347,4 +349,4 @@ def _prior(
         information[3:RIGID, 3:RIGID] = (
             vertical / _BETWEEN_HEADING_RAD**2 + (np.eye(3) - vertical) / _BETWEEN_INCLINATION_RAD**2
         )
-    return Prior(information, turn)
+    return PathPrior(information, turn)

@@ -79,7 +79,7 @@ def candidates(
     return distinct
 
 
-class _Volume(NamedTuple):
+class _TextureGrid(NamedTuple):
     """Texture on a regular grid along the first path's axes; zero where there is none."""
 
     low_mm: FloatArray
@@ -87,7 +87,7 @@ class _Volume(NamedTuple):
     mask: Float32Array
 
 
-def _resample(sweep: StraightSweep, texture: Float32Array, turn: Rotation) -> _Volume:
+def _resample(sweep: StraightSweep, texture: Float32Array, turn: Rotation) -> _TextureGrid:
     """Take the planes for parallel: refinement starts from further away than paths bend."""
     size, shape = sweep.spacing_mm, np.array(texture.shape)
     first = np.array([-(shape[0] // 2) * size[0], *sweep.pixels[2:]])
@@ -99,10 +99,12 @@ def _resample(sweep: StraightSweep, texture: Float32Array, turn: Rotation) -> _V
     matrix, offset = VOXEL_MM * axes.T / size[:, None], (axes.T @ low - first) / size
     values = affine_transform(texture, matrix, offset, tuple(whole), order=1, cval=np.nan)
     valid = np.isfinite(values)
-    return _Volume(low, np.where(valid, values, np.float32(0.0)), valid.astype(np.float32))
+    return _TextureGrid(low, np.where(valid, values, np.float32(0.0)), valid.astype(np.float32))
 
 
-def _peaks(fixed: _Volume, moving: _Volume, depth_shift_mm: float) -> list[tuple[FloatArray, float]]:
+def _peaks(
+    fixed: _TextureGrid, moving: _TextureGrid, depth_shift_mm: float
+) -> list[tuple[FloatArray, float]]:
     """Shifts of the moving volume at which the two correlate best, with score."""
     # Textures have no mean, so that sums of products are covariances.
     a = np.stack([fixed.mask, fixed.values**2, fixed.mask, fixed.values])
