@@ -225,9 +225,7 @@ def estimate_coherence(problem: MotionProblem, table: CorrelationTable, path: Fl
     by_patch = log_posterior.reshape(centres.size, -1, LOG_SCALES.size).sum(axis=0).T
     by_row = patches.rows_of(by_patch).sum(axis=2)
     log_scale = _peak(by_patch.sum(axis=1))
-    scale_sigma, false_turn = _deviations(problem, by_patch, log_scale)
-    if problem.curves.of_tissue:
-        return replace(as_measured, scale_sigma=scale_sigma, false_turn=false_turn)
+    scale_sigma, false_turn = _deviations(problem, by_patch)
     (weight,), (gains,) = binning.log_likelihood(log_scale, np.zeros(1), values)
     weight = softmax(weight + log_prior, axis=1)
     share, gain = (v.reshape(centres.size, -1) for v in (weight @ values, (weight * gains).sum(axis=1)))
@@ -235,6 +233,8 @@ def estimate_coherence(problem: MotionProblem, table: CorrelationTable, path: Fl
     row_scale = np.where(np.ptp(by_row, axis=0) > 1e-9, [_peak(row) for row in by_row.T], np.nan)
     row_gain = np.median(patches.rows_of(gain), axis=(0, 2)) + 0.0 * row_scale
     rows = RowScales(patches.row_depth_mm, row_scale - log_scale, row_gain)
+    if problem.curves.of_tissue:
+        return replace(as_measured, scale_sigma=scale_sigma, false_turn=false_turn, rows=rows)
     # To first order s^2 (1 - c (1 - a)) is observable, and a is open.
     scale_sigma = float(np.hypot(scale_sigma, 0.5 * share.mean() * POWERS.std()))
     return Coherence(centres, share, gain, float(np.exp(log_scale)), scale_sigma, false_turn, rows)
@@ -263,7 +263,7 @@ def _peak(log_posterior: FloatArray) -> float:
     return float(np.clip(-slope / (2.0 * min(bend, -1e-6)), LOG_SCALES[at - 1], LOG_SCALES[at + 1]))
 
 
-def _deviations(problem: MotionProblem, by_patch: FloatArray, log_scale: float) -> tuple[float, FloatArray]:
+def _deviations(problem: MotionProblem, by_patch: FloatArray) -> tuple[float, FloatArray]:
     """Standard deviations of the scale, and of false yaw and tilt per distance, from the scatter of patches.
 
     Structure lies in layers, and curves err by depth: the patches of a row err together. So do those of a
@@ -283,8 +283,8 @@ def _deviations(problem: MotionProblem, by_patch: FloatArray, log_scale: float) 
        Business & Economic Statistics 29(2), 2011.
     """
     posterior = softmax(by_patch, axis=0)
-    error = LOG_SCALES @ posterior - log_scale
-    variance = (LOG_SCALES - log_scale) ** 2 @ posterior - error**2
+    error = LOG_SCALES @ posterior
+    variance = LOG_SCALES**2 @ posterior - error**2
     arm = np.stack([np.ones(error.size), problem.levers.lateral_mm, problem.levers.lever_mm])
     # Where nothing tells yaw and tilt, they are open by a radian per mm.
     loose = np.diag([0.0, 1.0, 1.0])
