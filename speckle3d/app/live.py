@@ -1,7 +1,5 @@
 """A sweep while it is made: the picture as it comes, the length so far, the path, a cut of the volume."""
 
-from __future__ import annotations
-
 import asyncio
 import threading
 from collections.abc import Callable, Iterator

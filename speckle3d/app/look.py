@@ -1,7 +1,5 @@
 """Style of all pages: a line with the file's name, and tabs below it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from functools import partial
 from html import escape

@@ -1,28 +1,23 @@
 """Choose the pages of a file."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+from scipy.spatial.transform import Rotation
 
 import speckle3d as s3
 import xsens
 from speckle3d.app.look import Page
-from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
+from speckle3d.core.errors import Doubt, InsufficientDataError, InvalidInputError, MismatchError
 from speckle3d.io.family.reconstructions import FORMAT
 from speckle3d.io.hdf5 import SIGNATURE
 from speckle3d.io.import_settings import MissingSettingsError
 from speckle3d.io.load import kind_of
 from speckle3d.io.readers import find_reader, first_bytes
-
-if TYPE_CHECKING:
-    from scipy.spatial.transform import Rotation
-
-    from speckle3d.core.errors import Doubt
 
 RECONSTRUCTION = "reconstruction.h5"
 """File of a results folder."""
@@ -63,8 +58,8 @@ def pages_of(
         return _recording_pages(place, settings)
     if reconstruction is not None:
         raise InvalidInputError(f"{path}: expected a recording beside --reconstruction, got something else")
-    if first_bytes(place).startswith(SIGNATURE) and (kind := kind_of(place)) is not None:
-        if kind != FORMAT:
+    if first_bytes(place).startswith(SIGNATURE):
+        if (kind := kind_of(place)) != FORMAT:
             raise InvalidInputError(f"{path}: expected a recording, a reconstruction or a log, got {kind}")
         return _result_pages(place, sweep, place)
     if path.is_dir():
@@ -123,8 +118,6 @@ def _sweep_pages(
     from speckle3d.app.sweep.page import SweepPage
     from speckle3d.sensor_logs import log_of
 
-    if not len(sweep):
-        raise InvalidInputError(f"{path}: expected frames to look at, got none")
     pages = [Page("Sweep", SweepPage(sweep, reconstruction, doubts).view)]
     if sweep.orientation is not None:
         pages.append(_sensor(log_of(sweep.orientation, path.name), sweep.orientation.sensor_from_image))

@@ -1,19 +1,16 @@
 """Plots that pages share: an image with its axes, and lines over the time."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from bokeh.events import Tap
 from bokeh.models import ColumnDataSource, DataRange1d, Range1d
 from bokeh.models.annotations import Span
 from bokeh.plotting import figure
 from matplotlib import colormaps
 
-from speckle3d.core.arrays import ByteArray
+from speckle3d.core.arrays import AnyArray, ByteArray
 from speckle3d.study.figures import UNSEEN
 
 Pair = tuple[float, float]
@@ -78,7 +75,7 @@ class ImagePlot:
         self.source.data = {"image": [pixels], **place, **size}
 
 
-def greys(image: npt.NDArray[Any], low: float, high: float) -> ByteArray:
+def greys(image: AnyArray, low: float, high: float) -> ByteArray:
     """Colours of grey levels from black to white, shape (row, column, 4); NaN is what nobody has seen."""
     scale = colormaps["gray"].with_extremes(bad=UNSEEN)
     return np.asarray(scale((image - low) / max(high - low, 1e-6), bytes=True))

@@ -1,7 +1,5 @@
 """The server of the app: on this machine alone, for whoever has its signed address, while someone looks."""
 
-from __future__ import annotations
-
 import logging
 import secrets
 import time

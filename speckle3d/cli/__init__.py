@@ -1,7 +1,5 @@
 """The command line. Heavy modules are imported inside the commands, so that help and errors come at once."""
 
-from __future__ import annotations
-
 import io
 import os
 import signal

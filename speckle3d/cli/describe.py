@@ -1,7 +1,6 @@
 """Describe a file in rows of description, value and unit."""
 
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -33,7 +32,7 @@ def describe(path: PathLike) -> list[Row]:
 
 
 def _rows(path: PathLike) -> Iterator[Row]:
-    if Path(path).is_file() and is_volume(path):
+    if is_volume(path):
         yield "format", "volume", ""
         yield from _volume_rows(path)
         return

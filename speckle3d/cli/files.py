@@ -1,7 +1,5 @@
 """Commands about files: what one holds, the configuration, conversion, simulation."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -103,7 +101,7 @@ def convert(
     from speckle3d.study.posed import USUAL_RANGE_DB, open_posed
     from speckle3d.study.scenes.scene import slicer_sequence
 
-    is_reconstruction = source.is_file() and kind_of(source) == FORMAT
+    is_reconstruction = kind_of(source) == FORMAT
     suffix = require_suffix(out, SUFFIXES if is_reconstruction else (".h5", ".hdf5", *SUFFIXES))
     packs = compression != "none"
     if is_reconstruction:

@@ -1,7 +1,5 @@
 """Overwrite rules: never an input, and only files of the command's own kind."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path

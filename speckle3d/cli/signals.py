@@ -1,7 +1,5 @@
 """Handling of signals that ask a command to end."""
 
-from __future__ import annotations
-
 import signal
 import threading
 import time

@@ -239,7 +239,6 @@ def _run(session: Session, duration_s: float | None, connection: Connection, nam
             signal.raise_signal(number)
 
 
-_DEVICES = "Image_Reference", "ProbeToReference", "ProbeToWorld"
 _LAST_S = 5.0
 """Longest wait for a client to take what is left at the end."""
 
@@ -280,11 +279,10 @@ def play(
     has_echoes = not is_grey and read.grid.fan is None
     if kind == "rf" and not has_echoes:
         raise InvalidInputError(f"--as rf: expected echoes of parallel vectors, got {read.name}")
-    send = partial(played, read, read.frames, read.grid, False, _DEVICES)
+    send = partial(played, read, read.frames, read.grid, False)
     if kind == "bmode" or not has_echoes:
-        keep_levels = is_grey and read.frames.dtype == "uint8"
-        greys = s3.grey_images(read, levels="stored" if keep_levels else "log")
-        send = partial(played, read, greys, greys.grid, True, _DEVICES)
+        greys = s3.grey_images(read, levels="stored" if is_grey else "log")
+        send = partial(played, read, greys, greys.grid, True)
     shift_s = clock_shift_s(read)
     next(send(shift_s))  # refused at once if messages cannot hold it
     if shift_s:

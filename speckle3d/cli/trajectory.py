@@ -1,7 +1,5 @@
 """Trajectories as text, and one trajectory scored against another."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Any
 

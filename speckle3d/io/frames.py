@@ -20,6 +20,11 @@ ReadFrame = Callable[[int], AnyArray]
 """Reads frame i of an open file, shape (vector, sample)."""
 
 
+def from_pairs(pairs: AnyArray) -> AnyArray:
+    """Complex samples of pairs of I and Q, the last axis."""
+    return pairs.astype(np.float32).view(np.complex64)[..., 0]
+
+
 @dataclass(eq=False, repr=False)
 class FileFrames:
     """Frames of a file that is opened when the first one is asked for; several threads may read.

@@ -268,10 +268,8 @@ def _attribute(node: Node, name: str) -> Any:
     return None
 
 
-def read_attribute(node: Node, name: str, default: float | None = None) -> float:
-    """Read a number; `default` stands in for a missing one unless it is None."""
-    if default is not None and name not in node.attrs:
-        return default
+def read_attribute(node: Node, name: str) -> float:
+    """Read a number."""
     return float(read_vector_attribute(node, name, 1)[0])
 
 

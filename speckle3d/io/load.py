@@ -123,8 +123,7 @@ def recording_files(path: PathLike) -> list[Path]:
     files = [] if place.is_dir() else [place]
     files += () if reader is None else reader.companions(place)
     if (beside := _settings_beside(path, reader)) is not None:
-        config = settings_for(path).plus_config
-        files += [beside, *([] if config is None else [Path(config)])]
+        files += [beside, *map(Path, filter(None, [settings_for(path).plus_config]))]
     return files
 
 

@@ -44,9 +44,6 @@ class PickedPoints:
     pixels: FloatArray
     wire: IntArray | None = None
 
-    def __len__(self) -> int:
-        return len(self.frame)
-
     def require_inside(self, shape: tuple[int, ...]) -> None:
         """Raise `MismatchError` unless all points lie in the frames of images of `shape` (n, column, row)."""
         places = np.column_stack([self.frame, self.pixels])

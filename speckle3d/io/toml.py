@@ -49,9 +49,8 @@ def parsed(text: str, where: str) -> dict[str, Any]:
 def first_fault(error: ValidationError) -> tuple[str, str]:
     """Return the name of the first setting that is wrong, and what is wrong with it."""
     first = error.errors()[0]
-    return ".".join(
-        str(part) for part in first["loc"]
-    ), f"{first['msg'].removeprefix('Value error, ')}, got {first['input']!r:.200}"
+    fault = f"{first['msg'].removeprefix('Value error, ')}, got {first['input']!r:.200}"
+    return ".".join(map(str, first["loc"])), fault
 
 
 def validated(values: dict[str, Any], where: str, model: type[Model]) -> Model:

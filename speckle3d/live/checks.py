@@ -1,7 +1,5 @@
 """Advice to the person who holds the probe, by the checks that the reconstruction uses."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from speckle3d.live.tracking import LivePose

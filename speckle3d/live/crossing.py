@@ -1,7 +1,5 @@
 """Check while a second sweep is made that it crosses the first one."""
 
-from __future__ import annotations
-
 import threading
 
 from speckle3d.config import Config

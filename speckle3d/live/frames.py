@@ -1,19 +1,18 @@
 """Images and transforms as they are received, made into what a sweep holds."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Self
 
 import numpy as np
-import numpy.typing as npt
 
-from speckle3d.core.arrays import FloatArray
+from speckle3d.core.arrays import AnyArray, FloatArray
 from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.grid import ImageGrid
 from speckle3d.core.sweep import Sweep
 from speckle3d.io.igtl.messages import ImageReceived
 from speckle3d.io.import_settings import ImportSettings, MissingSettingsError, option_of
+from speckle3d.io.plus.transforms import pixel_matrix
 from speckle3d.io.recordings import Recording, Value
 
 _ECHOES, _GREY_LEVELS = ("int16", "float32"), "uint8"
@@ -37,7 +36,7 @@ class ImageLayout:
     samples_along_columns: bool
 
     @classmethod
-    def of(cls, image: ImageReceived, settings: ImportSettings, name: str) -> ImageLayout:
+    def of(cls, image: ImageReceived, settings: ImportSettings, name: str) -> Self:
         """Layout of the images that are like the first one.
 
         Parameters
@@ -72,7 +71,7 @@ class ImageLayout:
             ) from None
         return cls(image.device, replace(example, name=name, probe=settings.probe or ""), of_rf)
 
-    def frame(self, image: ImageReceived) -> npt.NDArray[Any]:
+    def frame(self, image: ImageReceived) -> AnyArray:
         """Frame of an image, shape (vector, sample).
 
         Raises
@@ -93,31 +92,28 @@ class ImageLayout:
 
     @property
     def image_from_pixel(self) -> FloatArray:
-        """From (column, row, slice, 1) of a message's pixel to the image's mm, shape (4, 4)."""
-        grid = self.example.grid
-        matrix = np.diag([grid.vector_pitch_mm, grid.sample_spacing_mm, 1.0, 1.0])
-        matrix[1, 3] = grid.first_sample_depth_mm
-        if self.samples_along_columns:
-            # Columns are samples, and what is right-handed before must be so after.
-            matrix = matrix[:, [1, 0, 2, 3]] @ np.diag([1.0, 1.0, -1.0, 1.0])
-        return matrix
+        """As `message_matrix`."""
+        return message_matrix(self.example.grid, not self.samples_along_columns)
 
 
-def _plane(image: ImageReceived, where: str) -> npt.NDArray[Any]:
+def message_matrix(grid: ImageGrid, upright: bool) -> FloatArray:
+    """From (column, row, slice, 1) of a message's pixel to the image's mm, shape (4, 4)."""
+    matrix = pixel_matrix(grid)
+    # Where columns are samples, slices turn round so that the axes stay right-handed.
+    return matrix if upright else matrix[:, [1, 0, 2, 3]] @ np.diag([1.0, 1.0, -1.0, 1.0])
+
+
+def _plane(image: ImageReceived, where: str) -> AnyArray:
     """Pixels of a single grey image, shape (column, row)."""
     pixels = image.pixels
-    if pixels.ndim == 3 and image.components == 1 and pixels.shape[2] == 1:
-        pixels = pixels[:, :, 0]
     if pixels.ndim != 2:
         raise InvalidInputError(
-            f"{where}: expected one image of grey levels or echoes, got shape {pixels.shape} with "
-            f"{image.components} components"
+            f"{where}: expected one image of grey levels or echoes, got shape {pixels.shape}"
         )
-    # Big-endian pixels are turned round once, here.
-    return pixels.astype(pixels.dtype.newbyteorder("="), copy=False)
+    return pixels
 
 
-def _example(pixels: npt.NDArray[Any], image: ImageReceived, settings: ImportSettings, where: str) -> Sweep:
+def _example(pixels: AnyArray, image: ImageReceived, settings: ImportSettings, where: str) -> Sweep:
     """Sweep of one black frame; of RF the speed of sound must be given: no message has it."""
     if pixels.dtype != _GREY_LEVELS:
         values, black = {"speed_of_sound_m_s": Value()}, np.zeros_like(pixels.T)

@@ -1,32 +1,29 @@
 """Poses, volumes and words as messages that PLUS's clients and 3D Slicer understand: RAS, mm."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.volume import Volume
 from speckle3d.io.igtl.messages import packed_image, packed_status, packed_text, packed_transform
+from speckle3d.io.images.headers import RAS_FROM_LPS
 
 POSE, VOLUME, ADVICE = "ImageToReference", "Volume_Reference", "SweepAdvice"
 """Devices: pixels of the received images to the first image's mm, as PLUS names it; the growing volume in the
 same; words."""
 _NOT_READY = 13
 """OpenIGTLink's code of a device that is not ready."""
-_RAS_FROM_LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
-"""Files of this package call a world's axes left, posterior, superior: Slicer shows both alike."""
 
 
 def pose_message(world_from_image: RigidTransform, image_from_pixel: FloatArray, time_s: float) -> bytes:
     """TRANSFORM from a received image's pixels (column, row, slice) to the world, at the image's own time."""
-    matrix = _RAS_FROM_LPS @ world_from_image.as_matrix() @ image_from_pixel
+    matrix = RAS_FROM_LPS @ world_from_image.as_matrix() @ image_from_pixel
     return packed_transform(POSE, time_s, np.asarray(matrix))
 
 
 def volume_message(volume: Volume, time_s: float) -> bytes:
     """IMAGE of a volume."""
-    matrix = np.asarray(_RAS_FROM_LPS @ volume.world_from_index)
+    matrix = np.asarray(RAS_FROM_LPS @ volume.world_from_index)
     return packed_image(VOLUME, time_s, volume.voxels, matrix)
 
 

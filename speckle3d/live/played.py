@@ -15,7 +15,7 @@ from speckle3d.core.geometry import rigid
 from speckle3d.core.grid import ImageGrid
 from speckle3d.core.sweep import Frames, OrientationSensor, Sweep, Tracker
 from speckle3d.io.igtl.messages import packed_image, packed_transform
-from speckle3d.io.plus.transforms import pixel_matrix
+from speckle3d.live.frames import message_matrix
 
 Played: TypeAlias = tuple[float, bytes, bool]
 """When a message was sent, s from the first frame, the message, and whether it is an image."""
@@ -26,10 +26,11 @@ def played(
     frames: Frames,
     grid: ImageGrid,
     upright: bool,
-    devices: tuple[str, str, str],
-    later_s: float = 0.0,
+    later_s: float,
 ) -> Iterator[Played]:
     """Make messages of a sweep, in the order of their times; each carries its own time.
+
+    Devices are Image_Reference, ProbeToReference of the tracker and ProbeToWorld of the orientation sensor.
 
     Parameters
     ----------
@@ -40,9 +41,6 @@ def played(
         Of these.
     upright : bool
         Whether vectors are columns of the images, or their rows.
-    devices : tuple of str
-        Of the images, the tracker and the orientation sensor; ``A_B`` and ``AToB`` are PLUS's ways to say
-        that A is told in B.
     later_s : float
         Added to the times in the messages.
 
@@ -51,17 +49,16 @@ def played(
     InvalidInputError
         If a message cannot hold the frames, or a time.
     """
-    image, *sensor_devices = devices
     first_s = float(sweep.frame_time_s[0])
 
     def images() -> Iterator[Played]:
         for i, time_s in enumerate(sweep.frame_time_s):
             pixels, place = _pixels(frames, i, upright), _place(sweep, grid, upright, i)
-            message = packed_image(image, time_s + later_s, pixels, place, pixels.ndim - 1)
+            message = packed_image("Image_Reference", time_s + later_s, pixels, place, pixels.ndim - 1)
             yield float(time_s) - first_s, message, True
 
-    sensors = zip((sweep.tracker, sweep.orientation), sensor_devices, strict=True)
-    readings = (_readings(sensor, name, first_s, later_s) for sensor, name in sensors if sensor is not None)
+    sensors = {"ProbeToReference": sweep.tracker, "ProbeToWorld": sweep.orientation}.items()
+    readings = (_readings(sensor, name, first_s, later_s) for name, sensor in sensors if sensor is not None)
     return heapq.merge(images(), *readings, key=lambda message: message[0])
 
 
@@ -95,10 +92,7 @@ def _pixels(frames: Frames, i: int, upright: bool) -> AnyArray:
 
 def _place(sweep: Sweep, grid: ImageGrid, upright: bool, i: int) -> FloatArray:
     """Where the pixels of a frame lie, (4, 4): in the world of a calibrated tracker, else in the image."""
-    image_from_pixel = pixel_matrix(grid)
-    if not upright:
-        # Columns are samples; slices turn round so that the axes stay right-handed.
-        image_from_pixel = image_from_pixel[:, [1, 0, 2, 3]] @ np.diag([1.0, 1.0, -1.0, 1.0])
+    image_from_pixel = message_matrix(grid, upright)
     tracker, time_s = sweep.tracker, sweep.frame_time_s[i]
     if tracker is None or tracker.sensor_from_image is None or not tracker.covers(time_s):
         return image_from_pixel

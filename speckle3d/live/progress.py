@@ -1,7 +1,5 @@
 """Progress of a live session, and the devices that it hears from."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from speckle3d.io.igtl.messages import ImageReceived, Received

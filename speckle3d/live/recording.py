@@ -1,12 +1,8 @@
 """Record received images and transforms into a sweep file, on one clock."""
 
-from __future__ import annotations
-
 import time
-from typing import Any
 
-import numpy.typing as npt
-
+from speckle3d.core.arrays import AnyArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.geometry import transforms_from_matrices
 from speckle3d.io.family.sweep_writer import GrowingSweep
@@ -38,7 +34,7 @@ class SweepRecorder:
         self._began_s = self._came_s = time.monotonic()
         self._timeless = False
 
-    def keep_frame(self, frame: npt.NDArray[Any], sent_s: float) -> float | None:
+    def keep_frame(self, frame: AnyArray, sent_s: float) -> float | None:
         """Write a frame; its time in the sweep, or None if it is not later than the last frame's."""
         now_s = time.monotonic()
         if self._progress.frames and sent_s == 0.0:

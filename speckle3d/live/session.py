@@ -5,8 +5,6 @@ still being matched wait, `MOST_WAITING` of them; of more every other one is lef
 recording, and the reconstruction at the end has them.
 """
 
-from __future__ import annotations
-
 import threading
 import time
 from collections import deque
@@ -15,14 +13,12 @@ from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any, Protocol
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.config import Config
-from speckle3d.core.arrays import Float32Array, FloatArray
+from speckle3d.core.arrays import AnyArray, Float32Array, FloatArray
 from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.core.errors import InvalidInputError, Speckle3DError
 from speckle3d.core.grid import ImageGrid
@@ -30,6 +26,7 @@ from speckle3d.core.threads import on_one_thread
 from speckle3d.imaging.voxels.volume import CompoundedVolume
 from speckle3d.io.family.sweep_writer import GrowingSweep
 from speckle3d.io.hdf5 import make_folder
+from speckle3d.io.igtl.link import End
 from speckle3d.io.igtl.messages import ImageReceived, Received, TransformReceived
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.live.checks import GOOD, NO_OVERLAP, TOO_FAST, Advice, words_for
@@ -47,13 +44,6 @@ MOST_WAITING = 12
 """Frames that wait to be matched, half a second of them: more would be late, not better."""
 _LOOK_S = 0.1
 VOLUME_EVERY_S = 1.0
-
-
-class MessageSource(Protocol):
-    """Source of messages."""
-
-    def receive(self, timeout_s: float) -> list[Received]:
-        """Take all messages in order, waiting for the first one; empty if none came in time."""
 
 
 @dataclass(frozen=True)
@@ -86,7 +76,7 @@ class SessionSettings:
 @dataclass(frozen=True)
 class _Waiting:
     number: int
-    frame: npt.NDArray[Any]
+    frame: AnyArray
     time_s: float
     sent_s: float
     came_s: float
@@ -97,8 +87,8 @@ class Session:
 
     Parameters
     ----------
-    source : MessageSource
-        As `speckle3d.io.igtl.link.Connection`.
+    source : End
+        Where messages come from.
     send : sequence of callable
         Each is given every message to send; none may wait.
     curves : DecorrelationCurves
@@ -116,7 +106,7 @@ class Session:
 
     def __init__(
         self,
-        source: MessageSource,
+        source: End,
         send: Sequence[Callable[[bytes], None]],
         curves: DecorrelationCurves,
         settings: SessionSettings,

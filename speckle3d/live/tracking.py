@@ -9,18 +9,14 @@ Two things of a recording's reconstruction have to wait for its end: ties betwee
 and the sign of the motion, which sensors tell.
 """
 
-from __future__ import annotations
-
 import threading
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.config import Config
-from speckle3d.core.arrays import FloatArray, IntArray
+from speckle3d.core.arrays import AnyArray, FloatArray, IntArray
 from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.geometry import mirrored
@@ -166,7 +162,7 @@ class LiveTracker:
         if self._thread is not None:
             self._thread.join()
 
-    def append(self, frame: npt.NDArray[Any], time_s: float) -> LivePose:
+    def append(self, frame: AnyArray, time_s: float) -> LivePose:
         """Match a frame with earlier ones and place it.
 
         Parameters

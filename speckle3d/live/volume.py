@@ -1,7 +1,5 @@
 """Growing volume of a live sweep, compounded from small images at the current poses."""
 
-from __future__ import annotations
-
 import threading
 
 import numpy as np

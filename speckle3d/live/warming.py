@@ -1,7 +1,5 @@
 """Load kernels before the first frame arrives."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.signal import lfilter
 

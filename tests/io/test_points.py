@@ -27,7 +27,7 @@ def test_a_wire_goes_by_its_name_before_its_number_or_there_are_none(tmp_path):
     path = file_of(tmp_path, HEAD + "0,1,1,2\n0,2,2,0\n0,3,3,1\n")
     np.testing.assert_array_equal(read_points(path, WIRES).wire, [2, 0, 1])
     plain = read_points(file_of(tmp_path, "frame,column_px,row_px\n0,1,2\n0,1,2\n"))
-    assert (plain.wire, len(plain)) == (None, 2)
+    assert (plain.wire, len(plain.frame)) == (None, 2)
     with pytest.raises(InvalidInputError, match="line 2"):
         read_points(file_of(tmp_path, "frame,column_px,row_px\n-1,1,2\n"))
 

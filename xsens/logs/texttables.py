@@ -15,7 +15,7 @@ from functools import cache
 from itertools import chain, islice, zip_longest
 
 import numpy as np
-from scipy.constants import g
+from scipy.constants import degree, g
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
@@ -33,15 +33,14 @@ _DATE_DIGIT, _MILLISECONDS = re.compile(r"\b(\d)\b"), re.compile(r":(\d{3})$")
 _DIGIT = re.compile("[0-9]")
 # -- names of columns
 
-_DEG = 0.017453292519943295
 TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}
 _FORCES = dict.fromkeys(("m_s2", "m_s_2", "m_s_s", "mps2"), 1.0) | {"g": g, "mg": 1e-3 * g}
-_RATES = {"rad_s": 1.0, "rads": 1.0, "mrad_s": 1e-3, "mdps": 1e-3 * _DEG}
-_RATES |= dict.fromkeys(("deg_s", "dps", "°_s"), _DEG)
+_RATES = {"rad_s": 1.0, "rads": 1.0, "mrad_s": 1e-3, "mdps": 1e-3 * degree}
+_RATES |= dict.fromkeys(("deg_s", "dps", "°_s"), degree)
 _FIELDS = dict.fromkeys(
     ("au", "a_u", "ut", "µt", "nt", "mt", "t", "gauss", "g", "mgauss", "mg", "local_flux"), 1.0
 )
-_ANGLES = {"deg": 1.0, "°": 1.0, "rad": 1.0 / _DEG}
+_ANGLES = {"deg": 1.0, "°": 1.0, "rad": 1.0 / degree}
 _AXES = {
     "0": "w",
     "1": "x",

@@ -16,9 +16,8 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from speckle3d.core.arrays import BoolArray, FloatArray
+from speckle3d.core.arrays import AnyArray, BoolArray, FloatArray
 from speckle3d.core.errors import InvalidInputError
 from xsens.messages.framing import Frames, Message, rows_at
 
@@ -200,7 +199,7 @@ The second is over 2**20; the third a 48-bit integer over 2**32, its fraction be
 """
 
 
-def as_floats(numbers: NDArray[Any]) -> FloatArray:
+def as_floats(numbers: AnyArray) -> FloatArray:
     """Float64 of numbers of one of the types in `REAL`, or of unsigned whole numbers."""
     if numbers.dtype == REAL[1]:
         return numbers / 2.0**20
@@ -312,7 +311,7 @@ class DataLayout:
         real = REAL[(self.settings >> 8) & 3]
         return np.dtype([(field.name, field.whole or real, (field.count,)) for field in self.fields])
 
-    def decode(self, frames: Frames, name: str) -> NDArray[Any]:
+    def decode(self, frames: Frames, name: str) -> AnyArray:
         """Numbers of a field in messages of this layout, shape (n, count); for `as_floats`."""
         kind, offset = self.dtype.fields[name][:2]  # type: ignore[index]
         return rows_at(frames.data, frames.payload_start + offset, kind.itemsize).view(kind.base)

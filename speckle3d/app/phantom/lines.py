@@ -6,14 +6,10 @@ References
    figure 16.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import panel as pn
 from bokeh.models import ColumnDataSource
 from panel.viewable import Viewable
@@ -23,6 +19,7 @@ from calibration.points import Recording
 from speckle3d.app.phantom.plots import ORANGE, SKY_BLUE
 from speckle3d.app.phantom.viewer import PhantomViewer
 from speckle3d.calibrating.settings import OrientationSettings, PlaneSettings, ScanSettings
+from speckle3d.core.arrays import AnyArray
 
 _HINT = (
     "In the image: the line found (blue) and the edges that agree with it (orange rings). "
@@ -50,7 +47,7 @@ class LinesViewer(PhantomViewer):
         controls = [self.widgets[name] for name in names if name in self.widgets]
         return self.layout(pn.GridBox(*controls, ncols=2), pn.pane.HTML(_HINT, width=600))
 
-    def show(self, image: npt.NDArray[Any], settings: ScanSettings) -> str:
+    def show(self, image: AnyArray, settings: ScanSettings) -> str:
         """Find the line in a frame."""
         self._line.data = self._inliers.data = {"column": [], "row": []}
         assert isinstance(settings, PlaneSettings | OrientationSettings)

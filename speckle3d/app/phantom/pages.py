@@ -1,7 +1,5 @@
 """The page for a recording of a phantom."""
 
-from __future__ import annotations
-
 from functools import partial
 from pathlib import Path
 
@@ -10,7 +8,6 @@ from speckle3d.app.phantom.lines import LinesViewer
 from speckle3d.app.phantom.points import PointsViewer
 from speckle3d.calibrating.phantoms import open_phantom, require_frames
 from speckle3d.calibrating.settings import ScanSettings, WireSettings
-from speckle3d.core.errors import InvalidInputError
 
 
 def phantom_page(images: Path, settings: ScanSettings) -> Page:
@@ -29,8 +26,6 @@ def phantom_page(images: Path, settings: ScanSettings) -> Page:
         If the recording cannot be opened, or phantom, points or frames of the settings do not fit it.
     """
     recording = open_phantom(images, settings)
-    if not recording.images.shape[0]:
-        raise InvalidInputError(f"{images}: expected frames to look at, got none")
     require_frames(settings.frames_left_out, recording.images.shape[0])
     is_wires = isinstance(settings, WireSettings)
     make = partial(PointsViewer if is_wires else LinesViewer, recording, images, settings)

@@ -1,7 +1,5 @@
 """The plots of a phantom's recording: one frame, and a bar for every frame."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -12,6 +10,7 @@ from bokeh.models import ColumnDataSource, HoverTool, Range1d
 
 from calibration.points import Recording
 from speckle3d.app.plots import ImagePlot, empty_plot, greys
+from speckle3d.core.arrays import AnyArray
 
 BLUE, SKY_BLUE, ORANGE, YELLOW, GREY, PALE = "#0072B2", "#56B4E9", "#D55E00", "#F0E442", "#999999", "#e8e8e8"
 """Okabe and Ito's palette, distinguishable with any colour vision: blue for what is used, sky blue for that
@@ -32,7 +31,7 @@ class FramePlot(ImagePlot):
         Called with the corners, shape (n, 2), of a box that was drawn.
     """
 
-    def __init__(self, recording: Recording, on_box: Callable[[npt.NDArray[Any]], None]) -> None:
+    def __init__(self, recording: Recording, on_box: Callable[[AnyArray], None]) -> None:
         column_mm, row_mm = (float(size) for size in recording.pixel_mm)
         super().__init__(
             f"column ({column_mm:.3g} mm apart)",
@@ -50,7 +49,7 @@ class FramePlot(ImagePlot):
         self.plot.patch("x", "y", source=self._region, fill_alpha=0.06, color=YELLOW, line_dash="dashed")
         self.plot.on_event(SelectionGeometry, self._select)
 
-    def show_frame(self, frame: int, region: npt.ArrayLike | None) -> npt.NDArray[Any]:
+    def show_frame(self, frame: int, region: npt.ArrayLike | None) -> AnyArray:
         """Draw a frame and the region, and return the frame as it is, shape (column, row)."""
         image = self._images[frame]
         self.show(greys(image.T, *self._levels), (0.0, 0.0), (1.0, 1.0))

@@ -1,13 +1,10 @@
 """The tuner of wires: points picked, moved and deleted with the mouse, and the calibration with them."""
 
-from __future__ import annotations
-
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import panel as pn
 from bokeh.models import ColumnDataSource, PointDrawTool
 from panel.viewable import Viewable
@@ -19,6 +16,7 @@ from speckle3d.app.phantom.plots import BLUE, ORANGE, SKY_BLUE
 from speckle3d.app.phantom.viewer import PhantomViewer, new_path, run_in_thread, sentence
 from speckle3d.calibrating.phantoms import WireSetup, detect_phantom, detections_by_hand
 from speckle3d.calibrating.settings import ScanSettings, WireSettings, with_values
+from speckle3d.core.arrays import AnyArray
 from speckle3d.core.errors import InvalidInputError, Speckle3DError
 from speckle3d.io.points import PickedPoints, read_points, write_points
 
@@ -89,7 +87,7 @@ class PointsViewer(PhantomViewer):
         files = pn.Row(save, self._points_name)
         return self.layout(pn.pane.HTML(_HINT, width=600), buttons, files, self._points_note)
 
-    def show(self, image: npt.NDArray[Any], settings: ScanSettings) -> str:
+    def show(self, image: AnyArray, settings: ScanSettings) -> str:
         """Draw the points of a frame, and count them."""
         points = self._picks.get(self.frame, {})
         column, row = zip(*points.values(), strict=True) if points else ((), ())

@@ -1,7 +1,5 @@
 """Base of both phantom tuners: frames, their picture, the settings, and the calibration with its result."""
 
-from __future__ import annotations
-
 import asyncio
 import html
 import os
@@ -11,7 +9,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-import numpy.typing as npt
 import panel as pn
 from panel.viewable import Viewable
 from pydantic import BaseModel
@@ -31,6 +28,7 @@ from speckle3d.calibrating.phantoms import (
 )
 from speckle3d.calibrating.settings import PlaneSettings, ScanSettings, with_values
 from speckle3d.calibrating.written import BESIDE
+from speckle3d.core.arrays import AnyArray
 from speckle3d.core.errors import InvalidInputError, Speckle3DError
 
 _Result = TypeVar("_Result")
@@ -148,7 +146,7 @@ class PhantomViewer:
         self._save.disabled = True
         self._show()
 
-    def show(self, image: npt.NDArray[Any], settings: ScanSettings) -> str:
+    def show(self, image: AnyArray, settings: ScanSettings) -> str:
         """Draw what is found in a frame, and return what to say; raise `Speckle3DError` where nothing is."""
         raise NotImplementedError
 
@@ -164,9 +162,9 @@ class PhantomViewer:
         """Say something below the picture."""
         self._words.object = sentence(words, colour, "phantom-told")
 
-    def mark_frames(self, uses: dict[int, str], refusals: dict[int, str] | None = None) -> None:
+    def mark_frames(self, uses: dict[int, str], refusals: dict[int, str]) -> None:
         """Say which frames have something and which not, in place of what became of them before."""
-        self._uses, self._refusals = uses, refusals or {}
+        self._uses, self._refusals = uses, refusals
         self._show()
 
     @batch_changes
@@ -189,7 +187,7 @@ class PhantomViewer:
             frames = {*self.settings().frames_left_out} ^ {frame}
             self.widgets["leave_out"].value = ",".join(map(str, sorted(frames)))
 
-    def _draw_region(self, corners: npt.NDArray[Any]) -> None:
+    def _draw_region(self, corners: AnyArray) -> None:
         # A mouse knows no more than a tenth of a pixel, and a command can be given that.
         self.widgets["region"].value = " ".join(f"{column:.1f},{row:.1f}" for column, row in corners)
 

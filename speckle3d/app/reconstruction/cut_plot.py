@@ -1,7 +1,5 @@
 """A plot of one cut: its image in mm, the cross hair, and measured points."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

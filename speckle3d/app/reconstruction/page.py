@@ -1,7 +1,5 @@
 """The reconstruction viewer: three cuts that a cross hair joins, trajectories in space, measurements."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import lru_cache
 from html import escape

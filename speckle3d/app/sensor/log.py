@@ -1,7 +1,5 @@
 """Readings of a log of an orientation sensor, and the orientation by them, from time zero on."""
 
-from __future__ import annotations
-
 from functools import cached_property
 
 import numpy as np

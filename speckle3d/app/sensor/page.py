@@ -1,7 +1,5 @@
 """An orientation sensor, live or of a log: how it is held, what it reads, and whether to trust its field."""
 
-from __future__ import annotations
-
 from html import escape
 from typing import Any
 

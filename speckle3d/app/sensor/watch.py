@@ -1,7 +1,5 @@
 """A live sensor that several viewers look at: recorded to a file, asked for its state by one thread alone."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections import deque

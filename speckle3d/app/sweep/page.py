@@ -1,7 +1,5 @@
 """The sweep player: frames, their patches, flags, doubts and sensors."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from html import escape
 from typing import Any

@@ -1,12 +1,9 @@
 """The plots of a sweep: the image with its patches in mm; flags, doubts and sensors over the time."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from bokeh.models import (
     ColumnDataSource,
     FactorRange,
@@ -22,13 +19,13 @@ from scipy.spatial.transform import RigidTransform
 
 import speckle3d as s3
 from speckle3d.app.plots import ImagePlot, time_plot
-from speckle3d.core.arrays import FloatArray, IntArray
+from speckle3d.core.arrays import AnyArray, FloatArray, IntArray
 from speckle3d.core.errors import Doubt
 from speckle3d.core.grid import ImageGrid
 from speckle3d.core.reconstruction import FramePairs
 from speckle3d.matching.quality import FrameFlag
 
-PatchValues = dict[str, npt.NDArray[Any]]
+PatchValues = dict[str, AnyArray]
 
 NEIGHBOURS = 8
 """Frames before and after with which a frame can be compared."""

@@ -1,7 +1,5 @@
 """Calibration from images of anything: a mounting from two crossing sweeps, and a sensor's clock offset."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from math import nan
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Sizes: between points of a reconstructed sweep, and of the surfaces of a volume."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Any
 

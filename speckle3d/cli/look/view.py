@@ -1,7 +1,5 @@
 """Looking at a file in the browser."""
 
-from __future__ import annotations
-
 import webbrowser
 from contextlib import ExitStack
 from pathlib import Path

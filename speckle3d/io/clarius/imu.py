@@ -33,6 +33,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.constants import g
 from scipy.spatial.transform import Rotation
 
 from speckle3d.core.arrays import FloatArray
@@ -45,7 +46,6 @@ from speckle3d.io.pose_paths import usable
 from speckle3d.io.recordings import Row
 from speckle3d.io.text import parse_number
 
-G_M_S2 = 9.80665
 MEANING = "scalar first, world from sensor"
 
 _VECTORS = [f"{name} {axis}" for name in ("accelerometer", "gyroscope", "magnetometer") for axis in "xyz"]
@@ -144,6 +144,6 @@ def read_samples(member: Member) -> SensorSamples:
             f"the sensor's quaternion {fault}: the sweep has no orientation, which `speckle3d imu orient "
             f"{member.path} --into SWEEP.h5` finds"
         )
-    streams = sign * G_M_S2 * measured_g, gyroscope, magnetometer if has_column[6:9].all() else None
+    streams = sign * g * measured_g, gyroscope, magnetometer if has_column[6:9].all() else None
     vectors = dict(zip(INERTIAL, streams, strict=True))
     return SensorSamples(stamps[places, 0] / 1e9, vectors, rotation, facts, remarks)

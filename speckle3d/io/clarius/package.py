@@ -36,7 +36,7 @@ from speckle3d.core.arrays import AnyArray, ComplexArray, FloatArray
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.extras import extra_module
 from speckle3d.core.files import open_regular
-from speckle3d.io.frames import ReadFrame
+from speckle3d.io.frames import ReadFrame, from_pairs
 from speckle3d.io.hdf5 import reading
 
 _NAME = re.compile(
@@ -288,8 +288,7 @@ def open_frames(member: Member, kind: str, turns: ComplexArray | None = None) ->
     samples = open_raw(member, kind)["samples"]
 
     def frame(i: int) -> Any:
-        parts = samples[i]
-        echoes = (parts.astype(np.float32).view(np.complex64) if kind == "IQ" else parts)[..., 0]
+        echoes = from_pairs(samples[i]) if kind == "IQ" else samples[i][..., 0]
         return echoes if turns is None else echoes * turns
 
     return frame

@@ -7,7 +7,6 @@ from typing import Any
 
 import h5py
 import numpy as np
-import numpy.typing as npt
 
 from speckle3d.core.arrays import AnyArray, FloatArray
 from speckle3d.core.errors import InvalidInputError, naming
@@ -17,7 +16,7 @@ from speckle3d.core.streams import TimedPoses, TimedRotations
 from speckle3d.core.sweep import INERTIAL, BModeSettings, OrientationSensor, RFSettings, Sweep, Tracker
 from speckle3d.core.text import printable
 from speckle3d.io.family.records import read_record
-from speckle3d.io.frames import FileFrames, HDF5Slices
+from speckle3d.io.frames import FileFrames, HDF5Slices, from_pairs
 from speckle3d.io.hdf5 import (
     Node,
     file_format,
@@ -52,11 +51,6 @@ SENSORS: dict[str, tuple[str, str, tuple[int, ...], Callable[[FloatArray, str], 
 """Of each sensor, its data set of readings, its attribute of the image's place, and the shape of both."""
 MEMBERS = frozenset({*SAMPLE_TYPES, *SENSORS, "frame_time_s", "truth", "fan", GROWING})
 """Members of the root that these versions of the format give a meaning to."""
-
-
-def from_pairs(pairs: npt.NDArray[np.int16]) -> npt.NDArray[np.complex64]:
-    """Complex samples of pairs of I and Q, the last axis."""
-    return pairs.astype(np.float32).view(np.complex64)[..., 0]
 
 
 def open_sweep(source: h5py.File, _: ImportSettings) -> Recording:

@@ -20,10 +20,9 @@ from pathlib import Path
 
 import h5py
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform
 
-from speckle3d.core.arrays import FloatArray
+from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.geometry import transforms_from_matrices
 from speckle3d.io.frames import FileFrames, HDF5Slices
@@ -63,7 +62,7 @@ class Landmarks:
         In the image frame.
     """
 
-    frame: npt.NDArray[np.int64]
+    frame: IntArray
     points_mm: FloatArray
 
 

@@ -88,8 +88,7 @@ def open_dicom(path: Path, settings: ImportSettings) -> Facts:
         header = pydicom.dcmread(stream, stop_before_pixels=True, force=True, specific_tags=list(_TAGS))
         plain = uid.ImplicitVRLittleEndian if header.original_encoding[0] else uid.ExplicitVRLittleEndian
         syntax = str(header.file_meta.get("TransferSyntaxUID", plain))
-        for _ in header.iterall():  # elements are read from their bytes when first asked for
-            pass
+        list(header.iterall())  # elements are read from their bytes when first asked for
     machine = " ".join(str(header[name].value) for name in _MACHINE if name in header)
     yield "scanner", machine or "not named", ""
     for name, expected in _EXPECTED.items():

@@ -14,6 +14,7 @@ from typing import Self
 from speckle3d.core.errors import FileError
 from speckle3d.io.igtl.messages import HEADER, MessageError, Received, body_bytes, decode
 
+_LOOPBACK = "127.0.0.1"
 STALL_S = 10.0
 """Longest time that a message may take."""
 
@@ -194,9 +195,7 @@ class Server(End):
     Parameters
     ----------
     port : int
-        0 for any free one, which `port` then tells.
-    address : str
-        This machine alone by default.
+        Of this machine alone; 0 for any free one, which `port` then tells.
 
     Raises
     ------
@@ -204,13 +203,13 @@ class Server(End):
         If the port is taken, or not for this user.
     """
 
-    def __init__(self, port: int, address: str = "127.0.0.1") -> None:
+    def __init__(self, port: int) -> None:
         super().__init__()
         try:
-            self._socket = socket.create_server((address, port))
+            self._socket = socket.create_server((_LOOPBACK, port))
         except (OSError, OverflowError) as error:
             reason = getattr(error, "strerror", None) or error
-            raise FileError(f"{address}:{port}: expected a free port to listen on: {reason}") from error
+            raise FileError(f"{_LOOPBACK}:{port}: expected a free port to listen on: {reason}") from error
         self.port = int(self._socket.getsockname()[1])
 
     def close(self) -> None:
@@ -218,16 +217,14 @@ class Server(End):
         super().close()
         self._socket.close()
 
-    def drain(self, timeout_s: float) -> bool:
-        """Wait until everything is sent to all clients; False if it was not in time."""
+    def drain(self, timeout_s: float) -> None:
+        """Wait until everything is sent to all clients, so long at most."""
 
         async def drained() -> None:
             await asyncio.gather(*(writer.drain() for writer in self._writers))
 
         with suppress(OSError):  # a client's that is lost, or too slow
             asyncio.run_coroutine_threadsafe(drained(), self._loop).result(timeout_s)
-            return True
-        return False
 
     async def _serve(self) -> None:
         async def welcome(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:

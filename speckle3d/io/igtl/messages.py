@@ -23,13 +23,13 @@ from pyigtl.messages import MessageBase
 
 from speckle3d.core.arrays import AnyArray, FloatArray
 from speckle3d.core.errors import InvalidInputError
+from speckle3d.io.images.headers import RAS_FROM_LPS
 
 HEADER = struct.Struct("> H 12s 20s II Q Q")
 _STATUS = struct.Struct("> H q 20s")
 _TYPE = re.compile(rb"[A-Z][A-Z0-9_]*\0*")
 _MOST_BYTES = 2**28
 """A colour volume of 400 voxels along each axis; more is a header that is none."""
-_RAS_FROM_LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
 
 
 pyigtl.messages.CRC64 = ecma_182
@@ -53,15 +53,12 @@ class ImageReceived:
         In the message's order, whose columns run fastest: the transposed of one slice is contiguous.
     image_to_world : ndarray, shape (4, 4)
         From column, row and slice of a pixel's centre to mm; the size of pixels is in it.
-    components : int
-        Numbers a pixel has: 3 of a colour image.
     """
 
     device: str
     time_s: float
     pixels: AnyArray
     image_to_world: FloatArray
-    components: int = 1
 
     @property
     def spacing_mm(self) -> FloatArray:
@@ -182,14 +179,13 @@ def _pack(message: Any, device: str, time_s: float) -> bytes:
 def _image(message: Any) -> ImageReceived:
     matrix = message.ijk_to_world_matrix
     if message.world_coordinate_system == "lps":
-        matrix = _RAS_FROM_LPS @ matrix
+        matrix = RAS_FROM_LPS @ matrix
     by_slice: AnyArray = message.image
     pixels = by_slice.transpose(2, 1, 0, *range(3, by_slice.ndim))
     if pixels.shape[2] == 1:
         pixels = pixels[:, :, 0]
     pixels = pixels.astype(pixels.dtype.newbyteorder("="), copy=False)
-    components = by_slice.shape[3] if by_slice.ndim == 4 else 1
-    return ImageReceived(message.device_name, message.timestamp, pixels, matrix, components)
+    return ImageReceived(message.device_name, message.timestamp, pixels, matrix)
 
 
 def _transform(message: Any) -> TransformReceived:

@@ -64,6 +64,9 @@ _SYNONYMS = {
 }  # fmt: skip
 """Fields of MetaImage by their other names."""
 
+RAS_FROM_LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
+"""World of NIfTI, 3D Slicer and OpenIGTLink (right, anterior, superior) from that of images and volumes."""
+
 _START = re.compile(rb"(?:\xef\xbb\xbf)?(?:NRRD000|(?:ObjectType|NDims|Comment|ObjectSubType)\s*=)")
 _FRAME_FIELD = re.compile(r"Seq_Frame0*(\d{1,7})_(\w+)")
 _MM_PER = {

@@ -28,7 +28,7 @@ from speckle3d.core.geometry import transforms_from_matrices
 from speckle3d.core.text import printable
 from speckle3d.core.volume import VOXEL_TYPES, LabelMap, Segment, Volume
 from speckle3d.io.hdf5 import LABELS_ALONE, atomic_path, reading, require_suffix
-from speckle3d.io.images.headers import is_image, mm_per, read_header, write_image
+from speckle3d.io.images.headers import RAS_FROM_LPS, is_image, mm_per, read_header, write_image
 from speckle3d.io.readers import first_bytes
 from speckle3d.io.text import number_text, numbers, unescape
 
@@ -36,8 +36,6 @@ SUFFIXES = (".nrrd", ".mha", ".nii.gz", ".nii")
 """Of files that are written; labels may have .seg.nrrd, too."""
 _PREFIX = "Speckle3D_"
 """Before the names of a volume's fields, so that none is taken for one of the format's own."""
-_RAS_FROM_LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
-"""World of NIfTI from that of the other formats."""
 _LABELS, _COMMENT = "label", "speckle3d"
 """NIfTI's intent of an image of labels, and the name of fields in its comment."""
 _SEGMENTATION = """\
@@ -229,7 +227,7 @@ def _read_nifti(path: Path) -> tuple[AnyArray, FloatArray, dict[str, str], bool]
         is_labels = image.header.get_intent()[0] == _LABELS
     while voxels.ndim > 3 and voxels.shape[-1] == 1:
         voxels = voxels[..., 0]
-    affine = np.diag([factor, factor, factor, 1.0]) @ _RAS_FROM_LPS @ image.affine
+    affine = np.diag([factor, factor, factor, 1.0]) @ RAS_FROM_LPS @ image.affine
     fields: dict[str, str] = {}
     for extension in image.header.extensions:
         with suppress(ValueError, LookupError, TypeError, AttributeError):  # of somebody else
@@ -298,7 +296,7 @@ Segment{i}_Layer=0
 def _write_nifti(path: Path, volume: Volume, fields: Mapping[str, str]) -> None:
     # NIfTI-1 counts voxels along an axis by two bytes.
     kind: Any = nibabel.Nifti2Image if max(volume.shape) >= 2**15 else nibabel.Nifti1Image
-    image = kind(volume.voxels, _RAS_FROM_LPS @ volume.world_from_index)
+    image = kind(volume.voxels, RAS_FROM_LPS @ volume.world_from_index)
     image.set_qform(image.affine, 1)
     image.set_sform(image.affine, 1)
     image.header.set_xyzt_units("mm")
