@@ -5,16 +5,20 @@ from pathlib import Path
 from typing import Self
 
 import numpy as np
+from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import AnyArray, FloatArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.grid import ImageGrid
 from speckle3d.core.sweep import Sweep
-from speckle3d.io.igtl.messages import ImageReceived
+from speckle3d.io.igtl.messages import ImageReceived, packed_transform
+from speckle3d.io.images.headers import RAS_FROM_LPS
 from speckle3d.io.import_settings import ImportSettings, MissingSettingsError, option_of
 from speckle3d.io.plus.transforms import pixel_matrix
 from speckle3d.io.recordings import Recording, Value
 
+POSE = "ImageToReference"
+"""Device of poses: pixels of the received images to the first image's mm, as PLUS names it."""
 _ECHOES, _GREY_LEVELS = ("int16", "float32"), "uint8"
 
 
@@ -90,10 +94,10 @@ class ImageLayout:
             )
         return np.ascontiguousarray(frame)
 
-    @property
-    def image_from_pixel(self) -> FloatArray:
-        """As `message_matrix`."""
-        return message_matrix(self.example.grid, not self.samples_along_columns)
+    def pose_message(self, world_from_image: RigidTransform, time_s: float) -> bytes:
+        """TRANSFORM from a received image's pixels (column, row, slice) to the world, at the image's time."""
+        image_from_pixel = message_matrix(self.example.grid, not self.samples_along_columns)
+        return packed_transform(POSE, time_s, RAS_FROM_LPS @ world_from_image.as_matrix() @ image_from_pixel)
 
 
 def message_matrix(grid: ImageGrid, upright: bool) -> FloatArray:

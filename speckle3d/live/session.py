@@ -27,17 +27,31 @@ from speckle3d.imaging.voxels.volume import CompoundedVolume
 from speckle3d.io.family.sweep_writer import GrowingSweep
 from speckle3d.io.hdf5 import make_folder
 from speckle3d.io.igtl.link import End
-from speckle3d.io.igtl.messages import ImageReceived, Received, TransformReceived
+from speckle3d.io.igtl.messages import (
+    ImageReceived,
+    Received,
+    TransformReceived,
+    packed_image,
+    packed_status,
+    packed_text,
+)
+from speckle3d.io.images.headers import RAS_FROM_LPS
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.live.checks import GOOD, NO_OVERLAP, TOO_FAST, Advice, words_for
 from speckle3d.live.crossing import CrossingCheck
 from speckle3d.live.frames import ImageLayout
-from speckle3d.live.outgoing import pose_message, volume_message, word_messages
 from speckle3d.live.progress import Devices, Progress
 from speckle3d.live.recording import SweepRecorder
 from speckle3d.live.tracking import LivePose, LiveTracker
 from speckle3d.live.volume import GrowingVolume
 
+VOLUME, ADVICE = "Volume_Reference", "SweepAdvice"
+"""Devices: the growing volume in the first image's mm, and words for the person who holds the probe.
+
+Files of this package call a world's axes left, posterior, superior, messages RAS: Slicer shows both alike.
+"""
+_NOT_READY = 13
+"""OpenIGTLink's code of a device that is not ready; 1 says that all is well."""
 MOST_BEFORE = 1000
 """Transforms that are kept until the first frame comes."""
 MOST_WAITING = 12
@@ -242,7 +256,7 @@ class Session:
         with closing(LiveTracker(layout.example, self._curves, self._settings.config)) as tracker:
             volume = GrowingVolume(tracker.image_grid)
             self.tracker, self._volume, tracker.images = tracker, volume, volume.keep
-            work = {"placing": partial(self._match, tracker, layout.image_from_pixel)}
+            work = {"placing": partial(self._match, tracker, layout)}
             if self._settings.volume:
                 work["volumes"] = partial(self._send_volumes, tracker, volume)
             if self._crossing is not None:
@@ -268,7 +282,7 @@ class Session:
             reason = str(error) if isinstance(error, Speckle3DError) else repr(error)
             self.progress.failure = f"{name} ended, recording goes on: {reason}"
 
-    def _match(self, tracker: LiveTracker, image_from_pixel: FloatArray) -> None:
+    def _match(self, tracker: LiveTracker, layout: ImageLayout) -> None:
         """Place frames as they come, and send their poses."""
         before = 0
         while True:
@@ -279,7 +293,7 @@ class Session:
                 waiting = self._queue.popleft()
             tracker.hurry = bool(self._queue)
             pose = tracker.append(waiting.frame, waiting.time_s)
-            self._send(pose_message(pose.world_from_image, image_from_pixel, waiting.sent_s))
+            self._send(layout.pose_message(pose.world_from_image, waiting.sent_s))
             self.poses.append(pose)
             self._sent_s = waiting.sent_s
             self.progress.poses += 1
@@ -299,9 +313,9 @@ class Session:
         if words == GOOD and self._crossing is not None:
             words = self._crossing.words
         if self._words.take(words, pose.time_s):
-            self.progress.words = self._words.text
-            for message in word_messages(self._words.text, self._words.text == GOOD, sent_s):
-                self._send(message)
+            self.progress.words = text = self._words.text
+            self._send(packed_text(ADVICE, sent_s, text))
+            self._send(packed_status(ADVICE, sent_s, text, 1 if text == GOOD else _NOT_READY))
 
     def _send_volumes(self, tracker: LiveTracker, volume: GrowingVolume) -> None:
         """Send the volume about once a second."""
@@ -311,8 +325,9 @@ class Session:
             if len(poses) > frames:
                 frames = len(poses)
                 with on_one_thread():
-                    self.voxels = volume.compound(poses)
-                    self._send(volume_message(self.voxels, self._sent_s))
+                    self.voxels = voxels = volume.compound(poses)
+                    place = RAS_FROM_LPS @ voxels.world_from_index
+                    self._send(packed_image(VOLUME, self._sent_s, voxels.voxels, place))
                 self.progress.volumes += 1
 
     def _send(self, message: bytes) -> None:

@@ -10,9 +10,8 @@ from scipy.spatial.transform import RigidTransform
 import speckle3d as s3
 from speckle3d.io.igtl.messages import ImageReceived, TransformReceived
 from speckle3d.io.import_settings import ImportSettings, MissingSettingsError
-from speckle3d.live.frames import ImageLayout
-from speckle3d.live.outgoing import ADVICE, POSE, VOLUME, pose_message
-from speckle3d.live.session import Session, SessionSettings
+from speckle3d.live.frames import POSE, ImageLayout
+from speckle3d.live.session import ADVICE, VOLUME, Session, SessionSettings
 
 RF = ImportSettings(
     sampling_rate_hz=2e8 / 3,
@@ -137,7 +136,7 @@ def test_a_pose_takes_pixels_to_slicers_axes(example):
     frames, _ = example
     layout = ImageLayout.of(image(frames[0], 0.0), RF, "sweep")
     world = RigidTransform.from_translation([1.0, 2.0, 3.0])
-    message = decode_whole(pose_message(world, layout.image_from_pixel, 5.0))
+    message = decode_whole(layout.pose_message(world, 5.0))
     # Sample 100 of vector 10: 3 mm along x and 1.155 mm deep in the image; x and y are reversed in RAS.
     at = message.matrix @ [100, 10, 0, 1]
     assert at[:3] == pytest.approx([-(1.0 + 3.0), -(2.0 + 1.155), 3.0], abs=1e-4)

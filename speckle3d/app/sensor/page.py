@@ -17,7 +17,6 @@ from speckle3d.app.look import Page, batch_changes
 from speckle3d.app.plots import time_plot
 from speckle3d.app.sensor.log import Columns, LogReadings
 from speckle3d.app.sensor.watch import SHOWN_S, SensorWatch
-from speckle3d.core.arrays import FloatArray
 from xsens.fusion.field import Trust
 
 _BOX = np.array([(x, y, z) for x in (-1, 1) for y in (0, 1) for z in (-1, 1)], dtype=float)
@@ -158,7 +157,9 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
         self._cursor.location = time_s
         rotation = self._source.orientation_at(time_s)
         if rotation is not None:
-            turn_probe(self._probe.object, rotation * (self._mounting or Rotation.identity()))
+            world_from_image = rotation * (self._mounting or Rotation.identity())
+            for trace, corners in zip(self._probe.object.data, _PARTS.values(), strict=False):
+                trace.update(dict(zip("xyz", world_from_image.apply(corners).T, strict=True)))
             self._probe.param.trigger("object")
         rows = self._source.facts(time_s)
         if self._mounting is None:
@@ -177,7 +178,7 @@ def banner(trust: Trust, sentence: str) -> str:
 
 
 def figure_probe() -> go.Figure:
-    """Draw the world's axes and a probe, which `turn_probe` turns."""
+    """Draw the world's axes and a probe, not yet turned."""
     figure = go.Figure()
     for colour in _PARTS:
         figure.add_mesh3d(color=colour, alphahull=0, hoverinfo="skip", flatshading=True)
@@ -195,10 +196,3 @@ def figure_probe() -> go.Figure:
         uirevision="kept",
         template="none",
     )
-
-
-def turn_probe(figure: go.Figure, world_from_image: Rotation) -> None:
-    """Show the probe as it is held."""
-    for trace, corners in zip(figure.data, _PARTS.values(), strict=False):
-        world: FloatArray = world_from_image.apply(corners)
-        trace.update(dict(zip("xyz", world.T, strict=True)))
