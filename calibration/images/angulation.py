@@ -19,6 +19,7 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.geometry import skew
+from speckle3d.core.images import spread_frames
 
 PARAMETERS = ("tilt", "yaw", "roll", "x", "y", "z")
 """Small turns about the image's x, y and z, and shifts along them."""
@@ -126,7 +127,7 @@ def angulation(
         for line in across
     ]
     cosine = abs(float(flat[0] @ flat[1])) / float(np.prod([np.linalg.norm(line) for line in flat]))
-    few = [beam[np.linspace(0, len(beam) - 1, _FRAMES).round().astype(int)] for beam in beams]
+    few = [beam[spread_frames(len(beam), _FRAMES)] for beam in beams]
     fans = [float(np.rad2deg(np.arccos(np.clip((beam @ beam.T).min(), -1.0, 1.0)))) for beam in few]
     return Angulation(float(np.rad2deg(np.arccos(min(cosine, 1.0)))), (fans[0], fans[1]))
 

@@ -37,7 +37,7 @@ def calibration_from_images(result: ImageCalibration, sweeps: tuple[Recording, R
         method="images",
         sensor="tracker",
         rotation=pose.rotation,
-        translation_mm=np.asarray(pose.translation),
+        translation_mm=pose.translation,
         pixel_mm=result.pixel_mm,
         covariance=result.covariance,
         parameters=_parameters(result),

@@ -56,10 +56,8 @@ def search(
         If the sweeps show nothing in common anywhere.
     """
     # As far as the box's corners, and a fifth more.
-    centre_mm, far_mm = (
-        crossing.centre_mm,
-        1.2 * np.sqrt(3.0) * np.hypot(capture_mm, 20.0 * capture_rad) + 1.0,
-    )
+    far_mm = 1.2 * np.sqrt(3.0) * np.hypot(capture_mm, 20.0 * capture_rad) + 1.0
+    centre_mm = crossing.centre_mm
 
     def best_of(count: int, most: int) -> list[RigidTransform]:
         """The best of many places in the box: those from which an increment leads to the start."""
@@ -194,7 +192,7 @@ def weights(similarity: Similarity) -> FloatArray:
     usual = float(np.median(contrast[valid]))
     unlike = 1.0 - np.where(valid, similarity.alike, 1.0)
     structure = contrast / (contrast + usual)
-    return np.asarray(np.where(valid, structure * (ROBUST / (ROBUST + unlike)) ** 2, 0.0))
+    return np.where(valid, structure * (ROBUST / (ROBUST + unlike)) ** 2, 0.0)
 
 
 def is_better(trial: Similarity, best: Similarity, weight: FloatArray) -> bool:

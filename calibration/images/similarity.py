@@ -59,7 +59,7 @@ class Similarity(PatchScores):
     @property
     def valid(self) -> BoolArray:
         """Mask of patches with enough support."""
-        return np.asarray(np.isfinite(self.alike))
+        return np.isfinite(self.alike)
 
     @property
     def mean(self) -> float:

@@ -24,8 +24,7 @@ from calibration.images.errors import (
     require_one_answer,
 )
 from calibration.images.search import DECISION, refine, search
-from calibration.images.similarity import CrossingSweeps, Level, prepare
-from calibration.points import Recording
+from calibration.images.similarity import CrossingSweeps, Level
 from calibration.settings import ImageFit
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError
@@ -84,13 +83,12 @@ class ImageCalibration:
 
     def covariance_of(self, point_mm: FloatArray) -> FloatArray:
         """Covariance of where a point of the image lies, along the image's axes, shape (3, 3), mm^2."""
-        motion = point_motion(np.asarray(point_mm, dtype=float)[None])[0]
+        motion = point_motion(point_mm[None])[0]
         return np.asarray(motion @ self.covariance @ motion.T)
 
 
 def calibrate_images(
-    first: Recording,
-    second: Recording,
+    crossing: CrossingSweeps,
     start: RigidTransform,
     settings: ImageFit | None = None,
     progress: Progress | None = None,
@@ -99,6 +97,8 @@ def calibrate_images(
 
     Parameters
     ----------
+    crossing : CrossingSweeps
+        Both sweeps, by `prepare`.
     start : RigidTransform
         A guess of sensor from image: a ruler's, or an old calibration.
     progress : callable, optional
@@ -106,22 +106,10 @@ def calibrate_images(
 
     Raises
     ------
-    InvalidInputError, MismatchError
-        If the images, grids and start are not what they must be.
     InsufficientDataError
-        If there are too few frames, the sweeps do not overlap or have nothing in common, their motion or the
-        tissue leaves the answer open, or another answer is as good.
+        If the sweeps do not overlap or have nothing in common, their motion or the tissue leaves the answer
+        open, or another answer is as good.
     """
-    return calibrate_from_sweeps(prepare(first, second, progress), start, settings, progress)
-
-
-def calibrate_from_sweeps(
-    crossing: CrossingSweeps,
-    start: RigidTransform,
-    settings: ImageFit | None = None,
-    progress: Progress | None = None,
-) -> ImageCalibration:
-    """Calibrate as `calibrate_images`, from sweeps that are prepared already: for many starts."""
     s = settings or ImageFit()
     answer, rivals = start, list[RigidTransform]()
     if s.capture_mm > 0.0 or s.capture_deg > 0.0:

@@ -7,7 +7,6 @@ images, and averaged with their neighbours across them.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -19,6 +18,7 @@ from calibration.points import Recording
 from speckle3d.core.arrays import Float32Array, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.extras import extra_module
+from speckle3d.core.progress import Progress
 from speckle3d.core.threads import in_parallel
 
 BASE_PIXEL_MM = 0.35
@@ -56,7 +56,7 @@ class Stack:
     @cached_property
     def sensor_matrices(self) -> FloatArray:
         """World from sensor, shape (n, 4, 4)."""
-        return np.asarray(self.world_from_sensor.as_matrix())
+        return self.world_from_sensor.as_matrix()
 
     def __len__(self) -> int:
         return len(self.images)
@@ -153,7 +153,7 @@ class Stack:
 def read_stack(
     recording: Recording,
     pixel_mm: float = BASE_PIXEL_MM,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> tuple[Stack, IntArray]:
     """Read a sweep's images, reduced to about `pixel_mm`, and their frame numbers.
 

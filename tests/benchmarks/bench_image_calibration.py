@@ -12,7 +12,7 @@ from cache import sweep_file
 from crossing_scenes import displace
 
 from calibration.images.similarity import prepare
-from calibration.images.solver import calibrate_from_sweeps
+from calibration.images.solver import calibrate_images
 from calibration.points import Recording
 from calibration.settings import ImageFit
 from speckle3d.core.errors import InsufficientDataError
@@ -54,7 +54,7 @@ def study(crossing, starts):
     rng, rows = np.random.default_rng(183), []
     for _ in range(starts):
         try:
-            estimate = calibrate_from_sweeps(crossing, displace(TRUTH, rng), ImageFit()).sensor_from_image
+            estimate = calibrate_images(crossing, displace(TRUTH, rng), ImageFit()).sensor_from_image
             error = (TRUTH.inv() * estimate).apply(crossing.centre_mm) - crossing.centre_mm
         except InsufficientDataError:
             error = np.full(3, np.inf)

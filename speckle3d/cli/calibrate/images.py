@@ -75,6 +75,7 @@ def images(
 
     from calibration.images.angulation import angulation
     from calibration.images.report import calibration_from_images, figure_of, notes_of
+    from calibration.images.similarity import prepare
     from calibration.images.solver import calibrate_images
     from speckle3d.calibrating.recordings import open_recording
     from speckle3d.calibrating.written import write_with_report
@@ -105,9 +106,9 @@ def images(
     poses_a, poses_b = (sweep.world_from_sensor(sweep.covered()) for sweep in (a, b))
     angulation(poses_a, poses_b, mounting).require(0.5)
     with s3.progress_bar("comparing sweeps") as bar:
-        result = calibrate_images(a, b, mounting, settings, bar)
+        result = calibrate_images(prepare(a, b, bar), mounting, settings, bar)
     notes, answer = notes_of(result), calibration_from_images(result, (a, b))
-    files = write_with_report(answer, (first, second), out, lambda _: figure_of(result, (a, b)), notes)
+    files = write_with_report(answer, (first, second), out, figure_of(result, (a, b)), notes)
     return report_of(files, notes)
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from crossing_scenes import centre_error_mm, crossing_sweeps, displace
 
 from calibration.images.angulation import angulation
+from calibration.images.similarity import prepare
 from calibration.images.solver import calibrate_images
 from calibration.settings import ImageFit
 from speckle3d.core.errors import InsufficientDataError
@@ -29,7 +30,7 @@ def judge(crossing_deg, seed):
     poses = [s.world_from_sensor(s.covered()) for s in (first, second)]
     try:  # as the command does it: the motion is judged first at the start
         angulation(*poses, start).require(0.5)
-        solution = calibrate_images(first, second, start, ImageFit(capture_mm=0.0, capture_deg=0.0))
+        solution = calibrate_images(prepare(first, second), start, ImageFit(capture_mm=0.0, capture_deg=0.0))
     except InsufficientDataError:
         return None
     turns = (truth.inv() * solution.sensor_from_image).rotation.as_rotvec(degrees=True)

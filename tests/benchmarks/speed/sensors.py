@@ -10,7 +10,7 @@ from crossing_scenes import displace
 from imu_logs import calibration, mt9_bin, mtdata2_messages, samples
 from vqf import VQF, offlineVQF
 
-from calibration.images.solver import calibrate_from_sweeps
+from calibration.images.solver import calibrate_images
 from calibration.plane import calibrate_plane
 from calibration.settings import ImageFit
 from speed.rows import Row, time_runs
@@ -40,7 +40,7 @@ def plane(runs):
 def images(runs):
     """A calibration from two crossing sweeps, 20 mm and 20 degrees off at most."""
     crossing, start = prepare_pair(601), displace(TRUTH, np.random.default_rng(183))
-    timing = time_runs(lambda: calibrate_from_sweeps(crossing, start, ImageFit()), runs)
+    timing = time_runs(lambda: calibrate_images(crossing, start, ImageFit()), runs)
     label = "calibration from two sweeps, 160 frames each"
     return [Row(label, timing.seconds, "s", target=IMAGES_S, falling=True, cores=timing.cores)]
 

@@ -11,7 +11,7 @@ from calibration.images.errors import (
     DEEP_MM,
 )
 from calibration.images.similarity import prepare
-from calibration.images.solver import calibrate_from_sweeps
+from calibration.images.solver import calibrate_images
 from calibration.settings import ImageFit
 from speckle3d.core.streams import TimedPoses
 
@@ -35,8 +35,8 @@ def test_a_tracker_that_displaces_a_sweep_is_within_the_claims(scene, crossing):
     poses = about * nudge * about.inv() * second.readings.world_from_sensor
     shifted_sweep = dataclasses.replace(second, readings=TimedPoses(second.readings.time_s, poses))
     settings = ImageFit(capture_mm=0.0, capture_deg=0.0, tracker_mm=0.3, tracker_deg=0.15)
-    plain = calibrate_from_sweeps(crossing, truth, settings)
-    nudged = calibrate_from_sweeps(prepare(first, shifted_sweep), truth, settings)
+    plain = calibrate_images(crossing, truth, settings)
+    nudged = calibrate_images(prepare(first, shifted_sweep), truth, settings)
     off = plain.sensor_from_image.inv() * nudged.sensor_from_image
     turns, errors = off.rotation.as_rotvec(), np.sqrt(np.diag(nudged.covariance)[:3])
     shifts = off.apply(first.grid.centre_mm) - first.grid.centre_mm
@@ -48,7 +48,7 @@ def test_a_tracker_that_displaces_a_sweep_is_within_the_claims(scene, crossing):
     # And claims without a word of it would be too small.
     no_tracker = settings.model_copy(update={"tracker_mm": 0.0, "tracker_deg": 0.0})
     silent = np.sqrt(
-        np.diag(calibrate_from_sweeps(crossing, truth, no_tracker).covariance_of(first.grid.centre_mm))
+        np.diag(calibrate_images(crossing, truth, no_tracker).covariance_of(first.grid.centre_mm))
     )
     assert (silent[[0, 2]] < 0.5 * spread[[0, 2]]).all()
     assert silent[1] > DEEP_MM * crossing.unit

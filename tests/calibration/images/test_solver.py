@@ -3,7 +3,7 @@ import pytest
 from crossing_scenes import centre_error_mm, crossing_sweeps, displace
 
 from calibration.images.similarity import prepare
-from calibration.images.solver import calibrate_from_sweeps, calibrate_images
+from calibration.images.solver import calibrate_images
 from speckle3d.core.errors import InsufficientDataError
 
 
@@ -20,13 +20,13 @@ def crossing(scene):
 @pytest.fixture(scope="module")
 def calibration(scene, crossing):
     start = displace(scene[2], np.random.default_rng(0))
-    return calibrate_from_sweeps(crossing, start)
+    return calibrate_images(crossing, start)
 
 
 @pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_far_starts_reach_the_truth(scene, crossing, calibration, seed):
     start = displace(scene[2], np.random.default_rng(seed))
-    result = calibration if seed == 0 else calibrate_from_sweeps(crossing, start)
+    result = calibration if seed == 0 else calibrate_images(crossing, start)
     error = centre_error_mm(result.sensor_from_image, scene[2], scene[0].grid)
     # Of it, 0.1 mm along the beams comes from the tracker: 0.1 mm and 0.05 degrees of jitter.
     assert np.linalg.norm(error) < 0.5
@@ -50,4 +50,4 @@ def test_errors_are_within_what_the_covariance_says(scene, calibration):
 @pytest.mark.slow
 def test_sweeps_of_different_things(scene):
     with pytest.raises(InsufficientDataError):
-        calibrate_images(scene[0], crossing_sweeps(1, frames=20)[1], scene[2])
+        calibrate_images(prepare(scene[0], crossing_sweeps(1, frames=20)[1]), scene[2])
