@@ -38,7 +38,6 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial.distance import directed_hausdorff
 from scipy.spatial.transform import RigidTransform
 
@@ -66,14 +65,14 @@ CHALLENGE_ERRORS = ("GPE_mm", "GLE_mm", "LPE_mm", "LLE_mm")
 
 
 def point_errors(
-    poses: RigidTransform, true: RigidTransform, grid: ImageGrid | None, landmarks: Landmarks | None = None
+    poses: RigidTransform, true: RigidTransform, grid: ImageGrid | None, landmarks: Landmarks | None
 ) -> dict[str, Any]:
     """Displacement errors over every pixel of the images and at landmarks, `CHALLENGE_ERRORS`.
 
     Parameters
     ----------
     poses, true : RigidTransform, length n
-        Estimate and reference; `drift_rates` checks that they are of the same frames.
+        Estimate and reference of the same frames.
     grid, landmarks : optional
         Without, their errors are None. Landmarks lie in frame 1 and later: the first frame has no error.
 
@@ -93,55 +92,6 @@ def point_errors(
     return errors
 
 
-def drift_rates(
-    world_from_image: RigidTransform, reference: RigidTransform, centre_mm: npt.ArrayLike
-) -> dict[str, float]:
-    """Relate the drift of the image centre to the path it travelled.
-
-    Parameters
-    ----------
-    world_from_image, reference : RigidTransform, length n
-    centre_mm : array_like, shape (3,)
-        Image centre in the image frame.
-
-    Returns
-    -------
-    dict
-        ``FDR_percent`` and ``ADR_percent``, ``MD_mm``, ``SD_mm``, ``HD_mm`` and ``EA_deg``, as the module's
-        table defines them.
-
-    Raises
-    ------
-    InsufficientDataError
-        If the reference does not move.
-    MismatchError
-        If they are not of the same frames, two or more.
-    """
-    centre = np.asarray(centre_mm, dtype=float)
-    if len(world_from_image) != len(reference) or len(reference) < 2:
-        raise MismatchError(
-            f"expected 2 poses or more of both, got {len(world_from_image)} and {len(reference)}"
-        )
-    estimate, true = (p[0].inv() * p for p in (world_from_image, reference))
-    centres, true_centres = estimate.apply(centre), true.apply(centre)
-    path_mm = np.cumsum(np.linalg.norm(np.diff(true_centres, axis=0), axis=1))
-    if not path_mm[-1] > 0:
-        raise InsufficientDataError("drift rates: expected a reference that moves, got one that rests")
-    drift = np.linalg.norm(centres - true_centres, axis=1)[1:]
-    moves = path_mm > 0
-    angle = np.rad2deg((true[1:].rotation.inv() * estimate[1:].rotation).magnitude())
-    return {
-        "FDR_percent": float(100.0 * drift[-1] / path_mm[-1]),
-        "ADR_percent": float(100.0 * np.mean(drift[moves] / path_mm[moves])),
-        "MD_mm": float(drift.max()),
-        "SD_mm": float(drift.sum()),
-        "HD_mm": max(
-            directed_hausdorff(a, b)[0] for a, b in ((centres, true_centres), (true_centres, centres))
-        ),
-        "EA_deg": float(np.mean(angle)),
-    }
-
-
 def score_row(
     poses: RigidTransform, true: RigidTransform, grid: ImageGrid | None, landmarks: Landmarks | None = None
 ) -> dict[str, Any]:
@@ -156,9 +106,36 @@ def score_row(
         at pixels are None.
     landmarks : Landmarks, optional
         Without, the errors at landmarks are None.
+
+    Raises
+    ------
+    InsufficientDataError
+        If the reference does not move.
+    MismatchError
+        If they are not of the same frames, two or more.
     """
-    rates = drift_rates(poses, true, np.zeros(3) if grid is None else grid.centre_mm)
-    return {**rates, **point_errors(poses, true, grid, landmarks)}
+    if len(poses) != len(true) or len(true) < 2:
+        raise MismatchError(f"expected 2 poses or more of both, got {len(poses)} and {len(true)}")
+    centre = np.zeros(3) if grid is None else grid.centre_mm
+    estimate, exact = (path[0].inv() * path for path in (poses, true))
+    centres, true_centres = estimate.apply(centre), exact.apply(centre)
+    path_mm = np.cumsum(np.linalg.norm(np.diff(true_centres, axis=0), axis=1))
+    if not path_mm[-1] > 0:
+        raise InsufficientDataError("drift rates: expected a reference that moves, got one that rests")
+    drift = np.linalg.norm(centres - true_centres, axis=1)[1:]
+    moves = path_mm > 0
+    angle = np.rad2deg((exact[1:].rotation.inv() * estimate[1:].rotation).magnitude())
+    return {
+        "FDR_percent": float(100.0 * drift[-1] / path_mm[-1]),
+        "ADR_percent": float(100.0 * np.mean(drift[moves] / path_mm[moves])),
+        "MD_mm": float(drift.max()),
+        "SD_mm": float(drift.sum()),
+        "HD_mm": max(
+            directed_hausdorff(a, b)[0] for a, b in ((centres, true_centres), (true_centres, centres))
+        ),
+        "EA_deg": float(np.mean(angle)),
+        **point_errors(poses, true, grid, landmarks),
+    }
 
 
 def challenge_score(

@@ -9,7 +9,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import BoolArray, FloatArray
@@ -125,7 +124,7 @@ def _of_tracker(sweep: Sweep) -> Reference | None:
 
 def sweep_curves(
     poses: Mapping[str, RigidTransform],
-    centre_mm: npt.ArrayLike,
+    centre_mm: FloatArray,
     reference: Reference | None = None,
     covariance: FloatArray | None = None,
 ) -> SweepCurves:
@@ -135,7 +134,7 @@ def sweep_curves(
     ----------
     poses : mapping of str to RigidTransform, length n
         ``world_from_image`` by mode; that of the reference's name is left out.
-    centre_mm : array_like, shape (3,)
+    centre_mm : ndarray, shape (3,)
         Image centre in the image frame.
     reference : Reference, optional
         A tracker's curves begin where the line through its first readings does (`lengths.read_end`), not at
@@ -158,7 +157,7 @@ def sweep_curves(
 
 
 def error_rows(
-    poses: Mapping[str, RigidTransform], reference: Reference | None, centre_mm: npt.ArrayLike
+    poses: Mapping[str, RigidTransform], reference: Reference | None, centre_mm: FloatArray
 ) -> list[ModeError]:
     """Errors of every mode by part; lengths alone of the tracker as the reference, and without a reference.
 
@@ -192,8 +191,8 @@ def _estimates(
     return {mode: path for mode, path in poses.items() if reference is None or mode != reference.name}
 
 
-def _curves(poses: RigidTransform, centre_mm: npt.ArrayLike, end_frames: int) -> FloatArray:
+def _curves(poses: RigidTransform, centre_mm: FloatArray, end_frames: int) -> FloatArray:
     """Length (mm), tilt, yaw and roll (degrees), shape (4, n), zero where the first end is read."""
     curves = _UNITS * np.stack(sum_motion(poses, centre_mm))
     curves -= [[read_end(curve[::-1], end_frames)] for curve in curves]
-    return np.asarray(curves)
+    return curves

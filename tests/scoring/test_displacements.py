@@ -3,18 +3,13 @@
 import challenge_examples as examples
 import numpy as np
 import pytest
-from drifting import CENTRE_MM, drifting_poses
+from drifting import drifting_poses
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
 from speckle3d.io.formats.challenge import Landmarks
 from speckle3d.io.load import load_landmarks, load_sweep
-from speckle3d.scoring.displacements import (
-    challenge_score,
-    drift_rates,
-    point_errors,
-    score_row,
-)
+from speckle3d.scoring.displacements import challenge_score, point_errors, score_row
 from speckle3d.scoring.references import find_reference
 
 
@@ -28,19 +23,19 @@ def at(*z):
 
 def test_drift_by_hand():
     # There and back: the path is 1, then 2 mm long; drifts are 0.1 and 0.3 mm.
-    rates = drift_rates(at(0.0, 1.1, 0.3), at(0.0, 1.0, 0.0), CENTRE_MM)
+    rates = score_row(at(0.0, 1.1, 0.3), at(0.0, 1.0, 0.0), None)
     assert rates["FDR_percent"] == pytest.approx(100 * 0.3 / 2)
     assert rates["ADR_percent"] == pytest.approx(100 * (0.1 / 1 + 0.3 / 2) / 2)
     assert (rates["MD_mm"], rates["SD_mm"]) == pytest.approx((0.3, 0.4))
     # 7 is 3 from the nearest of 0, 1, 4; of these, 4 is 2 from 2, the nearest other.
-    assert drift_rates(at(0.0, 1.0, 4.0), at(0.0, 2.0, 7.0), np.zeros(3))["HD_mm"] == pytest.approx(3.0)
+    assert score_row(at(0.0, 1.0, 4.0), at(0.0, 2.0, 7.0), None)["HD_mm"] == pytest.approx(3.0)
     # Turns about two axes: the angle is of the whole turn, neither a sum nor a mean of components.
     turn = Rotation.from_rotvec(np.deg2rad([[0.0, 0, 0], [3.0, 4.0, 0.0], [0.0, 0.0, -1.0]]))
-    rates = drift_rates(sliding(2.0, 3) * RigidTransform.from_rotation(turn), sliding(2.0, 3), np.zeros(3))
+    rates = score_row(sliding(2.0, 3) * RigidTransform.from_rotation(turn), sliding(2.0, 3), None)
     assert rates["EA_deg"] == pytest.approx((5.0 + 1.0) / 2)
     # A rest at the start is left out of the average rate.
     paths = [RigidTransform.concatenate([sliding(x)[:1], sliding(x)]) for x in (105.0, 100.0)]
-    assert drift_rates(*paths, CENTRE_MM)["ADR_percent"] == pytest.approx(5.0)
+    assert score_row(*paths, None)["ADR_percent"] == pytest.approx(5.0)
 
 
 def test_errors_and_score_are_those_the_challenge_publishes(tmp_path):
@@ -63,6 +58,6 @@ def test_errors_need_a_path_and_frames_of_landmarks():
     with pytest.raises(InvalidInputError):
         point_errors(sliding(1.0), sliding(1.0), None, Landmarks(np.array([51]), np.zeros((1, 3))))
     with pytest.raises(InsufficientDataError):
-        drift_rates(sliding(1.0), RigidTransform.identity(51), CENTRE_MM)
+        score_row(sliding(1.0), RigidTransform.identity(51), None)
     with pytest.raises(MismatchError):
-        drift_rates(sliding(1.0), sliding(1.0)[1:], CENTRE_MM)
+        score_row(sliding(1.0), sliding(1.0)[1:], None)
