@@ -119,7 +119,7 @@ def detect_phantom(
     FileError, InvalidInputError
         If the region, the points or the frames left out do not fit the recording.
     """
-    require_frames(settings.frames_left_out, recording.images.shape[0])
+    require_frames(settings, recording)
     if isinstance(settings, WireSettings):
         detections = _detect_wires(recording, settings, progress)
     else:
@@ -129,8 +129,9 @@ def detect_phantom(
     return detections.without(settings.frames_left_out, BY_HAND)
 
 
-def require_frames(frames: Sequence[int], count: int) -> None:
+def require_frames(settings: ScanSettings, recording: Recording) -> None:
     """Raise `MismatchError` unless the frames left out are among the recording's."""
+    frames, count = settings.frames_left_out, recording.images.shape[0]
     if frames and max(frames) >= count:
         raise MismatchError(f"--leave-out: expected frames from 0 to {count - 1}, got {max(frames)}")
 
@@ -228,7 +229,7 @@ def write_outcome(
         outcome.calibration,
         [images],
         out,
-        lambda calibration: figure_report(outcome.solution, calibration, outcome.recording, dots),
+        figure_report(outcome.solution, outcome.calibration, outcome.recording, dots),
         [*notes, f"made by: {command_line(settings, images, out)}"],
         outcome.beam,
         None if dots.are_lines else lambda path: write_points(path, points, names),

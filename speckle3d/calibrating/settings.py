@@ -27,14 +27,13 @@ def region_of(text: str) -> Corners | None:
         If it is none.
     """
     try:
-        corners = [tuple(map(float, corner.split(","))) for corner in text.split()]
+        pairs = [corner.split(",") for corner in text.split()]
+        corners = tuple((float(column), float(row)) for column, row in pairs)
     except ValueError:
-        corners = [()]
-    if not corners:
-        return None
-    if len(corners) < 3 or any(len(corner) != 2 for corner in corners):
+        corners = ((0.0, 0.0),)
+    if 0 < len(corners) < 3:
         raise InvalidInputError('expected at least three "column,row"')
-    return tuple((column, row) for column, row in corners)
+    return corners or None
 
 
 def frames_of(text: str) -> tuple[int, ...]:

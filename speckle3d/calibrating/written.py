@@ -48,7 +48,7 @@ def write_with_report(
     calibration: Calibration,
     inputs: Sequence[Path],
     out: Path,
-    figure: Callable[[Calibration], Figure],
+    figure: Figure,
     notes: Sequence[str],
     beam: Sequence[BeamBias] = (),
     dots: Callable[[Path], None] | None = None,
@@ -60,8 +60,8 @@ def write_with_report(
     ----------
     inputs : sequence of Path
         Recordings it was made from, named in the file with their hashes.
-    figure : callable
-        Draws the pictures of the calibration as it was written.
+    figure : Figure
+        Its pictures.
     notes : sequence of str
         What else the table says.
     dots : callable, optional
@@ -78,7 +78,7 @@ def write_with_report(
         write_calibration(part / out.name, calibration)
         with atomic_path(part / text.name) as path:
             path.write_text(table, encoding="utf-8")
-        save_figure(figure(calibration), part / pictures.name)
+        save_figure(figure, part / pictures.name)
         if dots:
             dots(part / points.name)
     return Written(calibration, table, (out, text, pictures))

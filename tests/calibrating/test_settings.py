@@ -48,7 +48,7 @@ def test_the_command_that_is_told_takes_the_same_settings(monkeypatch, settings,
     monkeypatch.setattr(
         calibrate_phantoms,
         "_calibrate",
-        lambda images, options, out, *arguments, **keywords: calls.append((images, options, out)),
+        lambda images, options, out: calls.append((images, options, out)),
     )
     line = command_line(settings, Path("the images.mha"), Path("out.h5"))
     monkeypatch.setattr(sys, "argv", shlex.split(line))

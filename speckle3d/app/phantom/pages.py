@@ -26,7 +26,7 @@ def phantom_page(images: Path, settings: ScanSettings) -> Page:
         If the recording cannot be opened, or phantom, points or frames of the settings do not fit it.
     """
     recording = open_phantom(images, settings)
-    require_frames(settings.frames_left_out, recording.images.shape[0])
+    require_frames(settings, recording)
     is_wires = isinstance(settings, WireSettings)
     make = partial(PointsViewer if is_wires else LinesViewer, recording, images, settings)
     make()  # which refuses what cannot be shown

@@ -137,7 +137,7 @@ class PhantomViewer:
             if not values.get(name):
                 values.pop(name, None)
         settings = with_values(self._start, values)
-        require_frames(settings.frames_left_out, self.recording.images.shape[0])
+        require_frames(settings, self.recording)
         return settings
 
     def changed(self, *_: Any) -> None:
