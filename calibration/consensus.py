@@ -48,8 +48,6 @@ _LOOSE_MM = 6.0
 _TIGHTER_MM = (6.0, 5.0, 4.0, 3.0, 3.0)
 _PLAUSIBLE_PIXEL = 2.0
 """Greatest ratio of a pixel size to the one given, either way; those of samples are uncertain."""
-_PIXEL_MM = np.array([0.02, 1.5])
-"""Plausible pixels if none are given."""
 _SQUARE = 0.6
 """Greatest cosine between the axes of a sample; 90 degrees minus 37."""
 _FAR_MM = 300.0
@@ -79,7 +77,7 @@ class Consensus:
     @property
     def inliers(self) -> BoolArray:
         """Frames whose candidate is within `gate_mm`, shape (f,)."""
-        return np.asarray(self.away_mm <= self.gate_mm)
+        return self.away_mm <= self.gate_mm
 
     @property
     def is_significant(self) -> bool:
@@ -98,14 +96,14 @@ class Consensus:
         return self
 
 
-def find_consensus(points: ImagePoints, pixel_mm: FloatArray | None = None) -> Consensus:
+def find_consensus(points: ImagePoints, pixel_mm: FloatArray) -> Consensus:
     """Find the calibration with which most frames have a candidate where the point should be.
 
     Parameters
     ----------
     points : ImagePoints
         Candidates; those of a frame have its number and one pose, the likeliest first.
-    pixel_mm : ndarray, shape (2,), optional
+    pixel_mm : ndarray, shape (2,)
         Column pitch and row spacing, to a factor of two.
 
     Returns
@@ -136,7 +134,7 @@ def choose_by_frame(frame: IntArray, away_mm: FloatArray, near_mm: float = GATES
     other frames say, with the errors of that: pixels came out 1 % too narrow, and claims too small.
     """
     order = np.lexsort((np.maximum(away_mm, near_mm), frame))
-    return np.asarray(order[np.unique(frame[order], return_index=True)[1]])
+    return order[np.unique(frame[order], return_index=True)[1]]
 
 
 class _Candidates:
@@ -145,7 +143,7 @@ class _Candidates:
     Pixels and positions are centred, and pixels scaled, so that all unknowns are millimetres.
     """
 
-    def __init__(self, points: ImagePoints, pixel_mm: FloatArray | None) -> None:
+    def __init__(self, points: ImagePoints, pixel_mm: FloatArray) -> None:
         self.points = points
         self.frames, self.of_frame, self.count = np.unique(
             points.frame, return_inverse=True, return_counts=True
@@ -157,9 +155,7 @@ class _Candidates:
         minus = np.broadcast_to(-np.eye(3), (len(points), 3, 3))
         self.rows = np.concatenate([affine_equations(self.places, points.turns), minus], axis=2)
         self.target = self.middle - points.shifts_mm
-        sizes = _PIXEL_MM[:, None] * np.ones(2)
-        if pixel_mm is not None:
-            sizes = np.outer([1.0 / _PLAUSIBLE_PIXEL, _PLAUSIBLE_PIXEL], pixel_mm)
+        sizes = np.outer([1.0 / _PLAUSIBLE_PIXEL, _PLAUSIBLE_PIXEL], pixel_mm)
         self.shortest, self.longest = sizes * self.spread
         widths = [np.full(3, _FAR_MM), np.repeat(self.longest, 3), np.full(3, _FAR_MM)]
         self.prior = np.diag(np.concatenate(widths) ** -2.0)
@@ -185,14 +181,14 @@ class _Candidates:
         plausible = np.all((length > self.shortest) & (length < self.longest), axis=1)
         models = models[plausible & (cosine < _SQUARE)]
         cost = np.minimum(self._nearest(models), _LOOSE_MM**2).sum(axis=1)
-        return np.asarray(models[np.argsort(cost, kind="stable")[:_BEST_SAMPLES]])
+        return models[np.argsort(cost, kind="stable")[:_BEST_SAMPLES]]
 
     def _nearest(self, models: FloatArray) -> FloatArray:
         """Squared distance of each frame's nearest candidate from the point, shape (models, frames)."""
         rows = self.rows.reshape(-1, 12).astype(np.float32)
         residuals = models.astype(np.float32) @ rows.T - self.target.ravel().astype(np.float32)
         squares = np.sum(residuals.reshape(len(models), len(self.of_frame), 3) ** 2, axis=2)
-        return np.asarray(np.minimum.reduceat(squares, self.start, axis=1))
+        return np.minimum.reduceat(squares, self.start, axis=1)
 
     def refine(self, model: FloatArray) -> FloatArray:
         """The model of the candidates that agree with it, within less and less."""

@@ -142,9 +142,8 @@ def fit_wandering(
         The part of the grid that has a say.
     """
     information = np.broadcast_to(certainty, jacobian.shape[1])
-    columns = np.ascontiguousarray(np.column_stack([jacobian, residuals]))
+    columns = np.column_stack([jacobian, residuals])
     pauses_s = np.maximum(np.diff(frame_time_s, prepend=frame_time_s[0]), 0.0)
-    effects = np.ascontiguousarray(effects)
 
     def whiten(g: int) -> tuple[FloatArray, float]:
         wandering, jitter, constant_s, _, *unit = grid[g]

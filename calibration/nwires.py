@@ -13,7 +13,6 @@ References
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform
 
 from calibration.detection.labelling import label_by_calibration, label_dots
@@ -107,7 +106,7 @@ def nwire_errors_mm(
 
 
 def label_by_wires(
-    dots: Detections, phantom: WirePhantom, world_from_sensor: RigidTransform, pixel_mm: npt.ArrayLike
+    dots: Detections, phantom: WirePhantom, world_from_sensor: RigidTransform, pixel_mm: FloatArray
 ) -> Detections:
     """Assign dots to wires, first by themselves, then by the calibration that follows from most frames.
 
@@ -115,7 +114,7 @@ def label_by_wires(
     ----------
     world_from_sensor : RigidTransform
         One for each frame of the sequence.
-    pixel_mm : array_like, shape (2,)
+    pixel_mm : ndarray, shape (2,)
         Rough distance between columns and between rows, mm.
 
     Raises

@@ -28,7 +28,7 @@ from calibration.robust import absolute_weights, robust_linear
 from calibration.settings import PlaneFit
 from calibration.solution import UNKNOWN, Prior, Problem, Solution, are_distinct
 from speckle3d.core.arrays import BoolArray, FloatArray
-from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.geometry import nearest_rotation
 
 _NORMALS = 30
@@ -209,8 +209,8 @@ class Equations:
 
         Raises
         ------
-        InsufficientDataError, InvalidInputError
-            If there are fewer residuals than parameters, or some are not finite.
+        InsufficientDataError
+            If there are fewer residuals than parameters.
         """
         columns = columns_of(free)
         weight = sigma / prior.sigma[columns]
@@ -227,8 +227,6 @@ class Equations:
             raise InsufficientDataError(
                 f"expected at least {len(columns)} residuals, got {count}: the phantom in more frames"
             )
-        if not np.isfinite(cost):
-            raise InvalidInputError("expected finite residuals at the starting point, got some that are not")
         damping, step = 1e-6, np.zeros(len(CHAIN))
         for _ in range(_MOST_STEPS):
             descent = np.linalg.solve(normal + damping * np.diag(np.maximum(np.diag(normal), _TINY)), pull)
@@ -259,7 +257,7 @@ class Equations:
 def _cross_zyx(a: FloatArray, b: FloatArray) -> FloatArray:
     """Cross product, its z component first; NumPy's own takes five times as long."""
     first, second = [0, 2, 1], [1, 0, 2]
-    return np.asarray(a[..., first] * b[..., second] - a[..., second] * b[..., first])
+    return a[..., first] * b[..., second] - a[..., second] * b[..., first]
 
 
 # 3. The plane in three stages (TR 303, appendix A)

@@ -11,8 +11,8 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
-from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
-from speckle3d.core.geometry import require_finite, rigid
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from speckle3d.core.geometry import rigid
 from speckle3d.core.grid import ImageGrid
 from speckle3d.core.streams import TimedPoses, TimedRotations
 from speckle3d.core.sweep import Frames
@@ -122,17 +122,6 @@ class ImagePoints:
     wire: IntArray | None = None
     time_s: FloatArray | None = None
 
-    def __post_init__(self) -> None:
-        if self.pixels.ndim != 2 or self.pixels.shape[1] != 2:
-            raise InvalidInputError(f"pixels: expected shape (n, 2), got {self.pixels.shape}")
-        require_finite(self.pixels, "pixels")
-        counts = {len(self.pixels), len(self.frame), len(self.world_from_sensor)}
-        counts |= {len(values) for values in (self.wire, self.time_s) if values is not None}
-        if len(counts) > 1:
-            raise MismatchError(
-                f"expected as many points as frames, poses, wires and times, got {sorted(counts)}"
-            )
-
     def __len__(self) -> int:
         return len(self.pixels)
 
@@ -149,7 +138,7 @@ class ImagePoints:
     @cached_property
     def shifts_mm(self) -> FloatArray:
         """Translations of the poses, shape (n, 3)."""
-        return np.asarray(self.world_from_sensor.translation)
+        return self.world_from_sensor.translation
 
     @property
     def wires(self) -> IntArray:
@@ -191,9 +180,9 @@ class ImagePoints:
     ) -> ImagePoints:
         """Two points of a line in each frame: m frames, poses and times, `points_px` of shape (m, 2, 2)."""
         twice = np.repeat(np.arange(len(frame)), 2)
-        times = None if time_s is None else np.asarray(time_s)[twice]
+        times = None if time_s is None else time_s[twice]
         poses = world_from_sensor[twice]
-        return cls(points_px.reshape(-1, 2), np.asarray(frame)[twice], poses, time_s=times)
+        return cls(points_px.reshape(-1, 2), frame[twice], poses, time_s=times)
 
 
 @dataclass(frozen=True)
@@ -230,8 +219,6 @@ class Detections:
 
     def without(self, frames: Collection[int], reason: str) -> Detections:
         """Leave out frames, for the same reason each, whether anything was found in them or not."""
-        if not frames:
-            return self
         selection = self[~np.isin(self.frame, list(frames))]
         return replace(selection, dropped={**self.dropped, **dict.fromkeys(frames, reason)})
 

@@ -46,7 +46,7 @@ def as_calibration(
         method=method,
         sensor="orientation" if angular else "tracker",
         rotation=chain.sensor_from_image.rotation,
-        translation_mm=None if angular else np.asarray(chain.sensor_from_image.translation),
+        translation_mm=None if angular else chain.sensor_from_image.translation,
         pixel_mm=None if angular else chain.pixel_mm,
         covariance=solution.image_covariance(pose),
         parameters=_parameters(solution),
@@ -71,7 +71,7 @@ def _parameters(solution: Solution) -> tuple[Parameter, ...]:
     turn = np.eye(len(CHAIN))
     turn[2:5, 2:5] = solution.chain.sensor_from_image.rotation.as_matrix()
     # Angles are in the order z, y, x; the world's origin moves as the phantom turns.
-    turn[8:11, 13:10:-1] = -skew(np.asarray(solution.chain.target_from_world.translation)[None])[0]
+    turn[8:11, 13:10:-1] = -skew(solution.chain.target_from_world.translation[None])[0]
     covariance = turn @ solution.full_covariance @ turn.T
     errors = dict(zip(CHAIN, np.sqrt(np.diag(covariance)), strict=True))
     units = {name: "mm/pixel" if name in SCALES else "mm" if name[0] in "xyz" else "rad" for name in CHAIN}

@@ -45,4 +45,4 @@ def robust_linear(matrix: FloatArray, target: FloatArray) -> tuple[FloatArray, F
 
 def absolute_weights(sizes: FloatArray, axis: int | None = None) -> FloatArray:
     """Weights by which most residuals count by their absolute value: Huber's, with a tenth of the median."""
-    return np.asarray(1.0 / np.maximum(sizes, _NEARLY * np.median(sizes, axis, keepdims=True) + _TINY))
+    return 1.0 / np.maximum(sizes, _NEARLY * np.median(sizes, axis, keepdims=True) + _TINY)

@@ -66,8 +66,7 @@ class Prior:
         """Prior of a pixel size, if known, with its relative error."""
         size, sigma = np.ones(2), np.full(len(CHAIN), np.inf)
         if pixel_mm is not None:
-            size = np.asarray(pixel_mm, dtype=float)
-            sigma[:2] = pixel_error * size
+            size, sigma[:2] = pixel_mm, pixel_error * pixel_mm
         return cls(size, np.eye(4), sigma)
 
     def with_place(self, world_from_target: FloatArray) -> Prior:
@@ -224,13 +223,12 @@ class Problem:
         InvalidInputError
             If the pixel size is neither fitted nor given.
         """
-        if not settings.fixed_pixels:
-            return cls(phantom, PROBE, settings.outlier_sigma, Prior.of(pixel_mm, pixel_error))
-        if pixel_mm is None:
+        if settings.fixed_pixels and pixel_mm is None:
             raise InvalidInputError(
                 "pixel_mm: expected the scanner's pixel size unless it is fitted, got none"
             )
-        return cls(phantom, POSE, settings.outlier_sigma, Prior.of(pixel_mm, 1.0))
+        probe, pixel_error = (POSE, 1.0) if settings.fixed_pixels else (PROBE, pixel_error)
+        return cls(phantom, probe, settings.outlier_sigma, Prior.of(pixel_mm, pixel_error))
 
     @property
     def free(self) -> tuple[str, ...]:

@@ -62,7 +62,7 @@ class Wires(Phantom):
 
 
 def calibrate_cross_wire(
-    points: ImagePoints, pixel_mm: FloatArray | None = None, settings: WireFit | None = None
+    points: ImagePoints, pixel_mm: FloatArray, settings: WireFit | None = None
 ) -> Solution:
     """Calibrate a 6-DOF sensor from images of two crossing wires, or of a bead.
 
@@ -71,8 +71,8 @@ def calibrate_cross_wire(
     points : ImagePoints
         The crossing in each frame, or several candidates for it, frames ascending and the likeliest first.
         Frames none of whose candidates agrees with the others are not used; they may be most.
-    pixel_mm : ndarray, shape (2,), optional
-        Column pitch and row spacing; needed if they are fixed.
+    pixel_mm : ndarray, shape (2,)
+        Column pitch and row spacing, to a factor of two unless they are fixed.
 
     Raises
     ------

@@ -36,8 +36,8 @@ def estimate_offset(
     calibrate: Calibrate,
     points: ImagePoints,
     readings: TimedPoses | TimedRotations,
-    around_s: float = 0.0,
-    search_s: float = 0.4,
+    around_s: float,
+    search_s: float,
 ) -> ClockOffset:
     """Find the clock offset with which a calibration explains its points best.
 

@@ -14,7 +14,6 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -27,6 +26,8 @@ from calibration.images.stacks import read_stack
 from calibration.points import Recording
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError
+from speckle3d.core.images import spread_frames
+from speckle3d.core.progress import Progress
 
 STEP_S = 0.01
 
@@ -59,7 +60,7 @@ def delay_from_images(
     recording: Recording,
     sensor_from_image: RigidTransform,
     search_s: float = SEARCH_S,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> ClockOffset:
     """Find the delay at which images of either way correlate best with cuts of the other.
 
@@ -166,8 +167,7 @@ def _direction(path_mm: FloatArray) -> FloatArray:
 def _middle(share: FloatArray, number: int) -> IntArray:
     """Frames spread over the middle of a way; at its ends the probe is too slow to show a delay."""
     inner = np.flatnonzero((share > 0.1) & (share < 0.9))
-    index = np.linspace(0, inner.size - 1, min(number, inner.size)).round().astype(np.int64)
-    return np.asarray(inner[np.unique(index)])
+    return inner[spread_frames(inner.size, number)]
 
 
 def _from_jitter(

@@ -15,20 +15,18 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
-
 import numpy as np
 import numpy.typing as npt
 from scipy import fft, ndimage
 
 from calibration.detection.dots import bright_centre
 from calibration.detection.lines import peak_between
-from calibration.detection.region import checked_pixel, detect_in_frames, finite_grey, region_mask
+from calibration.detection.region import detect_in_frames, finite_grey, region_mask
 from calibration.points import Detections
-from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray
+from speckle3d.core.arrays import AnyArray, BoolArray, Float32Array, FloatArray
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.extras import extra_module
+from speckle3d.core.progress import Progress
 from speckle3d.core.sweep import Frames
 
 _ORIENTATIONS = 16
@@ -62,16 +60,16 @@ _MOST_CANDIDATES = 6
 
 def crossings_in_frames(
     frames: Frames,
-    pixel_mm: npt.ArrayLike,
+    pixel_mm: FloatArray,
     region_px: npt.ArrayLike | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> Detections:
     """Find candidates for a crossing in every frame, read one at a time, the likeliest of each first.
 
     Parameters
     ----------
     frames : Frames, shape (n, column, row)
-    pixel_mm : array_like, shape (2,)
+    pixel_mm : ndarray, shape (2,)
         Distance between columns and between rows, mm; a third more or less does not matter.
     region_px : array_like, shape (k, 2), optional
         Corners (column, row) of a polygon outside which nothing counts.
@@ -83,9 +81,8 @@ def crossings_in_frames(
     InvalidInputError
         If an argument is not what it must be.
     """
-    size, standing = checked_pixel(pixel_mm), standing_still(frames)
-    inside = region_mask(frames.shape[1:], region_px)
-    return detect_in_frames(frames, lambda image: _crossings(image, size, inside, standing), progress)
+    inside, standing = region_mask(frames.shape[1:], region_px), standing_still(frames)
+    return detect_in_frames(frames, lambda image: _crossings(image, pixel_mm, inside, standing), progress)
 
 
 def standing_still(frames: Frames) -> Float32Array | None:
@@ -94,14 +91,14 @@ def standing_still(frames: Frames) -> Float32Array | None:
     if count < _FEWEST_GLANCES:
         return None
     glances = np.unique(np.linspace(0, count - 1, _GLANCES).astype(int))
-    levels = np.stack([np.asarray(frames[int(index)]) for index in glances])
+    levels = np.stack([frames[int(index)] for index in glances])
     place = int(_STANDING * (len(glances) - 1))
     levels.partition(place, axis=0)
     return np.asarray(levels[place], dtype=np.float32)
 
 
 def _crossings(
-    image: npt.NDArray[Any],
+    image: AnyArray,
     pixel_mm: FloatArray,
     inside: BoolArray,
     standing: Float32Array | None,

@@ -7,19 +7,17 @@ shift.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
-
 import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
-from calibration.detection.region import checked_pixel, detect_in_frames, finite_grey, region_mask
+from calibration.detection.region import detect_in_frames, finite_grey, region_mask
 from calibration.points import Detections
-from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from speckle3d.core.arrays import AnyArray, BoolArray, Float32Array, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.extras import extra_module
 from speckle3d.core.leastsquares import robust_sigma
+from speckle3d.core.progress import Progress
 from speckle3d.core.sweep import Frames
 
 _FAINTEST = 0.03
@@ -44,16 +42,16 @@ _MOST_DOTS = 20
 
 def dots_in_frames(
     frames: Frames,
-    pixel_mm: npt.ArrayLike,
+    pixel_mm: FloatArray,
     region_px: npt.ArrayLike | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> Detections:
     """Find the bright dots of every frame, read one at a time.
 
     Parameters
     ----------
     frames : Frames, shape (n, column, row)
-    pixel_mm : array_like, shape (2,)
+    pixel_mm : ndarray, shape (2,)
         Distance between columns and between rows, mm; ten per cent do not matter.
     region_px : array_like, shape (k, 2), optional
         Corners (column, row) of a polygon outside which nothing counts.
@@ -65,11 +63,11 @@ def dots_in_frames(
     InvalidInputError
         If an argument is not what it must be.
     """
-    size, inside = checked_pixel(pixel_mm), region_mask(frames.shape[1:], region_px)
-    return detect_in_frames(frames, lambda image: _dots(image, size, inside), progress)
+    inside = region_mask(frames.shape[1:], region_px)
+    return detect_in_frames(frames, lambda image: _dots(image, pixel_mm, inside), progress)
 
 
-def _dots(image: npt.NDArray[Any], pixel_mm: FloatArray, inside: BoolArray) -> tuple[FloatArray, FloatArray]:
+def _dots(image: AnyArray, pixel_mm: FloatArray, inside: BoolArray) -> tuple[FloatArray, FloatArray]:
     grey = finite_grey(image)
     contrast = ndimage.gaussian_filter(grey, _DOT_MM / pixel_mm)
     contrast -= ndimage.gaussian_filter(grey, _SURROUND_MM / pixel_mm, truncate=3.0)

@@ -16,7 +16,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.transform import RigidTransform
 
@@ -47,12 +46,12 @@ _WIDTHS, _GAPS = (0.9, 1.1 * _STEEPEST), (0.85, 1.1 * _STEEPEST)
 """Distances in the image over the phantom's: of a layer's outer wires, and between layers."""
 
 
-def label_dots(dots: Detections, phantom: WirePhantom, pixel_mm: npt.ArrayLike) -> Detections:
+def label_dots(dots: Detections, phantom: WirePhantom, pixel_mm: FloatArray) -> Detections:
     """Assign dots to the wires of an N-wire phantom, each frame by itself.
 
     Parameters
     ----------
-    pixel_mm : array_like, shape (2,)
+    pixel_mm : ndarray, shape (2,)
         Distance between columns and between rows, mm, known to 5 %.
 
     Returns
@@ -66,14 +65,14 @@ def label_dots(dots: Detections, phantom: WirePhantom, pixel_mm: npt.ArrayLike) 
     InvalidInputError
         If the phantom has fewer than two N.
     """
-    layers, size, score = _layers(phantom), np.asarray(pixel_mm, dtype=float), dots.score
+    layers, score = _layers(phantom), dots.score
     assert score is not None
     wires = np.concatenate([layer.wires for layer in layers])
     pixels: dict[int, FloatArray] = {}
     reasons = dict(dots.dropped)
     for frame in np.unique(dots.frame):
         in_frame = dots.frame == frame
-        dots_mm, strength = dots.pixels[in_frame] * size, score[in_frame]
+        dots_mm, strength = dots.pixels[in_frame] * pixel_mm, score[in_frame]
         try:
             triples = [_triples(dots_mm, layer, phantom) for layer in layers]
             hypotheses = _combine(triples, dots_mm, strength, layers)
@@ -92,10 +91,7 @@ def label_dots(dots: Detections, phantom: WirePhantom, pixel_mm: npt.ArrayLike) 
             usual += first[..., 1].mean(axis=1) <= last[..., 1].mean(axis=1)
             pixels[int(frame)] = dots.pixels[in_frame][hypotheses[np.lexsort((usual, total))[-1]]]
         except InsufficientDataError as error:
-            few = len(dots_mm) < wires.size
-            reasons[int(frame)] = f"{error}" + (
-                f" ({len(dots_mm)} dots for {wires.size} wires)" if few else ""
-            )
+            reasons[int(frame)] = f"{error} ({len(dots_mm)} dots for {wires.size} wires)"
     return Detections(
         frame=np.repeat(np.array(list(pixels), dtype=np.int64), wires.size),
         pixels=np.concatenate([np.zeros((0, 2)), *pixels.values()]),

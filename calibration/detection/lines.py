@@ -10,24 +10,18 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 
-from calibration.detection.region import (
-    Columns,
-    checked_pixel,
-    choose_columns,
-    detect_in_frames,
-)
+from calibration.detection.region import Columns, choose_columns, detect_in_frames
 from calibration.points import Detections
 from calibration.settings import LineSettings, Place
-from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from speckle3d.core.arrays import AnyArray, BoolArray, Float32Array, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError
+from speckle3d.core.progress import Progress
 from speckle3d.core.sweep import Frames
 
 _ROUNDS = 5
@@ -111,16 +105,16 @@ class LineFinder:
     def of_frames(
         cls,
         frames: Frames,
-        pixel_mm: npt.ArrayLike,
+        pixel_mm: FloatArray,
         settings: LineSettings | None = None,
         region_px: npt.ArrayLike | None = None,
     ) -> LineFinder:
         """Choose the columns from all frames; see `detect_lines`."""
         s = settings or LineSettings()
-        pixel = checked_pixel(pixel_mm)
-        return cls(pixel, s, choose_columns(frames, s.columns, region_px, s.smoothing_mm / pixel[1]))
+        columns = choose_columns(frames, s.columns, region_px, s.smoothing_mm / pixel_mm[1])
+        return cls(pixel_mm, s, columns)
 
-    def line(self, image: npt.NDArray[Any]) -> EchoLine:
+    def line(self, image: AnyArray) -> EchoLine:
         """Find the line in one frame, shape (column, row).
 
         Raises
@@ -191,10 +185,10 @@ class LineFinder:
 
 def detect_lines(
     frames: Frames,
-    pixel_mm: npt.ArrayLike,
+    pixel_mm: FloatArray,
     settings: LineSettings | None = None,
     region_px: npt.ArrayLike | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> Detections:
     """Find the line of a plane's echo in every frame, read one at a time.
 
@@ -204,7 +198,7 @@ def detect_lines(
     Parameters
     ----------
     frames : Frames, shape (n, column, row)
-    pixel_mm : array_like, shape (2,)
+    pixel_mm : ndarray, shape (2,)
         Distance between columns and between rows.
     region_px : array_like, shape (k, 2), optional
         Corners (column, row) of a polygon outside which nothing counts.
@@ -218,7 +212,7 @@ def detect_lines(
     """
     finder = LineFinder.of_frames(frames, pixel_mm, settings, region_px)
 
-    def find(image: npt.NDArray[Any]) -> tuple[FloatArray, FloatArray]:
+    def find(image: AnyArray) -> tuple[FloatArray, FloatArray]:
         line = finder.line(image)
         return line.points_px[None], np.array([line.strength])
 

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import gaussian_filter1d
 
 from calibration.points import Detections
-from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from speckle3d.core.arrays import AnyArray, BoolArray, Float32Array, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, naming
 from speckle3d.core.geometry import require_finite
 from speckle3d.core.grid import polygon_mask
+from speckle3d.core.progress import Progress
 from speckle3d.core.sweep import Frames
 
 _GLANCES = 48
@@ -129,15 +129,7 @@ def spread(size: int, count: int) -> IntArray:
     return np.unique(np.concatenate([left, size - 1 - left]))
 
 
-def checked_pixel(pixel_mm: npt.ArrayLike) -> FloatArray:
-    """Distances between columns and between rows as an array, shape (2,), if both are above zero."""
-    pixel = np.asarray(pixel_mm, dtype=float)
-    if pixel.shape != (2,) or not (np.isfinite(pixel) & (pixel > 0)).all():
-        raise InvalidInputError(f"pixel_mm: expected two values above zero, got {pixel.tolist()}")
-    return pixel
-
-
-def finite_grey(image: npt.NDArray[Any]) -> Float32Array:
+def finite_grey(image: AnyArray) -> Float32Array:
     """Grey levels of a frame, all finite."""
     grey = np.asarray(image, dtype=np.float32)
     require_finite(grey, "image")
@@ -146,8 +138,8 @@ def finite_grey(image: npt.NDArray[Any]) -> Float32Array:
 
 def detect_in_frames(
     frames: Frames,
-    find: Callable[[npt.NDArray[Any]], tuple[FloatArray, FloatArray]],
-    progress: Callable[[int, int], None] | None = None,
+    find: Callable[[AnyArray], tuple[FloatArray, FloatArray]],
+    progress: Progress | None = None,
 ) -> Detections:
     """Apply a detector to every frame but repeats, read one at a time; an error names the frame.
 

@@ -79,7 +79,7 @@ def points_of(pixels, rows):
 
 @pytest.mark.realdata
 def test_points_picked_by_hand_are_explained_to_a_millimetre(hand_picks):
-    solution = calibrate_cross_wire(points_of(*hand_picks), settings=ALL_FRAMES)
+    solution = calibrate_cross_wire(points_of(*hand_picks), np.full(2, 0.15), ALL_FRAMES)
     assert solution.used.all()
     # 0.980 mm, and as much with nine free numbers instead of a rigid mounting and two scales, which make
     # image axes 89.9 degrees apart: nothing is left that any mounting could explain.
