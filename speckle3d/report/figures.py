@@ -13,7 +13,7 @@ from plotly.colors import hex_to_rgb
 from plotly.subplots import make_subplots
 from scipy.spatial.transform import RigidTransform
 
-from speckle3d.core.arrays import FloatArray
+from speckle3d.core.arrays import AnyArray, Float32Array, FloatArray
 from speckle3d.core.grid import ImageGrid
 from speckle3d.core.images import spread_frames
 from speckle3d.core.reconstruction import FramePairs
@@ -175,11 +175,11 @@ def plot_rejections(pairs: FramePairs, frames: int) -> go.Figure:
     return figure.update_yaxes(title_text="patches left out / %", range=(0.0, 100.0), row=1, col=2)
 
 
-def _percent(part: npt.NDArray[Any], whole: npt.NDArray[Any]) -> FloatArray:
+def _percent(part: AnyArray, whole: AnyArray) -> FloatArray:
     """Shares in per cent; NaN of nothing."""
-    return np.asarray(100.0 * part / np.where(whole > 0, whole, np.nan))
+    return 100.0 * part / np.where(whole > 0, whole, np.nan)
 
 
-def _numbers(values: npt.ArrayLike) -> npt.NDArray[np.float32]:
+def _numbers(values: npt.ArrayLike) -> Float32Array:
     """Values as plotly writes them shortest."""
     return np.asarray(values, dtype=np.float32)

@@ -108,7 +108,7 @@ def _page(study: Study, overview: PageFigure | None, sections: Sequence[Section]
     keys, (intervals, comparisons) = ("name", "path", "sha256", "key", "seconds"), study.statistics
     drifts = {key for row in study.drift for key, value in row.items() if value is not None}
     return environment.get_template("page.html").render(
-        sweep_count=tables.quantity_text(len(study.successes) or len(study.failures), "sweep"),
+        sweep_count=tables.sweeps_text(len(study.successes) or len(study.failures)),
         lead=tables.summary_lines(study),
         doubts=tables.records_table([_doubt_row(doubt) for doubt in study.doubts], (), anchors),
         failures=tables.records_table(

@@ -25,9 +25,9 @@ Table = Sequence[Sequence[str]]
 """Cells, the first line the heads; markup of our own is `Markup`."""
 
 
-def quantity_text(count: int, noun: str) -> str:
-    """Number and noun."""
-    return f"{count} {noun}{'s' * (count != 1)}"
+def sweeps_text(count: int) -> str:
+    """Number of sweeps, in words."""
+    return f"{count} sweep{'s' * (count != 1)}"
 
 
 def parts_table(rows: Sequence[Row], anchors: Mapping[str, str]) -> Table:
@@ -93,14 +93,13 @@ def summary_lines(study: Study) -> list[str]:
     """Say in plain sentences how large the errors are, and whether the sweeps tell the modes apart."""
     successes, failures, rows = len(study.successes), len(study.failures), rows_with_error(study)
     if not successes:
-        count = quantity_text(failures, "sweep")
+        count = sweeps_text(failures)
         return [f"Nothing could be reconstructed from {count}; the reasons are below."]
     lines, (intervals, comparisons) = [], study.statistics
     for quantity in ("length_error_percent", "tilt_error_deg"):
         of = [row for row in intervals if row["quantity"] == quantity]
         names = ", ".join(
-            f"{row['mode']} {with_interval(row, 'mean')} ({quantity_text(row['sweeps'], 'sweep')})"
-            for row in of
+            f"{row['mode']} {with_interval(row, 'mean')} ({sweeps_text(row['sweeps'])})" for row in of
         )
         if of:
             lines.append(f"mean magnitude of {words_of(quantity)}, with its 95 % interval: {names}")

@@ -73,7 +73,7 @@ def wave_sum(waves: FloatArray, position_mm: FloatArray) -> FloatArray:
 
     ``waves`` holds one in a row: amplitude, wave number along x, y and z (rad/mm), phase (rad).
     """
-    return np.asarray(np.sin(position_mm @ waves[:, 1:4].T + waves[:, 4]) @ waves[:, 0])
+    return np.sin(position_mm @ waves[:, 1:4].T + waves[:, 4]) @ waves[:, 0]
 
 
 def random_waves(rng: Generator, rms: float, waves_rad_mm: Sequence[float], count: int = 6) -> FloatArray:
@@ -108,7 +108,7 @@ class Layer(NamedTuple):
         # Waves are slow to evaluate, so only near the boundary, where they can change the answer.
         near = np.flatnonzero(np.abs(below) <= np.abs(self.undulation[:, 0]).sum())
         below[near] -= wave_sum(self.undulation, position_mm[near] * [1.0, 0.0, 1.0])
-        return np.asarray(below >= 0.0)
+        return below >= 0.0
 
 
 class Clusters(NamedTuple):
@@ -241,7 +241,7 @@ def _children(clusters: Clusters, tile: Tile, *seed: int) -> Scatterers:
     rng, (top, bottom) = tile_rng(tile, *seed), clusters.depth_mm
     n, children = rng.poisson(clusters.per_mm3 * (bottom - top) * TILE_MM**2), clusters.children
     parent = tile_corner(tile, top) + rng.random((n, 3)) * [TILE_MM, bottom - top, TILE_MM]
-    axis = np.asarray(clusters.direction) + clusters.wander_rad * rng.standard_normal((n, 3))
+    axis = clusters.direction + clusters.wander_rad * rng.standard_normal((n, 3))
     axis *= (clusters.length_mm * rng.uniform(0.25, 1.0, n) / np.linalg.norm(axis, axis=1))[:, None]
     along = rng.random((n, children, 1)) - 0.5
     across = clusters.spread_mm * np.clip(rng.standard_normal((n, children, 3)), -3.0, 3.0)

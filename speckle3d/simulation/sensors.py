@@ -74,7 +74,7 @@ def simulate_orientation(
 
     def noisy(true: FloatArray, bias: float, white: float) -> FloatArray:
         level = true + noise * bias * rng.standard_normal(3)
-        return np.asarray(level + noise * white * rng.standard_normal(true.shape))
+        return level + noise * white * rng.standard_normal(true.shape)
 
     return OrientationSensor(
         TimedRotations(clock - _OFFSET_S, readings),

@@ -74,11 +74,8 @@ class StudyRequest:
             return failure(plan, _reason(error))
 
     def _reconstruct(self, path: Path, folder: Path) -> None:
-        settings, crossing, sweep = (
-            config_from_toml(self.settings_toml),
-            self._crossing(path),
-            load_sweep(path),
-        )
+        settings, crossing = config_from_toml(self.settings_toml), self._crossing(path)
+        sweep = load_sweep(path)
         modes: Sequence[str] | None = self.modes
         if modes is None:
             modes = available_modes(apply_calibrations(sweep, self.calibrations)[0], settings)

@@ -6,11 +6,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from speckle3d.calibration_files import apply_calibrations
 from speckle3d.config import stored_config
-from speckle3d.core.arrays import Float32Array, FloatArray
+from speckle3d.core.arrays import AnyArray, Float32Array, FloatArray
 from speckle3d.core.errors import InvalidInputError, MismatchError
 from speckle3d.core.grid import ImageGrid, ScanConversion
 from speckle3d.core.reconstruction import Reconstruction
@@ -105,11 +104,11 @@ class GreyImages:
         """Shape (frame, vector, sample)."""
         return len(self._sweep), self.grid.vectors, self.grid.samples
 
-    def __getitem__(self, index: int) -> npt.NDArray[Any]:
+    def __getitem__(self, index: int) -> AnyArray:
         levels = self._levels_of(self._sweep.frames[index])
         return levels if self._convert is None else np.nan_to_num(self._convert(levels), nan=self._outside)
 
-    def _levels_of(self, frame: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    def _levels_of(self, frame: AnyArray) -> AnyArray:
         if self._levels == "stored":
             return frame
         intensity = self._extractor.echo(frame).intensity
@@ -120,7 +119,7 @@ class GreyImages:
 
 
 def _decibel(intensity: Float32Array) -> Float32Array:
-    return np.asarray(10 * np.log10(np.maximum(intensity, np.float32(1e-12))))
+    return 10 * np.log10(np.maximum(intensity, np.float32(1e-12)))
 
 
 def grey_images(

@@ -50,7 +50,7 @@ _TURNING = SimulationSettings(preset="rotation", vectors=48, turn_deg=8.0)
 SWEEPS: Mapping[str, SimulationSettings] = {
     **{f"beef-{k}": _TISSUE.model_copy(update={"seed": 3000 + k}) for k in range(1, 6)},
     **{f"beef-{k}": _REVERSAL.model_copy(update={"seed": 3000 + k}) for k in range(6, 11)},
-    "phantom": _TURNING.model_copy(update={"seed": 3011, "length_mm": 30.0, "reverse": True}),
+    "phantom": _TURNING.model_copy(update={"seed": 3011, "length_mm": 30.0}),
 }
 """By data set. The published sweeps of beef are 1.5 to 4 mm long; these are 10 and 20 mm, in which the
 tracker's jitter of 0.15 mm is less than one per cent."""

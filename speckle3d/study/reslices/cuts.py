@@ -49,7 +49,7 @@ class DrawnCut:
 
     image: Float32Array
     cut: Cut
-    frames: FloatArray = field(default_factory=lambda: np.empty((0, 2, 2)))
+    frames: FloatArray
 
 
 @dataclass(frozen=True)
@@ -125,11 +125,12 @@ def cut_at_modes(
         raise InvalidInputError("cut: expected one that meets the sweep, got one that shows nothing")
     cuts = {}
     for (mode, cut), image in zip(place.cuts.items(), levels, strict=True):
-        cuts[mode] = DrawnCut(image, cut)
+        lines = np.empty((0, 2, 2))
         if cut.world_from_picture is not None:
             plane_from_image = cut.world_from_picture.inv() * poses[mode]
             lines = crossings(frame_outlines(grid, poses[mode]), cut.world_from_picture)
-            cuts[mode] = DrawnCut(image, cut, within_fan(lines, plane_from_image, modes.posed.sweep.grid))
+            lines = within_fan(lines, plane_from_image, modes.posed.sweep.grid)
+        cuts[mode] = DrawnCut(image, cut, lines)
     reference = Reference.over_all(modes.reference, poses[modes.reference])
     lengths = length_words(error_rows(poses, reference, grid.centre_mm), modes.reference)
     name = modes.posed.sweep.name

@@ -9,10 +9,9 @@ from typing import Any
 
 import jinja2
 import numpy as np
-import numpy.typing as npt
 from matplotlib.colors import to_rgb
 
-from speckle3d.core.arrays import ByteArray, FloatArray
+from speckle3d.core.arrays import AnyArray, ByteArray, FloatArray
 from speckle3d.core.files import PathLike
 from speckle3d.core.grid import Region
 from speckle3d.core.progress import Progress
@@ -149,7 +148,7 @@ class _Bytes:
         return len(self.source), self.source.grid.vectors, self.source.grid.samples
 
     def __getitem__(self, index: int) -> ByteArray:
-        image: npt.NDArray[Any] = self.source.read(index)
+        image: AnyArray = self.source.read(index)
         # Outside a fan there is nothing.
         return np.asarray(np.clip(np.rint(np.nan_to_num(image)), 0, 255), dtype=np.uint8)
 
@@ -180,4 +179,4 @@ def slicer_sequence(
     times, name = posed.sweep.frame_time_s[posed.frames], posed.sweep.name
     sweep = Sweep(_Bytes(source), grid, signal, times, name=name, probe=posed.sweep.probe)
     lps_from_pixels = posed.world_from_image.as_matrix() @ pixel_matrix(grid)
-    return sweep, {"ImageToWorld": np.asarray(_RAS_FROM_LPS @ lps_from_pixels)}
+    return sweep, {"ImageToWorld": _RAS_FROM_LPS @ lps_from_pixels}

@@ -59,7 +59,7 @@ def test_lengths_over_narrow_cuts_do_not_overlap():
 def test_where_a_plane_lies_comes_back_from_the_file(tmp_path):
     sheet = curved_sheet(np.eye(3), np.array([0, 0, 1.0]), (-1.0, 4.0), 0.5)
     cuts = {"truth": sheet, "pose": PLANE}
-    panels = {mode: DrawnCut(np.zeros(cut.shape, np.float32), cut) for mode, cut in cuts.items()}
+    panels = {mode: DrawnCut(np.zeros(cut.shape, np.float32), cut, np.empty(0)) for mode, cut in cuts.items()}
     path = save_reslices(CutPicture(panels, marks={"pose": "a mark"}), tmp_path / "cut.png")
     plane = read_plane(path)
     assert (plane.mode, plane.mark) == ("pose", "a mark")
