@@ -1,5 +1,7 @@
 """Reconstructing a sweep, and comparing modes over many."""
 
+from __future__ import annotations
+
 from pathlib import Path
 from typing import Annotated, Literal
 

@@ -1,5 +1,7 @@
 """Calibration of decorrelation curves: phantoms in steps, tracked sweeps, data sheets."""
 
+from __future__ import annotations
+
 from typing import Annotated
 
 import speckle3d as s3

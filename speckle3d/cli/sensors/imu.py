@@ -1,5 +1,7 @@
 """The orientation sensor: its logs, its orientation, its accuracy, and recording it live."""
 
+from __future__ import annotations
+
 import math
 from pathlib import Path
 from typing import Annotated, Literal
