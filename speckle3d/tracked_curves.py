@@ -15,7 +15,6 @@ from typing import NamedTuple
 import numpy as np
 
 from speckle3d.config import Config
-from speckle3d.core.arrays import FloatArray
 from speckle3d.core.curves import ATTENUATION_SIGMA, DecorrelationCurves, curve_widths
 from speckle3d.core.errors import InsufficientDataError, MismatchError, Speckle3DError
 from speckle3d.core.leastsquares import robust_sigma
@@ -39,7 +38,6 @@ LEAST_SURE = 0.3
 STEADY_MM = 0.01
 """Jitter up to which positions are a stage's, exact enough for each step; trackers have 0.05 to 0.3."""
 ROUNDS = 2
-"""One more for tissue, whose depths the first two bring together."""
 
 
 def tracked_curves(
@@ -80,7 +78,7 @@ def tracked_curves(
         try:
             curves = _fit_length(bare, start, settings, progress, 1) if adapt else start
             tissue = replace(curves, of_tissue=True)
-            candidates.append(_fit_length(bare, tissue, settings, progress, ROUNDS + 1))
+            candidates.append(_fit_length(bare, tissue, settings, progress))
         except (InsufficientDataError, MismatchError) as error:
             reason = error
     if not candidates:
@@ -95,28 +93,12 @@ def _fit_length(
     progress: Progress | None,
     rounds: int = ROUNDS,
 ) -> DecorrelationCurves:
-    """Curves scaled until the images' lengths of some sweeps equal the tracker's.
-
-    Those of tissue are first stretched at each depth until all depths have the same length.
-    """
-    for last in np.arange(rounds) == rounds - 1:
+    """Curves scaled until the images' lengths of some sweeps equal the tracker's."""
+    for _ in range(rounds):
         results = [track(sweep, curves, config, progress) for sweep in sweeps]
         lengths = [tracker_scale(sweep, result) for sweep, result in zip(sweeps, results, strict=True)]
         curves = corrected_curves(curves, [result.curves for result in results], lengths)
-        if curves.of_tissue and not last:
-            curves = stretched(curves, np.mean([_row_widths(result, curves) for result in results], axis=0))
     return replace(curves, origin="tracked")
-
-
-def _row_widths(result: Tracked, curves: DecorrelationCurves) -> FloatArray:
-    """Logarithm of how much wider each depth's curve is than the others', by a sweep's own patches."""
-    rows = result.coherence.rows
-    if rows is None:
-        return np.zeros(curves.depth_mm.size)
-    # Rows without an echo have no scale.
-    scaled = np.isfinite(rows.logarithm)
-    logarithm = rows.logarithm[scaled]
-    return np.interp(curves.depth_mm, rows.depth_mm[scaled], np.median(logarithm) - logarithm)
 
 
 def jitters(sweep: Sweep) -> bool:

@@ -92,7 +92,7 @@ def examine_curves(texture: Texture, motion: Motion) -> tuple[Doubt | None, ...]
 def rows_without_tilt(motion: Motion) -> RowScales | None:
     """Scales of rows without the part that tilt explains, which may be wrong curves."""
     rows, problem = motion.coherence.rows, motion.problem
-    if rows is None or problem.curves.of_tissue:
+    if rows is None:
         return None
     lever = np.median(problem.patches.rows_of(problem.levers.lever_mm), axis=-1)
     by_tilt = np.log(np.maximum(np.abs(1.0 + motion.turn_per_mm[1] * lever), 1e-3))

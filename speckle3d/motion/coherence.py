@@ -226,6 +226,8 @@ def estimate_coherence(problem: MotionProblem, table: CorrelationTable, path: Fl
     by_row = patches.rows_of(by_patch).sum(axis=2)
     log_scale = _peak(by_patch.sum(axis=1))
     scale_sigma, false_turn = _deviations(problem, by_patch)
+    if problem.curves.of_tissue:
+        return replace(as_measured, scale_sigma=scale_sigma, false_turn=false_turn)
     (weight,), (gains,) = binning.log_likelihood(log_scale, np.zeros(1), values)
     weight = softmax(weight + log_prior, axis=1)
     share, gain = (v.reshape(centres.size, -1) for v in (weight @ values, (weight * gains).sum(axis=1)))
@@ -233,8 +235,6 @@ def estimate_coherence(problem: MotionProblem, table: CorrelationTable, path: Fl
     row_scale = np.where(np.ptp(by_row, axis=0) > 1e-9, [_peak(row) for row in by_row.T], np.nan)
     row_gain = np.median(patches.rows_of(gain), axis=(0, 2)) + 0.0 * row_scale
     rows = RowScales(patches.row_depth_mm, row_scale - log_scale, row_gain)
-    if problem.curves.of_tissue:
-        return replace(as_measured, scale_sigma=scale_sigma, false_turn=false_turn, rows=rows)
     # To first order s^2 (1 - c (1 - a)) is observable, and a is open.
     scale_sigma = float(np.hypot(scale_sigma, 0.5 * share.mean() * POWERS.std()))
     return Coherence(centres, share, gain, float(np.exp(log_scale)), scale_sigma, false_turn, rows)

@@ -127,7 +127,7 @@ def estimate_motion(problem: MotionProblem, table: CorrelationTable) -> Motion:
         If no pair determines a plane.
     """
     curves = problem.curves
-    if curves.origin == "data sheet" and not curves.of_tissue:
+    if curves.origin == "data sheet":
         # Tilt bends rows as a lens does: it is left out until the lens is known.
         first = _alternate(replace(problem, curves=replace(curves, tilt=None)), table)
         if first.coherence.rows:
