@@ -26,9 +26,9 @@ def window_sums(
     Returns
     -------
     ndarray, shape (n, 4)
-        Each window's first axes from the next one's, as quaternions.
+        Rotation from the next window's first axes to each one's, quaternions, scalar last.
     ndarray, shape (n, 3, 3)
-        Means over each window of its first axes from the sensor's.
+        Mean over each window of the rotation from the sensor's axes to its first ones.
     ndarray, shape (d, n, 5)
         Sums of directions and of their lengths, and how many have one.
     """
