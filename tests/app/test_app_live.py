@@ -19,7 +19,7 @@ def test_the_page_has_picture_length_and_end(browser, data_folder, tmp_path, mon
         page = open_page(browser, read_until(session, "http"))
         page.wait_for_selector("text=/waiting for/")
         with running(play, stderr=subprocess.PIPE):
-            page.wait_for_selector("text=/\\+1\\d\\.\\d mm ±\\d/")
+            page.wait_for_selector("text=/\\+\\d+\\.\\d mm ±\\d/")
             page.wait_for_selector("text=/the sweep has ended/")
             session.communicate()
             assert session.returncode == 0
