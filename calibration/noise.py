@@ -142,7 +142,7 @@ def fit_wandering(
         The part of the grid that has a say.
     """
     information = np.broadcast_to(certainty, jacobian.shape[1])
-    columns = np.column_stack([jacobian, residuals])
+    columns = np.ascontiguousarray(np.column_stack([jacobian, residuals]))
     pauses_s = np.maximum(np.diff(frame_time_s, prepend=frame_time_s[0]), 0.0)
 
     def whiten(g: int) -> tuple[FloatArray, float]:

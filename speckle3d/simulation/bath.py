@@ -147,7 +147,7 @@ class WaterBath(TiledMedium):
             position = np.concatenate([_sheet(self.entropy, tile) for tile in tiles]) * [1.0, roughness, 1.0]
             if self.reflector == "bar":
                 position = position[np.abs(position[:, 2]) <= _BAR_MM / 2.0]
-            place = (medium_from_image * image_from_sheet).apply(position)
+            place = np.ascontiguousarray((medium_from_image * image_from_sheet).apply(position))
             return place, np.full(len(place), amplitude * strength, np.float32)
 
         sheets = [sheet(image_from_sheet, 1.0, 1.0)]

@@ -67,7 +67,7 @@ def main():
     parser.add_argument("--starts", type=int, default=183)
     parser.add_argument("--seed", type=int, default=601)
     parser.add_argument("--frames", type=int, default=160)
-    options = bench.parse_options(parser, starts=1, frames=40)
+    options = bench.parse_options(parser, starts=1, frames=16)
     errors = study(prepare_pair(options.seed, options.frames), options.starts)
     middle = np.median(errors, axis=0)
     with np.errstate(invalid="ignore"):
