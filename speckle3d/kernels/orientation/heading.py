@@ -9,13 +9,17 @@ from typing import Any
 import numpy as np
 
 from speckle3d.core.arrays import FloatArray
+from speckle3d.kernels.copying import copy_into
 from speckle3d.kernels.orientation.rotations import (
     add_product,
     compiled,
+    for_kernels,
     inverse,
     norm,
+    squared_norm,
+    store,
     subtract_product,
-    transported,
+    times_transpose,
 )
 
 ROOM, BIAS, IRON, PLACE, STRAY, LAG, SIZE = 0, 3, 6, 9, 12, 15, 16
@@ -140,7 +144,7 @@ def find_headings(
     states, covariances, transitions, noises : ndarray, shapes (k, n, SIZE) and (k, n, SIZE, SIZE), or k = 0
         Filled: after each bin, and from the one before to it.
     """
-    f, q = np.zeros((SIZE, SIZE)), np.zeros((SIZE, SIZE))
+    f, q = np.eye(SIZE), np.zeros((SIZE, SIZE))
     for j in range(models.shape[0]):
         s, m = filters[j], models[j]
         for k in range(bins.shape[0]):
@@ -154,7 +158,10 @@ def find_headings(
                     _correct(s, b, m, f, q, out)
                 out.turn_rad, out.variance = turn_to_north(s.x, s.p)
                 if states.shape[0] > 0:
-                    states[j, k], covariances[j, k], transitions[j, k], noises[j, k] = s.x, s.p, f, q
+                    store(s.x, states[j, k])
+                    copy_into(covariances[j, k], s.p)
+                    copy_into(transitions[j, k], f)
+                    copy_into(noises[j, k], q)
             out.stray, out.doubt = s.stray, s.doubt
 
 
@@ -169,32 +176,37 @@ def turn_to_north(x: FloatArray, p: FloatArray) -> tuple[float, float]:
     return -math.atan2(along, across), min(max(variance / (square * square), 0.0), math.pi**2)
 
 
-@compiled
+@for_kernels
 def _begin(s: Any, b: Any, m: Any) -> None:
     """Begin with the bin's reading; after a pause with the iron and lag found so far."""
     if not s.ran:
         s.norm = norm(b.field)
-        _forget(s, IRON, 3, m.iron)
-        _forget(s, LAG, 1, _LAG_S)
-    _forget(s, ROOM, 3, 1.0)
-    _forget(s, BIAS, 3, math.sqrt(b.bias_variance))
-    _forget(s, PLACE, 3, _PLACE if s.ran else m.first_place)
-    _forget(s, STRAY, 3, m.first_stray * s.stray)
-    s.x[ROOM : ROOM + 3] = b.field / s.norm - b.level @ s.x[IRON : IRON + 3]
-    s.bias[:] = b.bias
+        for i in range(3):
+            s.p[IRON + i, IRON + i] = m.iron**2
+        s.p[LAG, LAG] = _LAG_S**2
+    for i in range(3):
+        _forget(s, ROOM + i, 1.0)
+        _forget(s, BIAS + i, math.sqrt(b.bias_variance))
+        _forget(s, PLACE + i, _PLACE if s.ran else m.first_place)
+        _forget(s, STRAY + i, m.first_stray * s.stray)
+        s.x[ROOM + i] = b.field[i] / s.norm
+        for j in range(3):
+            s.x[ROOM + i] -= b.level[i, j] * s.x[IRON + j]
+    store(b.bias, s.bias)
     s.changing_s, s.beside = 0.0, m.beside_iron and not s.ran
     s.begun, s.ran, s.rested = True, True, b.resting
 
 
-@compiled
-def _forget(s: Any, first: int, count: int, sd: float) -> None:
-    """Set states anew, to zero with that deviation."""
-    for i in range(first, first + count):
-        s.x[i], s.p[i], s.p[:, i] = 0.0, 0.0, 0.0
-        s.p[i, i] = sd * sd
+@for_kernels
+def _forget(s: Any, i: int, sd: float) -> None:
+    """Set a state anew, to zero with that deviation."""
+    s.x[i] = 0.0
+    for j in range(SIZE):
+        s.p[i, j] = s.p[j, i] = 0.0
+    s.p[i, i] = sd * sd
 
 
-@compiled
+@for_kernels
 def _predict(s: Any, b: Any, m: Any, f: FloatArray, q: FloatArray) -> None:
     """Predict over a bin; fill its transition and noise."""
     span, across, along = b.span_s, s.x[ROOM], s.x[ROOM + 1]
@@ -204,10 +216,9 @@ def _predict(s: Any, b: Any, m: Any, f: FloatArray, q: FloatArray) -> None:
     place = m.first_place if leaves and s.changing_s > span else _PLACE
     moves_on = moves_on or leaves
     s.rested = b.resting
-    s.x[BIAS : BIAS + 3] -= b.bias - s.bias
-    s.bias[:] = b.bias
-    f[:], q[:] = np.eye(SIZE), 0.0
     for i in range(3):
+        s.x[BIAS + i] -= b.bias[i] - s.bias[i]
+        s.bias[i] = b.bias[i]
         turn = moving * span * keep_bias * b.level[2, i]
         f[ROOM, BIAS + i], f[ROOM + 1, BIAS + i] = -turn * along, turn * across
         f[BIAS + i, BIAS + i], f[STRAY + i, STRAY + i] = keep_bias, keep_stray
@@ -221,13 +232,15 @@ def _predict(s: Any, b: Any, m: Any, f: FloatArray, q: FloatArray) -> None:
     q[ROOM + 1, ROOM + 1] += b.slip_rad2 * across * across
     q[ROOM, ROOM + 1] = q[ROOM + 1, ROOM] = -b.slip_rad2 * across * along
     s.changing_s = max(s.changing_s - span, 0.0)
-    x = s.x.copy()
-    s.x[:] = 0.0
-    add_product(s.x, f, x)
-    s.p[:] = transported(f, s.p) + q
+    x, p = np.zeros(SIZE), times_transpose(f, times_transpose(f, s.p))
+    add_product(x, f, s.x)
+    store(x, s.x)
+    for i in range(SIZE):
+        for j in range(SIZE):
+            s.p[i, j] = p[i, j] + q[i, j]
 
 
-@compiled
+@for_kernels
 def _correct(s: Any, b: Any, m: Any, f: FloatArray, q: FloatArray, out: Any) -> None:
     """Correct by a reading, the less the less likely it is: its errors have Student's distribution.
 
@@ -238,8 +251,8 @@ def _correct(s: Any, b: Any, m: Any, f: FloatArray, q: FloatArray, out: Any) -> 
     """
     for again in (False, True):
         off, cross, total = _innovation(s, b)
-        weight, determinant = inverse(total)
-        misfit = float(off @ (weight @ off))
+        weight, determinant = inverse(total, 0.0)
+        misfit = squared_norm(off, weight)
         if not (again or b.resting):
             _adapt(s, b, off, misfit, weight)
         if again or misfit <= _OUTLIER or not _foresee_change(s, m, f, q, off, total):
@@ -253,9 +266,9 @@ def _correct(s: Any, b: Any, m: Any, f: FloatArray, q: FloatArray, out: Any) -> 
         out.trust = 0.0
         return
     if out.trust < 1.0:
-        extra = (1.0 / out.trust - 1.0) * np.trace(total) / 3.0
-        weight, _ = inverse(total + extra * np.eye(3))
-    gain = cross @ weight
+        extra = (1.0 / out.trust - 1.0) * (total[0, 0] + total[1, 1] + total[2, 2]) / 3.0
+        weight, _ = inverse(total, extra)
+    gain = times_transpose(cross, weight)
     add_product(s.x, gain, off)
     subtract_product(s.p, gain, cross)
     for i in range(SIZE):
@@ -263,7 +276,7 @@ def _correct(s: Any, b: Any, m: Any, f: FloatArray, q: FloatArray, out: Any) -> 
             s.p[i, j] = s.p[j, i] = 0.5 * (s.p[i, j] + s.p[j, i])
 
 
-@compiled
+@for_kernels
 def _foresee_change(s: Any, m: Any, f: FloatArray, q: FloatArray, off: FloatArray, total: FloatArray) -> bool:
     """Whether an outlier is iron put on the sensor, or iron beside it left behind; if so, foresee it."""
     if m.iron_put_on > 0.0 and s.changing_s <= 0.0:
@@ -272,48 +285,44 @@ def _foresee_change(s: Any, m: Any, f: FloatArray, q: FloatArray, off: FloatArra
             s.p[i, i] += m.iron_put_on**2
             q[i, i] += m.iron_put_on**2
         return True
-    wide, _ = inverse(total + _PLACE**2 * np.eye(3))
-    if not s.beside or off @ (wide @ off) <= _OUTLIER:
+    if not s.beside or squared_norm(off, inverse(total, _PLACE**2)[0]) <= _OUTLIER:
         return False
     s.beside, s.changing_s = False, _CHANGE_S
-    _forget(s, PLACE, 3, m.first_place)
-    f[PLACE : PLACE + 3], q[PLACE : PLACE + 3] = 0.0, 0.0
     for i in range(PLACE, PLACE + 3):
-        q[i, i] = m.first_place**2
+        _forget(s, i, m.first_place)
+        f[i, i], q[i, i] = 0.0, m.first_place**2
     return True
 
 
-@compiled
+@for_kernels
 def _innovation(s: Any, b: Any) -> tuple[FloatArray, FloatArray, FloatArray]:
     """The reading less what is expected, its covariance with the state, and its own.
 
     The last holds its noise, and what the level axes' tilt makes of the field.
     """
-    cross, total, off = np.zeros((SIZE, 3)), np.zeros((3, 3)), b.field / s.norm
-    for j in range(SIZE):
-        _add_field(s, b, s.p[j], 1.0, cross[j])
+    h, total, off = np.zeros((3, SIZE)), np.zeros((3, 3)), np.empty(3)
     for i in range(3):
-        _add_field(s, b, cross[:, i], 1.0, total[i])
-    _add_field(s, b, s.x, -1.0, off)
+        off[i] = b.field[i] / s.norm
+        h[i, ROOM + i] = h[i, PLACE + i] = h[i, STRAY + i] = 1.0
+        h[i, LAG] = b.field_rate[i] / s.norm
+        for j in range(3):
+            h[i, IRON + j] = b.level[i, j]
+    cross = times_transpose(s.p, h)
     across, up = s.x[ROOM] ** 2 + s.x[ROOM + 1] ** 2, s.x[ROOM + 2] ** 2
     for i in range(3):
+        for k in range(SIZE):
+            off[i] -= h[i, k] * s.x[k]
+            for j in range(3):
+                total[i, j] += h[i, k] * cross[k, j]
         total[i, i] += _NOISE_SQRT_S**2 / b.span_s + b.tilt_rad2 * (up if i < 2 else across)
     return off, cross, total
 
 
-@compiled
-def _add_field(s: Any, b: Any, x: FloatArray, factor: float, field: FloatArray) -> None:
-    """Add the field that a state has the sensor read, times a factor."""
-    for i in range(3):
-        iron = b.level[i, 0] * x[IRON] + b.level[i, 1] * x[IRON + 1] + b.level[i, 2] * x[IRON + 2]
-        late = b.field_rate[i] / s.norm * x[LAG]
-        field[i] += factor * (x[ROOM + i] + x[PLACE + i] + x[STRAY + i] + iron + late)
-
-
-@compiled
+@for_kernels
 def _adapt(s: Any, b: Any, off: FloatArray, misfit: float, weight: FloatArray) -> None:
     """Follow the stray's variance by the slope of the reading's likelihood: the room may become another."""
-    score_vector = weight @ off
+    score_vector = np.zeros(3)
+    add_product(score_vector, weight, off)
     share = min(1.0, _LARGEST_SCORE / misfit)
     score = 0.0
     for i in range(3):

@@ -25,21 +25,25 @@ from typing import Any
 import numpy as np
 
 from speckle3d.core.arrays import FloatArray
+from speckle3d.kernels.copying import copy_into
 from speckle3d.kernels.orientation.rotations import (
+    AXES,
     Quaternion,
     add_product,
     compiled,
+    difference,
+    for_kernels,
     inverse,
     invert,
-    matrix_product,
     norm,
     product,
     quaternion,
     quaternion_of,
     rotate,
+    store,
     subtract_product,
     three,
-    transported,
+    times_transpose,
     turn_by,
 )
 
@@ -178,7 +182,7 @@ def run_filter(
     xyzw : ndarray, shape (m, 4)
         Level axes from the sensor's at every sample, by what came before it.
     """
-    s, step, f, n = filters[0], partial[0], np.zeros((SIZE, SIZE)), 0
+    s, step, f, n = filters[0], partial[0], np.eye(SIZE), 0
     for k in range(step_s.shape[0]):
         if s.pause_s >= 0.0:
             _set_up(s, force_m_s2[k])
@@ -189,63 +193,72 @@ def run_filter(
         if whole:
             _complete(s, step, f)
             if covariance.shape[0] > 0:
-                covariance[n], transition[n] = s.p, f
+                copy_into(covariance[n], s.p)
+                copy_into(transition[n], f)
             step.last = k + 1
             steps[n] = partial[0]
             n += 1
             _open(s, step)
         level = quaternion(s.level)
-        xyzw[k] = level if s.resting else product(level, quaternion(step.turn))
+        store(level if s.resting else product(level, quaternion(step.turn)), xyzw[k])
     return n
 
 
-@compiled
+@for_kernels
 def _open(s: Any, step: Any) -> None:
     """Begin an increment."""
     step.duration_s = step.fields = step.lost_rad2 = 0.0
-    step.rate[:], step.field[:], step.force[:], step.turn[:] = 0.0, 0.0, 0.0, _NO_TURN
-    step.start[:], step.start_bias[:] = s.level, s.bias
+    for part in (step.rate, step.field, step.force):
+        store(_NONE, part)
+    store(_NO_TURN, step.turn)
+    store(s.level, step.start)
+    store(s.bias, step.start_bias)
 
 
-@compiled
+@for_kernels
 def _add(step: Any, dt: float, rate: FloatArray, force: FloatArray, field: FloatArray) -> None:
     """Add a sample to an increment, with the increment's bias."""
     half = turn_by(rate, step.start_bias, 0.5 * dt)
     q = product(quaternion(step.turn), half)
-    for i, part in enumerate(rotate(q, three(force))):
-        step.force[i] += dt * part
+    part = rotate(q, three(force))
+    for i in range(3):
+        step.force[i] += dt * part[i]
         step.rate[i] += dt * rate[i]
     q = product(q, half)
     if math.isfinite(field[0] + field[1] + field[2]):
-        for i, part in enumerate(rotate(q, three(field))):
-            step.field[i] += part
+        part = rotate(q, three(field))
+        for i in range(3):
+            step.field[i] += part[i]
         step.fields += 1.0
-    step.turn[:] = q
+    store(q, step.turn)
     step.duration_s += dt
 
 
-@compiled
+@for_kernels
 def _complete(s: Any, step: Any, f: FloatArray) -> None:
     """Predict over an increment, and correct; fill what it leaves behind, and its transition."""
-    step.rate /= step.duration_s
-    step.field /= step.fields if step.fields > 0.0 else math.nan
+    for i in range(3):
+        step.rate[i] /= step.duration_s
+        step.field[i] /= step.fields
     _predict(s, step, f)
     if s.starting:
         _begin(s, step)
     else:
-        _correct_by_speed(s, step)
+        _correct(s, step, SPEED)
         if s.resting:
-            gain = _correct(s.p, BIAS, _REST_BIAS_RAD**2 / step.duration_s, _LEVEL)
-            _inject(s, gain, step.rate - s.bias)
-    step.level[:], step.speed[:], step.bias[:] = s.level, s.speed, s.bias
+            _correct(s, step, BIAS)
+    store(s.level, step.level)
+    store(s.speed, step.speed)
+    store(s.bias, step.bias)
     step.resting, step.started = s.resting, not s.starting
     for i in range(6):
         step.sd[i] = math.sqrt(s.p[i, i])
     if s.starting and s.still_s < s.start_s:
-        step.sd[:2] = step.sd[:2] * min(max(_START_S / s.start_s, 1.0), _LARGEST_START)
+        for i in range(2):
+            step.sd[i] *= min(max(_START_S / s.start_s, 1.0), _LARGEST_START)
 
 
-@compiled
+@for_kernels
 def _upright(force: FloatArray) -> Quaternion:
     """The shortest rotation that takes a force to up."""
     size = norm(force)
@@ -256,131 +269,136 @@ def _upright(force: FloatArray) -> Quaternion:
     return x / length, y / length, 0.0, w / length
 
 
-@compiled
+@for_kernels
 def _set_up(s: Any, force: FloatArray) -> None:
     """Begin before the first sample: anew, or after a pause with the bias found so far."""
-    bias_variance = s.p[BIAS : BIAS + 3, BIAS : BIAS + 3].copy()
-    s.p[:] = np.diag(s.fresh)
-    if s.running:
-        walk = _BIAS_WALK_RAD_S_SQRT_S**2 * s.pause_s
-        s.p[BIAS : BIAS + 3, BIAS : BIAS + 3] = bias_variance + walk * np.eye(3)
+    walk = _BIAS_WALK_RAD_S_SQRT_S**2 * s.pause_s
+    for i in range(SIZE):
+        for j in range(SIZE):
+            if s.running and min(i, j) >= BIAS and max(i, j) < SPEED:
+                s.p[i, j] += walk if i == j else 0.0
+            else:
+                s.p[i, j] = s.fresh[i] if i == j else 0.0
     s.running = s.starting = True
     s.resting = s.rest_known = False
     s.still_s = s.start_s = 0.0
     s.pause_s = -1.0
-    s.start_force[:], s.speed[:] = 0.0, 0.0
-    s.level[:] = _upright(force)
-    s.start_turn[:] = s.level  # in level axes: those of a sensor upside down would turn with every reading
+    store(_NONE, s.start_force)
+    store(_NONE, s.speed)
+    store(_upright(force), s.level)
+    store(s.level, s.start_turn)  # in level axes: those of a sensor upside down would turn with every reading
 
 
-@compiled
+@for_kernels
 def _begin(s: Any, step: Any) -> None:
     """Set up from the mean force since the start."""
     turn = quaternion(s.start_turn)
-    s.start_force += np.array(rotate(turn, three(step.force)))
+    part = rotate(turn, three(step.force))
+    for i in range(3):
+        s.start_force[i] += part[i]
     turn = product(turn, quaternion(step.turn))
-    s.start_turn[:] = turn
+    store(turn, s.start_turn)
     s.start_s += step.duration_s
-    s.level[:] = product(_upright(s.start_force), turn)
-    s.speed[:] = 0.0
+    store(product(_upright(s.start_force), turn), s.level)
+    store(_NONE, s.speed)
     s.starting = s.start_s < (_START_S if s.still_s > 0.5 * _START_S else _MOVING_START_S)
 
 
-@compiled
+@for_kernels
 def _rest(s: Any, step: Any) -> None:
     """Note whether the sensor rests."""
-    force = step.force / step.duration_s
+    x, y, z = three(step.force)
+    force = x / step.duration_s, y / step.duration_s, z / step.duration_s
     if not s.rest_known:
-        s.rest_rate[:], s.rest_force[:], s.rest_known = step.rate, force, True
-    rate_off, force_off = step.rate - s.rest_rate, force - s.rest_force
+        store(step.rate, s.rest_rate)
+        store(force, s.rest_force)
+        s.rest_known = True
+    rate_off, force_off = difference(step.rate, s.rest_rate), difference(force, s.rest_force)
     share = step.duration_s / (_REST_MEMORY_S + step.duration_s)
-    s.rest_rate[:] = s.rest_rate + share * rate_off
-    s.rest_force[:] = s.rest_force + share * force_off
+    for i in range(3):
+        s.rest_rate[i] += share * rate_off[i]
+        s.rest_force[i] += share * force_off[i]
     bias_sd = math.sqrt(max(s.p[3, 3], s.p[4, 4], s.p[5, 5], 0.0))
     still = (
         norm(rate_off) < _STILL_RAD_S
         and norm(force_off) < _STILL_M_S2
-        and norm(s.rest_rate - s.bias) < _STILL_BIAS_RAD_S + 3.0 * bias_sd
+        and norm(difference(s.rest_rate, s.bias)) < _STILL_BIAS_RAD_S + 3.0 * bias_sd
     )
     s.still_s = s.still_s + step.duration_s if still else 0.0
     s.resting = s.still_s > _STILL_S
 
 
-@compiled
+@for_kernels
 def _predict(s: Any, step: Any, f: FloatArray) -> None:
     """Predict over one increment; fill its transition."""
     _rest(s, step)
     level, duration = quaternion(s.level), step.duration_s
-    f[:] = np.eye(SIZE)
     span = 0.0 if s.resting else duration
     for j in range(3):
-        x, y, z = rotate(level, three(_AXES[j]))
+        x, y, z = rotate(level, AXES[j])
         u, v, w = three(s.speed)
         f[0, BIAS + j], f[1, BIAS + j], f[2, BIAS + j] = -span * x, -span * y, -span * z
         f[SPEED, BIAS + j], f[SPEED + 1, BIAS + j] = span * (y * w - z * v), span * (z * u - x * w)
         f[SPEED + 2, BIAS + j] = span * (x * v - y * u)
     f[6, 1], f[7, 0] = GRAVITY_M_S2 * duration, -GRAVITY_M_S2 * duration
     shock = max(norm(step.force) - _SHOCK_M_S2 * duration, 0.0)  # a knock, whose reading may be cut off
-    noise = _GYRO_NOISE_RAD_SQRT_S**2 + (s.scale_noise_sqrt_s * norm(step.rate - s.bias)) ** 2
+    noise = _GYRO_NOISE_RAD_SQRT_S**2 + (s.scale_noise_sqrt_s * norm(difference(step.rate, s.bias))) ** 2
     if s.resting:
         noise = (_REST_NOISE * _GYRO_NOISE_RAD_SQRT_S) ** 2
-    step.noise[:3] = noise * duration + step.lost_rad2
-    step.noise[3:6] = _BIAS_WALK_RAD_S_SQRT_S**2 * duration
-    step.noise[6:] = _FORCE_NOISE_M_S_SQRT_S**2 * duration + shock**2
-    s.p[:] = transported(f, s.p)
+    for i in range(3):
+        step.noise[i] = noise * duration + step.lost_rad2
+        step.noise[BIAS + i] = _BIAS_WALK_RAD_S_SQRT_S**2 * duration
+        step.noise[SPEED + i] = _FORCE_NOISE_M_S_SQRT_S**2 * duration + shock**2
+    copy_into(s.p, times_transpose(f, times_transpose(f, s.p)))
+    part = rotate(level, three(step.force))
     for i in range(SIZE):
         s.p[i, i] += step.noise[i]
-    s.speed += np.array(rotate(level, three(step.force)))
+    for i in range(3):
+        s.speed[i] += part[i]
     s.speed[2] -= GRAVITY_M_S2 * duration
     if not s.resting:
-        s.level[:] = product(level, quaternion(step.turn))
-    step.predicted[:], step.predicted_speed[:] = s.level, s.speed
+        store(product(level, quaternion(step.turn)), s.level)
+    store(s.level, step.predicted)
+    store(s.speed, step.predicted_speed)
 
 
-@compiled
-def _correct_by_speed(s: Any, step: Any) -> None:
-    """Correct by a velocity of zero, whose error is a hand's, or smaller at rest, and persists.
+_NONE, _NO_TURN = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)
 
-    A velocity tells nothing of turning about up: its own direction turns as likely. So neither heading nor
-    the bias about up is corrected by it, and their errors count as noise (Schmidt).
+
+@for_kernels
+def _correct(s: Any, step: Any, first: int) -> None:
+    """Correct by a velocity of zero, or a resting sensor's bias by its rate.
+
+    A velocity's error is a hand's, or smaller at rest, and persists. It tells nothing of turning about up:
+    its own direction turns as likely. So the bias about up is not corrected by it, nor the heading by either,
+    which is found elsewhere; their errors count as noise (Schmidt).
     """
-    speed, time_s = (_REST_SPEED_M_S, _REST_TIME_S) if s.resting else (SPEED_M_S, _SPEED_TIME_S)
-    up = np.array(rotate(invert(quaternion(s.level)), (0.0, 0.0, 1.0)))
-    gain = _correct(s.p, SPEED, 2.0 * speed**2 * time_s / step.duration_s, up)
-    _inject(s, gain, -s.speed)
-
-
-_LEVEL, _AXES, _NO_TURN = np.zeros(3), np.eye(3), np.array([0.0, 0.0, 0.0, 1.0])
-
-
-@compiled
-def _correct(p: FloatArray, first: int, variance: float, up: FloatArray) -> FloatArray:
-    """Correct a covariance by an observation of three states; return the gain, shape (9, 3).
-
-    The heading is found elsewhere, and corrected by nothing; nor is the bias about `up`.
-    """
-    cross = p[:, first : first + 3].copy()
-    total = cross[first : first + 3].copy()
-    for i in range(3):
-        total[i, i] += variance
-    gain = matrix_product(cross, inverse(total)[0])
-    gain[2] = 0.0
+    if first == SPEED:
+        speed, time_s = (_REST_SPEED_M_S, _REST_TIME_S) if s.resting else (SPEED_M_S, _SPEED_TIME_S)
+        variance, off = 2.0 * speed**2 * time_s / step.duration_s, difference(_NONE, s.speed)
+        up = rotate(invert(quaternion(s.level)), AXES[2])
+    else:
+        variance, off = _REST_BIAS_RAD**2 / step.duration_s, difference(step.rate, s.bias)
+        up = _NONE
+    cross, error = np.empty((SIZE, 3)), np.zeros(SIZE)
+    for i in range(SIZE):
+        for j in range(3):
+            cross[i, j] = s.p[i, first + j]
+    gain = times_transpose(cross, inverse(cross[first : first + 3], variance)[0])
     for j in range(3):
+        gain[2, j] = 0.0
         about_up = up[0] * gain[3, j] + up[1] * gain[4, j] + up[2] * gain[5, j]
         for i in range(3):
-            gain[3 + i, j] -= about_up * up[i]
-    subtract_product(p, gain, cross)
-    subtract_product(p, p[:, first : first + 3] - variance * gain, gain)
-    return gain
-
-
-@compiled
-def _inject(s: Any, gain: FloatArray, off: FloatArray) -> None:
-    """Apply the estimated error to the state."""
-    error = np.zeros(SIZE)
+            gain[BIAS + i, j] -= about_up * up[i]
+    subtract_product(s.p, gain, cross)
+    for i in range(SIZE):
+        for j in range(3):
+            cross[i, j] = s.p[i, first + j] - variance * gain[i, j]
+    subtract_product(s.p, cross, gain)
     add_product(error, gain, off)
     turn = quaternion_of(error[0], error[1], error[2])
-    s.level[:] = product(turn, quaternion(s.level))
-    s.speed[:] = rotate(turn, three(s.speed))
-    s.speed[:] = s.speed + error[SPEED:]
-    s.bias[:] = s.bias + error[BIAS:SPEED]
+    store(product(turn, quaternion(s.level)), s.level)
+    store(rotate(turn, three(s.speed)), s.speed)
+    for i in range(3):
+        s.bias[i] += error[BIAS + i]
+        s.speed[i] += error[SPEED + i]

@@ -1,32 +1,52 @@
 """Unit quaternions, scalar last, as tuples, and a small inverse, for kernels."""
 
 import math
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numba import njit
+from numba.extending import register_jitable
 
 from speckle3d.core.arrays import FloatArray
 
 compiled = njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+for_kernels = register_jitable(fastmath=False, error_model="numpy")
 
 Quaternion: TypeAlias = tuple[float, float, float, float]
 Vector: TypeAlias = tuple[float, float, float]
 
+AXES = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
 
-@compiled
+
+@for_kernels
 def three(v: FloatArray) -> Vector:
     """The vector in an array."""
     return v[0], v[1], v[2]
 
 
-@compiled
-def norm(v: FloatArray) -> float:
-    """Length of the vector in an array."""
+@for_kernels
+def difference(v: Any, w: Any) -> Vector:
+    """The vector `v` less `w`, arrays or tuples."""
+    return v[0] - w[0], v[1] - w[1], v[2] - w[2]
+
+
+@for_kernels
+def norm(v: Any) -> float:
+    """Length of the vector in an array or a tuple."""
     return math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
 
 
-@compiled
+@for_kernels
+def store(values: Any, out: FloatArray) -> None:
+    """Copy numbers, an array or a tuple, to an array.
+
+    ``out[:] = values`` does the same, and compiles for seconds, for numba's words about its shape.
+    """
+    for i in range(len(values)):
+        out[i] = values[i]
+
+
+@for_kernels
 def quaternion(q: FloatArray) -> Quaternion:
     """The quaternion in an array, of unit length."""
     x, y, z, w = q[0], q[1], q[2], q[3]
@@ -34,7 +54,7 @@ def quaternion(q: FloatArray) -> Quaternion:
     return x / norm, y / norm, z / norm, w / norm
 
 
-@compiled
+@for_kernels
 def quaternion_of(x: float, y: float, z: float) -> Quaternion:
     """Quaternion of a rotation vector, rad."""
     square = x * x + y * y + z * z
@@ -43,14 +63,14 @@ def quaternion_of(x: float, y: float, z: float) -> Quaternion:
     return s * x, s * y, s * z, math.cos(0.5 * angle)
 
 
-@compiled
+@for_kernels
 def turn_by(rate: FloatArray, bias: FloatArray, span_s: float) -> Quaternion:
     """Turn by a reading of the gyroscope over some time."""
-    x, y, z = rate[0] - bias[0], rate[1] - bias[1], rate[2] - bias[2]
+    x, y, z = difference(rate, bias)
     return quaternion_of(x * span_s, y * span_s, z * span_s)
 
 
-@compiled
+@for_kernels
 def vector_of(q: Quaternion) -> Vector:
     """Rotation vector, rad, of a unit quaternion; the shorter one."""
     x, y, z, w = q
@@ -60,7 +80,7 @@ def vector_of(q: Quaternion) -> Vector:
     return s * x, s * y, s * z
 
 
-@compiled
+@for_kernels
 def product(p: Quaternion, q: Quaternion) -> Quaternion:
     """Quaternion of the rotation by `q`, then by `p`."""
     px, py, pz, pw = p
@@ -73,13 +93,13 @@ def product(p: Quaternion, q: Quaternion) -> Quaternion:
     )
 
 
-@compiled
+@for_kernels
 def invert(q: Quaternion) -> Quaternion:
     """Quaternion of the rotation back."""
     return -q[0], -q[1], -q[2], q[3]
 
 
-@compiled
+@for_kernels
 def rotate(q: Quaternion, v: Vector) -> Vector:
     """A vector turned by a unit quaternion."""
     x, y, z, w = q
@@ -89,59 +109,60 @@ def rotate(q: Quaternion, v: Vector) -> Vector:
     return v[0] + w * a + y * c - z * b, v[1] + w * b + z * a - x * c, v[2] + w * c + x * b - y * a
 
 
-@compiled
-def transported(f: FloatArray, p: FloatArray) -> FloatArray:
-    """Covariance `p` after a transition `f`, ``f @ p @ f.T``; most entries of `f` are zero."""
-    n = p.shape[0]
-    half, out = np.zeros((n, n)), np.zeros((n, n))
-    for i in range(n):
-        for j in range(n):
-            if f[i, j] != 0.0:
-                for k in range(n):
-                    half[k, i] += p[k, j] * f[i, j]
-    for i in range(n):
-        for j in range(n):
-            if f[i, j] != 0.0:
-                for k in range(n):
-                    out[i, k] += f[i, j] * half[j, k]
-    return out
-
-
-@compiled
-def matrix_product(a: FloatArray, b: FloatArray) -> FloatArray:
-    """``a @ b`` by loops: of small matrices, faster than a call of BLAS."""
-    out = np.zeros((a.shape[0], b.shape[1]))
+@for_kernels
+def times_transpose(a: FloatArray, b: FloatArray) -> FloatArray:
+    """``a @ b.T`` by loops: of small matrices, faster than a call of BLAS; zeros of `a` are skipped."""
+    out = np.zeros((a.shape[0], b.shape[0]))
     for i in range(a.shape[0]):
         for k in range(a.shape[1]):
-            for j in range(b.shape[1]):
-                out[i, j] += a[i, k] * b[k, j]
+            if a[i, k] != 0.0:
+                for j in range(b.shape[0]):
+                    out[i, j] += a[i, k] * b[j, k]
     return out
 
 
-@compiled
-def add_product(x: FloatArray, a: FloatArray, b: FloatArray) -> None:
+@for_kernels
+def add_product(x: FloatArray, a: FloatArray, b: Any) -> None:
     """Add ``a @ b`` to the vector `x`."""
     for i in range(a.shape[0]):
         for k in range(a.shape[1]):
             x[i] += a[i, k] * b[k]
 
 
-@compiled
+@for_kernels
+def squared_norm(v: FloatArray, weight: FloatArray) -> float:
+    """Squared length of a vector, weighted by a matrix, ``v @ weight @ v``."""
+    total = 0.0
+    for i in range(3):
+        for j in range(3):
+            total += v[i] * weight[i, j] * v[j]
+    return total
+
+
+@for_kernels
 def subtract_product(p: FloatArray, a: FloatArray, b: FloatArray) -> None:
-    """Subtract ``a @ b.T`` from `p`; both have three columns."""
+    """Subtract ``a @ b.T`` from `p`."""
     for i in range(p.shape[0]):
         for j in range(p.shape[1]):
-            p[i, j] -= a[i, 0] * b[j, 0] + a[i, 1] * b[j, 1] + a[i, 2] * b[j, 2]
+            for k in range(a.shape[1]):
+                p[i, j] -= a[i, k] * b[j, k]
 
 
-@compiled
-def inverse(m: FloatArray) -> tuple[FloatArray, float]:
-    """Inverse of a symmetric matrix, shape (3, 3), and its determinant."""
-    out = np.empty((3, 3))
-    for i in range(3):
-        j, k = (i + 1) % 3, (i + 2) % 3
-        for n in range(3):
-            o, p = (n + 1) % 3, (n + 2) % 3
-            out[i, n] = m[j, o] * m[k, p] - m[j, p] * m[k, o]
-    determinant = m[0, 0] * out[0, 0] + m[0, 1] * out[0, 1] + m[0, 2] * out[0, 2]
-    return out / determinant, determinant
+@for_kernels
+def inverse(m: FloatArray, variance: float) -> tuple[FloatArray, float]:
+    """Inverse of the covariance `m` and as much white noise, by elimination, and their determinant."""
+    n, determinant, out = m.shape[0], 1.0, m.copy()
+    for i in range(n):
+        out[i, i] += variance
+    for k in range(n):
+        pivot = out[k, k]
+        determinant *= pivot
+        out[k, k] = 1.0
+        for j in range(n):
+            out[k, j] /= pivot
+        for i in range(n):
+            if i != k:
+                share, out[i, k] = out[i, k], 0.0
+                for j in range(n):
+                    out[i, j] -= share * out[k, j]
+    return out, determinant

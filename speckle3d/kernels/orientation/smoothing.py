@@ -15,14 +15,17 @@ from speckle3d.kernels.orientation.inclination import BIAS, SIZE, SPEED
 from speckle3d.kernels.orientation.rotations import (
     add_product,
     compiled,
+    difference,
+    inverse,
     invert,
-    matrix_product,
     product,
     quaternion,
     quaternion_of,
     rotate,
+    store,
+    subtract_product,
     three,
-    transported,
+    times_transpose,
     turn_by,
     vector_of,
 )
@@ -33,7 +36,7 @@ def turn_about_up(angles_rad: FloatArray, xyzw: FloatArray) -> FloatArray:
     """Quaternions, shape (m, 4), turned about up."""
     out = np.empty_like(xyzw)
     for k in range(xyzw.shape[0]):
-        out[k] = product(quaternion_of(0.0, 0.0, angles_rad[k]), quaternion(xyzw[k]))
+        store(product(quaternion_of(0.0, 0.0, angles_rad[k]), quaternion(xyzw[k])), out[k])
     return out
 
 
@@ -42,7 +45,7 @@ def rotate_rows(xyzw: FloatArray, vectors: FloatArray) -> FloatArray:
     """Vectors, shape (m, 3), each turned by a quaternion."""
     out = np.empty_like(vectors)
     for k in range(vectors.shape[0]):
-        out[k] = rotate(quaternion(xyzw[k]), three(vectors[k]))
+        store(rotate(quaternion(xyzw[k]), three(vectors[k])), out[k])
     return out
 
 
@@ -68,33 +71,39 @@ def smooth_steps(
         Filled, at the start of the stretch and at the end of each step.
     """
     n = steps.shape[0]
-    levels[n], biases[n] = steps[n - 1].level, steps[n - 1].bias
-    speed, off = steps[n - 1].speed.copy(), np.empty(SIZE)
+    store(steps[n - 1].level, levels[n])
+    store(steps[n - 1].bias, biases[n])
+    speed, off = np.empty(3), np.empty(SIZE)
+    store(steps[n - 1].speed, speed)
     for k in range(n - 2, first - 1, -1):
         step, after, f, p = steps[k], steps[k + 1], transition[k + 1], covariance[k]
-        forecast = transported(f, p)
+        forecast = times_transpose(f, times_transpose(f, p))
         for i in range(SIZE):
             forecast[i, i] += after.noise[i]
-        gain: Any = np.linalg.solve(forecast, matrix_product(f, p)).T
-        covariance[k] = p + transported(gain, covariance[k + 1] - forecast)
+        gain = times_transpose(times_transpose(p, f), inverse(forecast, 0.0)[0])
+        for i in range(SIZE):
+            for j in range(SIZE):
+                forecast[i, j] -= covariance[k + 1, i, j]
+        subtract_product(p, times_transpose(gain, forecast), gain)
         turn = product(quaternion(levels[k + 2]), invert(quaternion(after.predicted)))
-        off[:3] = vector_of(turn)
-        off[3:6] = biases[k + 2] - step.bias
-        off[6:] = speed
-        off[6:] -= np.array(rotate(turn, three(after.predicted_speed)))
+        store(vector_of(turn), off)
+        store(difference(biases[k + 2], step.bias), off[BIAS:])
+        store(difference(speed, rotate(turn, three(after.predicted_speed))), off[SPEED:])
         error = np.zeros(SIZE)
         add_product(error, gain, off)
         turn = quaternion_of(error[0], error[1], error[2])
-        levels[k + 1] = product(turn, quaternion(step.level))
-        biases[k + 1] = step.bias + error[BIAS:SPEED]
-        speed[:] = rotate(turn, three(step.speed))
-        speed += error[SPEED:]
+        store(product(turn, quaternion(step.level)), levels[k + 1])
+        store(rotate(turn, three(step.speed)), speed)
+        for i in range(3):
+            speed[i] += error[SPEED + i]
+            biases[k + 1, i] = step.bias[i] + error[BIAS + i]
     for k in range(first, -1, -1):
         step = steps[k]
-        biases[k], levels[k] = biases[k + 1], levels[k + 1]
+        store(biases[k + 1], biases[k])
+        store(levels[k + 1], levels[k])
         if not step.resting:
             turn = product(quaternion(step.turn), turn_by(step.start_bias, biases[k], step.duration_s))
-            levels[k] = product(quaternion(levels[k + 1]), invert(turn))
+            store(product(quaternion(levels[k + 1]), invert(turn)), levels[k])
 
 
 @compiled
@@ -120,15 +129,16 @@ def orient_samples(
     """
     first = 0
     for n in range(steps.shape[0]):
-        q, span_s, last = quaternion(nodes[n]), 0.0, steps[n].last
+        q, whole_s, span_s, last = quaternion(nodes[n]), 0.0, 0.0, steps[n].last
         for k in range(first, last):
             if not steps[n].resting:
                 q = product(q, turn_by(rate_rad_s[k], biases[n], step_s[k]))
-            xyzw[k] = q
+            store(q, xyzw[k])
+            whole_s += step_s[k]
         x, y, z = vector_of(product(quaternion(nodes[n + 1]), invert(q)))
-        whole_s = step_s[first:last].sum()
         for k in range(first, last):
             span_s += step_s[k]
             share = span_s / whole_s
-            xyzw[k] = product(quaternion_of(share * x, share * y, share * z), quaternion(xyzw[k]))
+            turn = quaternion_of(share * x, share * y, share * z)
+            store(product(turn, quaternion(xyzw[k])), xyzw[k])
         first = last

@@ -5,7 +5,15 @@ import math
 import numpy as np
 
 from speckle3d.core.arrays import FloatArray
-from speckle3d.kernels.orientation.rotations import compiled, product, quaternion, quaternion_of, rotate
+from speckle3d.kernels.orientation.rotations import (
+    AXES,
+    compiled,
+    product,
+    quaternion_of,
+    rotate,
+    store,
+    three,
+)
 
 
 @compiled
@@ -39,7 +47,7 @@ def window_sums(
         q = (0.0, 0.0, 0.0, 1.0)
         for k in range(n * width, (n + 1) * width):
             for d in range(directions.shape[0]):
-                x, y, z = directions[d, k]
+                x, y, z = three(directions[d, k])
                 length = math.sqrt(x * x + y * y + z * z)
                 if length > 0.0 and math.isfinite(length):
                     turned = rotate(q, (x, y, z))
@@ -47,12 +55,11 @@ def window_sums(
                         sums[d, n, i] += turned[i]
                     sums[d, n, 3] += length
                     sums[d, n, 4] += 1.0
-            for j, axis in enumerate(((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))):
+            for j, axis in enumerate(AXES):
                 turned = rotate(q, axis)
                 for i in range(3):
                     carried[n, i, j] += turned[i] / width
             dt = step_s[k]
             q = product(q, quaternion_of(dt * rate_rad_s[k, 0], dt * rate_rad_s[k, 1], dt * rate_rad_s[k, 2]))
-        turns[n] = q
-        turns[n] = quaternion(turns[n])
+        store(q, turns[n])
     return turns, carried, sums
