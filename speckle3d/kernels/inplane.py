@@ -11,6 +11,7 @@ from speckle3d.core.leastsquares import MAD_TO_SIGMA
 from speckle3d.core.poses import HELD
 from speckle3d.kernels.copying import copy_into
 from speckle3d.kernels.correlation import LAGS, cohere_patch, common_window, correlate_patch, phase_ramp
+from speckle3d.kernels.elimination import invert_matrix
 
 LEAST_CORRELATION = 0.05
 """Below this at any lag, the logarithm is mostly noise; the parabola is then put through the coefficient."""
@@ -169,25 +170,6 @@ def _ramp(geometry: Geometry, field: FloatArray, p: int, across: float) -> tuple
 
 
 @register_jitable(fastmath=False, error_model="numpy")
-def _invert(matrix: FloatArray) -> float:
-    """Invert a symmetric, positive definite matrix in place; returns its determinant."""
-    determinant, size = 1.0, matrix.shape[0]
-    for k in range(size):
-        pivot = matrix[k, k]
-        determinant *= pivot
-        matrix[k, k] = 1.0
-        for j in range(size):
-            matrix[k, j] /= pivot
-        for i in range(size):
-            factor = matrix[i, k]
-            if i != k:
-                matrix[i, k] = 0.0
-                for j in range(size):
-                    matrix[i, j] -= factor * matrix[k, j]
-    return determinant
-
-
-@register_jitable(fastmath=False, error_model="numpy")
 def _median(values: FloatArray) -> float:
     """Median by Hoare's selection, which changes the order of `values`."""
     low, high, middle = 0, values.size - 1, values.size // 2
@@ -250,7 +232,7 @@ def _fit(
                     normal[k, j] += weight[p] * term * geometry.design[p, j]
             n += 1
     limit = _COLLINEAR * normal[0, 0] * normal[1, 1] * normal[2, 2]
-    determined = _invert(normal) > limit
+    determined = invert_matrix(normal) > limit
     scale, before, size = np.ones(2), np.ones(2), np.empty((2, count))
     for i in range(2 if few else 0):
         mean, spread, whole = 0.0, 0.0, 0.0
@@ -274,7 +256,7 @@ def _fit(
                     right[k] += term * data[i, n]
                     for j in range(6):
                         inverse[k, j] += term * terms[i, n, j]
-        _invert(inverse)
+        invert_matrix(inverse)
         for k in range(6):
             solution[k] = 0.0
             for j in range(6):

@@ -8,6 +8,7 @@ from numba import njit
 from numba.extending import register_jitable
 
 from speckle3d.core.arrays import FloatArray
+from speckle3d.kernels.elimination import invert_matrix
 
 compiled = njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
 for_kernels = register_jitable(fastmath=False, error_model="numpy")
@@ -150,19 +151,9 @@ def subtract_product(p: FloatArray, a: FloatArray, b: FloatArray) -> None:
 
 @for_kernels
 def inverse(m: FloatArray, variance: float) -> tuple[FloatArray, float]:
-    """Inverse of the covariance `m` and as much white noise, by elimination, and their determinant."""
-    n, determinant, out = m.shape[0], 1.0, m.copy()
-    for i in range(n):
+    """Inverse of the covariance `m` and as much white noise, and their determinant."""
+    out = m.copy()
+    for i in range(m.shape[0]):
         out[i, i] += variance
-    for k in range(n):
-        pivot = out[k, k]
-        determinant *= pivot
-        out[k, k] = 1.0
-        for j in range(n):
-            out[k, j] /= pivot
-        for i in range(n):
-            if i != k:
-                share, out[i, k] = out[i, k], 0.0
-                for j in range(n):
-                    out[i, j] -= share * out[k, j]
+    determinant = invert_matrix(out)
     return out, determinant
