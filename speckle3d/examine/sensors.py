@@ -5,18 +5,16 @@ What images and sensors say differently is in `speckle3d.examine.disagreements`:
 
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import numpy as np
 from scipy.ndimage import median_filter
 from scipy.spatial.transform import RigidTransform, Rotation
-from scipy.stats import median_abs_deviation
 
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import DECISIVE, Doubt, MismatchError
 from speckle3d.core.geometry import nearest_rotation, rigid
-from speckle3d.core.leastsquares import robust_sigma
+from speckle3d.core.leastsquares import MAD_TO_SIGMA, robust_sigma
 from speckle3d.core.sweep import OrientationSensor, Sweep, Tracker
 
 REFUTED = 2.0
@@ -179,8 +177,10 @@ def conventions(turned: Rotation) -> Iterator[tuple[str, Rotation]]:
         yield f"handedness: {axis} mirrored", Rotation.from_matrix(flip @ turned.as_matrix() @ flip)
 
 
-_spread = partial(median_abs_deviation, scale="normal")
-"""Robust standard deviation by column."""
+def _spread(values: FloatArray) -> FloatArray:
+    """Robust standard deviation by column."""
+    away = np.abs(values - np.median(values, axis=0))
+    return np.asarray(MAD_TO_SIGMA * np.median(away, axis=0))
 
 
 def doubts_of_gyroscope(sensor: OrientationSensor, jitter_rad: float) -> Iterator[Doubt]:

@@ -1,19 +1,18 @@
 """Adapt curves to a sweep's tissue and a scanner's processing, with the remaining errors.
 
-Averaging of frames (persistence) widens the beam by what the probe goes meanwhile, so that lengths come out
-short. Where speckle has changed from one frame to the next, their mean varies less in grey: frames taken at
+Averaging of frames (persistence) widens the beam by how far the probe goes meanwhile: lengths come out short.
+Where speckle has changed from one frame to the next, their mean varies less in grey: frames taken at
 speed are flatter than those taken slowly, which nothing else makes of them. To first order the beam is
 widened by twice the logarithm of what the grey levels' spread loses.
 
 Filters leave structure and take speckle away. Decibels of speckle have a long tail of dark ones, filtered
-they are even about their median; where bright ones have the long tail, it is structure that is seen.
+they are even about their median; where bright ones have it, structure is seen.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import ttest_1samp
 
 from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.core.sweep import BModeSettings, RFSettings
@@ -107,7 +106,7 @@ def grey_error(signal: RFSettings | BModeSettings, texture: Texture) -> float:
 def averaging_loss(table: CorrelationTable, features: Sequence[FrameFeatures]) -> float:
     """Share of the length that is lost to averaging of frames; 0 if there is none to be seen.
 
-    Each patch tells its own slope of spread over loss; that they scatter is the error of their mean.
+    Each patch tells its own slope of spread over loss; their scatter is the error of the mean.
     """
     last = table.second - table.first == 1
     spread = np.array([frame.grey_spread for frame in features])[table.second[last]]
@@ -115,6 +114,8 @@ def averaging_loss(table: CorrelationTable, features: Sequence[FrameFeatures]) -
     lost = 1.0 - table.median[last]
     if lost.size < LEAST_PAIRS or not usable.any():
         return 0.0
+    from scipy.stats import ttest_1samp  # half a second, which RF has no need of
+
     faster = lost - lost.mean()
     slopes = faster @ spread[:, usable] / max(float(faster @ faster), 1e-12)
     if not ttest_1samp(slopes, SINGLE_SLOPE, alternative="less").pvalue <= LEVEL:

@@ -21,9 +21,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import median_filter, uniform_filter1d
-from scipy.signal import find_peaks
 from scipy.spatial.transform import RigidTransform
-from scipy.stats import theilslopes
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError, MismatchError
@@ -144,10 +142,20 @@ def monotone_parts(length_mm: npt.ArrayLike) -> list[Part]:
     length = np.asarray(length_mm, dtype=float)
     width = min(JITTER_FRAMES, length.size)
     smooth = uniform_filter1d(median_filter(length, width, mode="nearest"), width, mode="nearest")
-    turns = [find_peaks(sign * smooth, prominence=HYSTERESIS_MM)[0] for sign in (1, -1)]
-    edges = [0, *sorted(np.concatenate(turns).tolist()), length.size - 1]
+    edges = [0, *_turns(smooth), length.size - 1]
     names = [("f", "r")[i % 2] + (str(i // 2 + 1) if i > 1 else "") for i in range(len(edges) - 1)]
     return [Part(name, a, b) for name, a, b in zip(names, edges[:-1], edges[1:], strict=True)]
+
+
+def _turns(length: FloatArray) -> list[int]:
+    """Frames where a length without jitter turns by `HYSTERESIS_MM` and more."""
+    ways = length, -length
+    if any(np.max(np.maximum.accumulate(way) - way) < HYSTERESIS_MM for way in ways):
+        return []  # it goes one way, as most do: the package that finds peaks takes half a second to load
+    from scipy.signal import find_peaks
+
+    peaks = [find_peaks(way, prominence=HYSTERESIS_MM)[0] for way in ways]
+    return sorted(np.concatenate(peaks).tolist())
 
 
 def compare_modes(
@@ -265,7 +273,8 @@ def read_end(values: FloatArray, end_frames: int = END_FRAMES) -> float:
     end = values[-_width(values.size, end_frames) :]
     if end.size < 3:
         return float(end[-1])
-    slope = float(theilslopes(end)[0])
+    first, last = np.triu_indices(end.size, 1)
+    slope = np.median((end[last] - end[first]) / (last - first))
     return float(np.median(end - slope * np.arange(1 - end.size, 1)))
 
 

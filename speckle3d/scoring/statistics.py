@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy import stats
 
 FEWEST = 3
 """Sweeps that an interval needs: below, a bootstrap only repeats the values themselves."""
@@ -30,6 +29,8 @@ def mean_interval(values: npt.ArrayLike) -> dict[str, Any]:
     """
     sample, low, high = np.asarray(values, dtype=float), None, None
     if sample.size >= FEWEST and np.ptp(sample) > 0:
+        from scipy import stats  # half a second, which one sweep has no need of
+
         bootstrap = stats.bootstrap((sample,), np.mean, method="percentile", rng=_SEED)
         low, high = map(float, bootstrap.confidence_interval)
     return {"sweeps": sample.size, "mean": float(sample.mean()), "low": low, "high": high}
@@ -42,8 +43,11 @@ def signed_rank_p(differences: npt.ArrayLike) -> float | None:
     never reach 0.05.
     """
     sample = np.asarray(differences, dtype=float)
-    enough = sample.size >= FEWEST and np.ptp(sample) > 0
-    return float(stats.wilcoxon(sample).pvalue) if enough else None
+    if sample.size < FEWEST or not np.ptp(sample) > 0:
+        return None
+    from scipy import stats
+
+    return float(stats.wilcoxon(sample).pvalue)
 
 
 def holm(p_values: Sequence[float | None]) -> list[float | None]:

@@ -4,7 +4,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy import signal as filters
 
 from speckle3d.core.arrays import AnyArray
 from speckle3d.core.errors import InvalidInputError
@@ -58,6 +57,8 @@ class ReceivedFrames:
 
     def __getitem__(self, index: int) -> AnyArray:
         """One frame, shape (vector, sample)."""
+        from scipy import signal as filters  # RF has no need of it, and it takes half a second
+
         echoes = filters.hilbert(self.frames[index], axis=1)
         baseband = echoes * np.exp(-2j * np.pi * self.cycles_per_sample * np.arange(echoes.shape[1]))
         counts = filters.resample_poly(baseband, 1, self.decimation, axis=1, window=_WINDOW)

@@ -17,7 +17,6 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-import nibabel
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
@@ -220,6 +219,8 @@ def _read_nifti(path: Path) -> tuple[AnyArray, FloatArray, dict[str, str], bool]
 
     The header's unit counts; a header without one means mm.
     """
+    import nibabel
+
     with naming(str(path)), reading(path, Exception):
         image: Any = nibabel.load(path)
         voxels = np.asanyarray(image.dataobj)
@@ -294,6 +295,8 @@ Segment{i}_Layer=0
 
 
 def _write_nifti(path: Path, volume: Volume, fields: Mapping[str, str]) -> None:
+    import nibabel
+
     # NIfTI-1 counts voxels along an axis by two bytes.
     kind: Any = nibabel.Nifti2Image if max(volume.shape) >= 2**15 else nibabel.Nifti1Image
     image = kind(volume.voxels, RAS_FROM_LPS @ volume.world_from_index)
