@@ -18,7 +18,6 @@ from math import ceil
 import numpy as np
 import numpy.typing as npt
 from scipy.interpolate import BSpline, make_interp_spline, make_smoothing_spline
-from scipy.signal import find_peaks
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import BoolArray, FloatArray
@@ -90,6 +89,8 @@ def peak_of(tried_s: FloatArray, misfit: FloatArray, doubt: str) -> int:
             f"expected a delay between {tried_s[0]:g} and {tried_s[-1]:g} s, got the best at the range's "
             "end: the delay may lie outside the range searched: --search-s"
         )
+    from scipy.signal import find_peaks  # half a second, which a known delay has no need of
+
     gain = float(np.median(misfit) - misfit[best])
     good = find_peaks(-misfit, height=-(misfit[best] + _AMBIGUOUS * gain))[0]
     # Not by find_peaks' prominence: the range may end before the misfit rises beyond a rival.
