@@ -6,7 +6,6 @@ from the frequency domain to the coarsest rate that still holds the intensity's 
 I/Q, may have been sampled more coarsely than that, and then the rate rises.
 """
 
-import itertools
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -27,6 +26,11 @@ sampled at: one sweep then has the same patches and lengths as RF and as I/Q. In
 to that width, so twice the width is the least; half as many samples again let a parabola through its
 correlation at neighbouring samples be read between them. Documented accuracies were measured at this rate, a
 third of 66.7 MHz for echoes of 5 to 10 MHz."""
+
+_DEPARTURE_COST = 100.0
+"""Samples are padded by 1 % rather than that the rate departs by 1e-4 from the one above. Over 750 rates of
+20 to 100 MHz and bands it departs by 2e-4 (median), at most 2e-3, for a padding of 3 %, at most 26 %; at a
+cost of 30 by up to 4e-3, for 11 %. Without departure some pad sevenfold, and one in eight has no lengths."""
 
 
 class IntensitySettings(BaseModel):
@@ -154,11 +158,17 @@ def two_way_wavenumber(signal: RFSettings) -> float:
 
 
 def _plan_resampling(signal: RFSettings, samples: int, edge_fraction: float) -> _Resampling:
+    """Fast lengths of both transforms, the first even, and the bins of the band."""
     low, high = signal.bandwidth_hz
     edge = edge_fraction * (high - low)
     padding = int(2 * signal.sampling_rate_hz / edge)
     ratio = signal.sampling_rate_hz / (_RATE_OVER_BAND * (high - low + 2 * edge))
-    length, out_length = _transform_lengths(samples + padding, ratio)
+    least = int(np.ceil((samples + padding) / ratio))
+    out_lengths = map(fft.next_fast_len, range(least, 2 * least))
+    pairs = ((2 * fft.next_fast_len(round(n * ratio / 2)), n) for n in out_lengths)
+    length, out_length = min(
+        pairs, key=lambda pair: pair[1] / least + _DEPARTURE_COST * abs(pair[0] / pair[1] / ratio - 1)
+    )
     frequency = signal.bin_frequency_hz(length)
     weights = band_weights(frequency, low, high, edge)
     bins = np.flatnonzero(weights)
@@ -168,13 +178,6 @@ def _plan_resampling(signal: RFSettings, samples: int, edge_fraction: float) -> 
     # real signal's spectrum.
     scale = (1.0 if signal.are_complex else 2.0) * out_length / length * weights[bins]
     return _Resampling(length, out_length, bins, destination, scale.astype(np.float32))
-
-
-def _transform_lengths(samples: int, ratio: float) -> tuple[int, int]:
-    """First fast lengths of the two transforms, the first even and `ratio` times the second, rounded."""
-    out_lengths = itertools.count(int(np.ceil(samples / ratio)))
-    pairs = ((2 * round(out_length * ratio / 2), out_length) for out_length in out_lengths)
-    return next(pair for pair in pairs if all(n == fft.next_fast_len(n) for n in pair))
 
 
 def band_weights(frequency: FloatArray, low: float, high: float, edge: float) -> FloatArray:

@@ -14,7 +14,7 @@ from speckle3d.matching.intensity import Echo, IntensityExtractor
 
 RF = RFSettings(66.67e6, 1540.0, 7e6, (5e6, 10e6))
 GRID = ImageGrid(6, 1800, 0.3, RF.sample_spacing_mm)
-BANDS = [(RF, 1800), (sweep_examples.RF, 1001), (RFSettings(40e6, 1540.0, 10e6, (3e6, 15e6)), 640)]
+BANDS = [(RF, 1800), (sweep_examples.RF, 1001), (RFSettings(37e6, 1540.0, 7e6, (5e6, 10e6)), 1000)]
 
 
 def extractor(signal, samples):
