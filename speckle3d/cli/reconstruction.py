@@ -98,7 +98,7 @@ def reconstruct(
     modes, calibrations = list[str](dict.fromkeys(drift or ())), calibration or ()
     recording = open_recording(sweep_file)
     sweep = recording.sweep
-    note(*recording.remarks)
+    note(*recording.notes)
     curves_path = curves_file or curves_beside(sweep_file)
     curves = s3.load_curves(curves_path)
     mount(sweep, calibrations)
