@@ -13,7 +13,7 @@ LARGEST_LOSS = 0.3
 """Share of frames that may not be placed; with more, lengths are mostly guesses."""
 
 _WORDS = {
-    FrameFlag.FROZEN: "that repeat the one before",
+    FrameFlag.FROZEN: "the same as the one before",
     FrameFlag.SATURATED: "saturated, poses guessed",
     FrameFlag.LIFTED: "with the probe lifted, poses guessed",
     FrameFlag.NO_SPECKLE: "without speckle, poses guessed",

@@ -28,11 +28,13 @@ def test_without_a_sensor_the_command_says_that_it_assumes_the_sign(run, edit_sw
 
 def test_a_tracker_that_the_images_contradict_leaves_both_lengths(run, edit_sweep, tmp_path):
     def in_metres(file):
+        file["tracker/world_from_sensor"][9, :3, 3] = 1e6
         file["tracker/world_from_sensor"][:, :3, 3] *= 1e-3
 
     out = tmp_path / "o"
     code, table, err = run("reconstruct", edit_sweep(in_metres), "-o", out, "--drift", "pose")
     assert code == 0, err
+    assert "poses: 1 of" in err
     summary = json.loads((out / "summary.json").read_text())["sweeps"][0]
     assert "images and tracker" in {doubt["about"] for doubt in summary["doubts"]}
     assert "metres for millimetres" in table
