@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -143,14 +144,14 @@ def monotone_parts(length_mm: npt.ArrayLike) -> list[Part]:
     width = min(JITTER_FRAMES, length.size)
     smooth = uniform_filter1d(median_filter(length, width, mode="nearest"), width, mode="nearest")
     edges = [0, *_turns(smooth), length.size - 1]
-    names = [("f", "r")[i % 2] + (str(i // 2 + 1) if i > 1 else "") for i in range(len(edges) - 1)]
-    return [Part(name, a, b) for name, a, b in zip(names, edges[:-1], edges[1:], strict=True)]
+    ends = enumerate(pairwise(edges))
+    return [Part("fr"[i % 2] + (str(i // 2 + 1) if i > 1 else ""), *part) for i, part in ends]
 
 
 def _turns(length: FloatArray) -> list[int]:
     """Frames where a length without jitter turns by `HYSTERESIS_MM` and more."""
-    ways = length, -length
-    if any(np.max(np.maximum.accumulate(way) - way) < HYSTERESIS_MM for way in ways):
+    ways = np.stack([length, -length])
+    if (np.maximum.accumulate(ways, axis=1) - ways).max(axis=1).min() < HYSTERESIS_MM:
         return []  # it goes one way, as most do: the package that finds peaks takes half a second to load
     from scipy.signal import find_peaks
 
@@ -164,6 +165,7 @@ def compare_modes(
     centre_mm: npt.ArrayLike,
     covered: npt.ArrayLike | None = None,
     end_frames: int = END_FRAMES,
+    jitter_mm: float | None = None,
 ) -> list[ModeError]:
     """Errors of length, tilt, yaw and roll of every mode in every monotone part.
 
@@ -181,6 +183,9 @@ def compare_modes(
         Which frames have a reference; the others are left out of every sum.
     end_frames : int
         Most frames of the line at each end of a part; 1 for an exact reference.
+    jitter_mm : float, optional
+        Of the tracker, along the sweep, as if each frame had a reading of its own; by default from the
+        frames, which have one if the tracker is as fast.
 
     Returns
     -------
@@ -223,16 +228,17 @@ def compare_modes(
     estimates = {mode: sum_motion(path[mask], centre_mm) for mode, path in poses.items()}
     rows = []
     for part in monotone_parts(true.length_mm):
-        frames, (exact, reference_sigma_mm) = part.last - part.first + 1, _changes(true, part, end_frames)
+        exact, reference_sigma_mm = _changes(true, part, end_frames, jitter_mm)
         reference_mm, sign = abs(exact[0]), -1.0 if exact[0] < 0 else 1.0
         for mode, estimate in estimates.items():
-            changes, sigma_mm = _changes(estimate, part, END_FRAMES if mode == TRACKER else end_frames)
+            most = END_FRAMES if mode == TRACKER else end_frames
+            changes, sigma_mm = _changes(estimate, part, most, jitter_mm)
             error_mm = sign * (changes[0] - exact[0])
             percent = 100.0 * error_mm / reference_mm if reference_mm else np.nan
             turns = np.rad2deg(np.subtract(changes[1:], exact[1:])).tolist()
             jitter_sigma_mm = sigma_mm if mode == TRACKER else np.nan
             errors = reference_mm + error_mm, error_mm, percent, *turns, reference_sigma_mm, jitter_sigma_mm
-            rows.append(ModeError(part.name, mode, frames, reference_mm, *errors))
+            rows.append(ModeError(part.name, mode, part.last - part.first + 1, reference_mm, *errors))
     return rows
 
 
@@ -278,7 +284,7 @@ def read_end(values: FloatArray, end_frames: int = END_FRAMES) -> float:
     return float(np.median(end - slope * np.arange(1 - end.size, 1)))
 
 
-def jitter_mm(length_mm: FloatArray) -> float:
+def jitter_of(length_mm: FloatArray) -> float:
     """Standard deviation of a tracker's jitter along the sweep, mm; NaN for fewer than eight readings.
 
     By third differences: a hand is too smooth to have any at 25 frames/s, white noise of
@@ -298,11 +304,14 @@ def _width(size: int, end_frames: int) -> int:
     return max(1, min(end_frames, size // 10))
 
 
-def _changes(motion: MotionSums, part: Part, end_frames: int) -> tuple[list[float], float]:
+def _changes(
+    motion: MotionSums, part: Part, end_frames: int, jitter_mm: float | None = None
+) -> tuple[list[float], float]:
     """Change of length, tilt, yaw and roll over a part, and the length's deviation by jitter at both ends."""
     inside = [values[part.first : part.last + 1] for values in motion]
     changes = [read_end(values, end_frames) - read_end(values[::-1], end_frames) for values in inside]
     width = _width(inside[0].size, end_frames)
     variance = _LINE_EXCESS * (4 * width - 2) / (width * (width + 1)) if width > 2 else 1.0
-    jitter = 0.0 if end_frames == 1 else jitter_mm(motion.length_mm)
-    return changes, jitter * float(np.sqrt(2.0 * variance))
+    if jitter_mm is None:
+        jitter_mm = jitter_of(motion.length_mm)
+    return changes, jitter_mm * (2.0 * variance) ** 0.5 if end_frames > 1 else 0.0

@@ -157,7 +157,10 @@ def sweep_curves(
 
 
 def error_rows(
-    poses: Mapping[str, RigidTransform], reference: Reference | None, centre_mm: FloatArray
+    poses: Mapping[str, RigidTransform],
+    reference: Reference | None,
+    centre_mm: FloatArray,
+    jitter_mm: float | None = None,
 ) -> list[ModeError]:
     """Errors of every mode by part; lengths alone of the tracker as the reference, and without a reference.
 
@@ -165,6 +168,8 @@ def error_rows(
     ----------
     poses : mapping of str to RigidTransform, length n
         By mode; the reference may be among them.
+    jitter_mm : float, optional
+        As for `compare_modes`.
     """
     estimates = _estimates(poses, reference)
     if reference is None or not estimates:
@@ -175,7 +180,7 @@ def error_rows(
             for mode in poses
         ]
     true = reference.world_from_image
-    rows = compare_modes(estimates, true, centre_mm, reference.covered, reference.end_frames)
+    rows = compare_modes(estimates, true, centre_mm, reference.covered, reference.end_frames, jitter_mm)
     if reference.name == TRACKER:
         for last in {row.part: row for row in rows}.values():
             length, sigma = last.reference_mm, last.reference_sigma_mm

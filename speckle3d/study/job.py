@@ -42,7 +42,7 @@ from speckle3d.io.hdf5 import PathLike
 from speckle3d.io.load import import_record, load_landmarks, load_sweep, recording_sha256
 from speckle3d.motion.sensors import sensed_orientation
 from speckle3d.scoring.displacements import score_row
-from speckle3d.scoring.lengths import TRACKER
+from speckle3d.scoring.lengths import TRACKER, jitter_of, sum_motion
 from speckle3d.scoring.modes import length_claims
 from speckle3d.scoring.references import (
     Reference,
@@ -197,7 +197,7 @@ def run_job(
         doubts = (*tracked.doubts, *differing_lengths(lengths))
         rows = [
             replace(row, sigma_mm=claims[row.mode] * abs(row.estimate_mm)) if row.mode in claims else row
-            for row in error_rows(estimates, reference_poses, centre)
+            for row in error_rows(estimates, reference_poses, centre, _jitter_of_slow_tracker(credible))
         ]
         details = _details_of(tracked, corrections, provenance)
         summary = Summary(
@@ -292,6 +292,23 @@ def _title(summary: Summary) -> str:
     """Name of the sweep and what is in doubt, for figures."""
     suspects = ", ".join(dict.fromkeys(doubt.suspect for doubt in summary.doubts if doubt.suspect))
     return f"{summary.sweep}; in doubt: {suspects}" if suspects else summary.sweep
+
+
+def _jitter_of_slow_tracker(sweep: Sweep) -> float | None:
+    """Jitter of a tracker slower than the images, mm, as if each frame had a reading; None of any other.
+
+    Poses at the frames lie between its readings, on lines that hide most of it.
+    """
+    tracker, times = sweep.tracker, sweep.frame_time_s
+    if tracker is None or tracker.sensor_from_image is None:
+        return None
+    reading_s = tracker.readings.time_s + tracker.time_offset_s
+    during = (reading_s >= times[0]) & (reading_s <= times[-1])
+    if (count := int(during.sum())) >= len(times):
+        return None
+    poses = tracker.readings.world_from_sensor[during] * tracker.sensor_from_image
+    length_mm = sum_motion(poses, sweep.grid.centre_mm).length_mm
+    return float(jitter_of(length_mm) * np.sqrt(len(times) / count))
 
 
 def _drift_rows(

@@ -6,11 +6,7 @@ from drifting import CENTRE_MM, accumulate, drifting_poses, hand_sweep, tracker_
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.geometry import rotation_from_fixed_angles
-from speckle3d.scoring.lengths import (
-    compare_modes,
-    monotone_parts,
-    sum_motion,
-)
+from speckle3d.scoring.lengths import compare_modes, monotone_parts, sum_motion
 
 
 def straight(length_mm, tilt_rad=0.0):
@@ -19,11 +15,6 @@ def straight(length_mm, tilt_rad=0.0):
     shifts = CENTRE_MM + np.outer(np.diff(length_mm), [0.0, 0.0, 1.0])
     moves = RigidTransform.from_components(shifts, rotation_from_fixed_angles(0.0, 0.0, tilts))
     return accumulate(moves * RigidTransform.from_translation(-CENTRE_MM))
-
-
-def there_and_back():
-    ramp = np.linspace(0.0, 10.0, 51)
-    return np.concatenate([ramp, ramp[-2::-1]])
 
 
 def test_parts_of_a_jittery_tracker_are_those_of_the_hand():
@@ -39,7 +30,7 @@ def test_parts_of_a_jittery_tracker_are_those_of_the_hand():
 
 @pytest.mark.parametrize("end_frames", [1, 25])
 def test_a_uniform_stretch_and_tilt_are_exact_in_every_part(end_frames):
-    length = there_and_back()
+    length = 10.0 - np.abs(np.linspace(-10.0, 10.0, 101))
     image = straight(1.15 * length, np.deg2rad(0.02))
     rows = compare_modes({"image": image}, straight(length), CENTRE_MM, end_frames=end_frames)
     assert [(row.part, row.frames) for row in rows] == [("f", 51), ("r", 51)]
@@ -50,21 +41,18 @@ def test_a_uniform_stretch_and_tilt_are_exact_in_every_part(end_frames):
 
 
 def test_a_jittery_tracker_scores_as_the_truth_does_and_says_how_sure_it_is():
-    gaps, raw, ratios = [], [], []
+    gaps, ratios = [], []
     for seed in range(40):
         rng = np.random.default_rng(seed)
         truth = hand_sweep(rng, 200)
         modes, tracker = {"image": drifting_poses(truth, rng)}, tracker_poses(truth, rng, outliers=0.02)
         (exact,) = compare_modes(modes, truth, CENTRE_MM, end_frames=1)
         (rough,) = compare_modes(modes, tracker, CENTRE_MM)
-        (ends,) = compare_modes(modes, tracker, CENTRE_MM, end_frames=1)
         gaps.append(rough.length_error_mm - exact.length_error_mm)
-        raw.append(ends.length_error_mm - exact.length_error_mm)
         ratios.append((rough.reference_mm - exact.reference_mm) / rough.reference_sigma_mm)
-        assert exact.reference_sigma_mm == 0
-    # Measured on 60 seeds: 0.11 mm with lines through a tenth of the sweep, 0.33 mm from the end frames.
+    assert exact.reference_sigma_mm == 0
+    # Measured on 60 seeds: 0.11 mm with lines through a tenth of the sweep.
     assert np.sqrt(np.mean(np.square(gaps))) < 0.15
-    assert np.sqrt(np.mean(np.square(raw))) > 0.2
     # The claim is of jitter alone; an uneven hand bends the lines a little more.
     assert 0.8 < np.sqrt(np.mean(np.square(ratios))) < 1.8
 
