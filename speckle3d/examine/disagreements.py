@@ -66,7 +66,12 @@ def _doubt_sensor(
     by_images, by_sensor = _motion(image, centre), _motion(poses, centre)
     travel = np.abs(by_images[:, 2])
     unit = unit_of_length(image, sensor, poses) if isinstance(sensor, Tracker) else ""
-    noise, slow = jitter(poses, centre), np.zeros_like(covariance)
+    # Poses between readings hide jitter, and a median over frames holds fewer readings than frames then.
+    assert sensor.sensor_from_image is not None
+    readings, frame_s = sensor.readings, sweep.frame_time_s
+    noise = jitter(rigid(readings.world_from_sensor) * rigid(sensor.sensor_from_image), centre)
+    per_reading = max(1.0, float(np.median(np.diff(readings.time_s)) / np.median(np.diff(frame_s))))
+    slow = np.zeros_like(covariance)
     if isinstance(sensor, OrientationSensor):
         slow = orientation_errors(poses, centre, sweep.frame_time_s[frames], errors)
     for axis, name in (2, "length"), (0, "x"), (1, "y"), (5, "roll"), (4, "yaw"):
@@ -75,7 +80,7 @@ def _doubt_sensor(
         image_sigma = np.sqrt(covariance[:, axis, axis])
         least = LEAST_SIGMA_MM if axis < 3 else 0.0
         # Of the difference of two medians.
-        jitter_left = noise[int(axis > 2)] * np.sqrt(np.pi / SMOOTH)
+        jitter_left = noise[int(axis > 2)] * np.sqrt(np.pi * per_reading / SMOOTH)
         sensor_sigma = np.sqrt(jitter_left**2 + least**2 + slow[:, axis, axis])
         size = np.abs(by_images[:, axis] - by_sensor[:, axis]) / np.hypot(image_sigma, sensor_sigma)
         worst = int(np.argmax(travel if axis == 2 else size))
