@@ -295,7 +295,7 @@ def _title(summary: Summary) -> str:
 
 
 def _jitter_of_slow_tracker(sweep: Sweep) -> float | None:
-    """Jitter of a tracker slower than the images, mm, as if each frame had a reading; None of any other.
+    """Jitter of a tracker slower than the images, mm, as if each frame had a reading; None of any other, NaN where unknown.
 
     Poses at the frames lie between its readings, on lines that hide most of it.
     """
@@ -306,6 +306,8 @@ def _jitter_of_slow_tracker(sweep: Sweep) -> float | None:
     during = (reading_s >= times[0]) & (reading_s <= times[-1])
     if (count := int(during.sum())) >= len(times):
         return None
+    if count < 2:
+        return np.nan
     poses = tracker.readings.world_from_sensor[during] * tracker.sensor_from_image
     length_mm = sum_motion(poses, sweep.grid.centre_mm).length_mm
     return float(jitter_of(length_mm) * np.sqrt(len(times) / count))
