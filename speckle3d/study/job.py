@@ -295,9 +295,9 @@ def _title(summary: Summary) -> str:
 
 
 def _jitter_of_slow_tracker(sweep: Sweep) -> float | None:
-    """Jitter of a tracker slower than the images, mm, as if each frame had a reading; None of any other, NaN where unknown.
+    """Jitter, mm, of a tracker slower than the images, as if each frame had a reading; None of any other.
 
-    Poses at the frames lie between its readings, on lines that hide most of it.
+    Poses at the frames lie between its readings, on lines that hide most of it. NaN of too few readings.
     """
     tracker, times = sweep.tracker, sweep.frame_time_s
     if tracker is None or tracker.sensor_from_image is None:
