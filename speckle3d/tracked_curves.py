@@ -103,9 +103,13 @@ def _fit_length(
 
 def jitters(sweep: Sweep) -> bool:
     """Whether positions come from a noisy tracker, not from the truth or a stage."""
-    if sweep.truth is not None or sweep.tracker is None or len(sweep) < 3:
+    tracker = sweep.tracker
+    if sweep.truth is not None or tracker is None or len(tracker.readings.time_s) < 3:
         return False
-    poses = sweep.tracker.world_from_image(sweep.frame_time_s)
+    if tracker.sensor_from_image is None:
+        raise InsufficientDataError(tracker.uncalibrated)
+    # Of its readings: frames lie on lines between those of a slow one.
+    poses = tracker.readings.world_from_sensor * tracker.sensor_from_image
     z = (poses[0].inv() * poses).apply(sweep.grid.centre_mm)[:, 2]
     # Of second differences, which smooth motion hardly has.
     return bool(robust_sigma(z[2:] - 2.0 * z[1:-1] + z[:-2]) > np.sqrt(6.0) * STEADY_MM)

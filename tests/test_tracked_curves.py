@@ -9,17 +9,17 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.core.curves import curve_widths
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.streams import TimedPoses
-from speckle3d.tracked_curves import tracked_curves, tracker_scale
+from speckle3d.tracked_curves import jitters, tracked_curves, tracker_scale
 from speckle3d.tracking import track
 
 
-def shaken(sweep, jitter_mm, seed=3):
+def shaken(sweep, jitter_mm, every=1):
     """The sweep whose tracker alone knows where it is, and that worse."""
     readings = sweep.tracker.readings
     poses = readings.world_from_sensor
-    off = jitter_mm * np.random.default_rng(seed).standard_normal((len(poses), 3))
-    shaken_poses = RigidTransform.from_components(poses.translation + off, poses.rotation)
-    tracker = replace(sweep.tracker, readings=TimedPoses(readings.time_s, shaken_poses))
+    places = poses.translation + jitter_mm * np.random.default_rng(3).standard_normal((len(poses), 3))
+    poses = RigidTransform.from_components(places, poses.rotation)[::every]
+    tracker = replace(sweep.tracker, readings=TimedPoses(readings.time_s[::every], poses))
     return replace(sweep, truth=None, tracker=tracker)
 
 
@@ -32,11 +32,12 @@ def test_the_length_is_the_trackers_and_its_error_grows_with_jitter(sweep, track
     assert 0.005 < scales[0].sigma < scales[1].sigma < 0.03
     with pytest.raises(InsufficientDataError):
         tracker_scale(shaken(sweep, 20.0), tracking)
+    # Slower than the images, and no stage all the same.
+    assert jitters(shaken(sweep, 0.1, every=8))
 
 
 def test_curves_of_few_tracked_frames_claim_what_they_leave_open(sweep, curves):
-    few = shaken(sweep.part(0, 32), 0.1)
-    fit = tracked_curves([few], curves)
+    fit = tracked_curves([shaken(sweep.part(0, 32), 0.1)], curves)
     assert 0.01 < fit.scale_sigma < 0.2
     later = sweep.part(40, 88)
     true = (later.truth[0].inv() * later.truth).apply(later.grid.centre_mm)[:, 2]

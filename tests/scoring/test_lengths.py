@@ -50,7 +50,6 @@ def test_a_jittery_tracker_scores_as_the_truth_does_and_says_how_sure_it_is():
         (rough,) = compare_modes(modes, tracker, CENTRE_MM)
         gaps.append(rough.length_error_mm - exact.length_error_mm)
         ratios.append((rough.reference_mm - exact.reference_mm) / rough.reference_sigma_mm)
-    assert exact.reference_sigma_mm == 0
     # Measured on 60 seeds: 0.11 mm with lines through a tenth of the sweep.
     assert np.sqrt(np.mean(np.square(gaps))) < 0.15
     # The claim is of jitter alone; an uneven hand bends the lines a little more.
