@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 from crossing_tissue import GRID, PairCase, tissue_pair
+from made_once import made_in
 from sweep_examples import frames_of
 
 from speckle3d.config import Config
@@ -31,7 +32,7 @@ from speckle3d.tracking import track
 
 TABLE = Path(__file__).parent / "accuracy" / "table.toml"
 SWEEPS_FOLDER = os.environ.get("SPECKLE3D_ACCURACY_SWEEPS")
-"""Folder that `simulate_set` has filled, for those who run the tests again and again."""
+"""Folder for the simulated sweeps, for those who run the tests again and again."""
 INDEPENDENT = Path(__file__).resolve().parents[2] / "shared" / "independent"
 SHORT_FRAMES = 28
 """Of 3.5 mm."""
@@ -57,30 +58,25 @@ class Errors:
         return abs(self.length_percent) / self.claim_percent
 
 
-def simulate_set(folder, data_folder):
-    """Write all sweeps that are simulated to `folder`: a minute."""
+SIMULATED = {
+    "tissue": {"preset": "tissue", "length_mm": 8.0, "seed": 4},
+    "tissue-0.15": {"preset": "tissue", "length_mm": 5.0, "seed": 11},
+    "tissue-0.7": {"preset": "tissue", "length_mm": 5.0, "seed": 21},
+    "reversal": {"preset": "reversal", "length_mm": 6.0, "seed": 22, "vectors": 40},
+    "rotation": {"preset": "rotation", "length_mm": 6.0, "seed": 6},
+}
+"""By file. A number behind the name is the attenuation, dB/cm/MHz."""
 
-    def write(name, attenuation=None, vectors=48, **settings):
-        sweep = simulate(SimulationSettings(vectors=vectors, **settings))[0].sweep
-        if attenuation is not None:
-            medium = replace(sweep.frames.medium, attenuation_db_cm_mhz=attenuation)
-            beam = tabulate_beam(sweep.frames.beam.probe, attenuation_db_cm_mhz=attenuation)
-            sweep = replace(sweep, frames=replace(sweep.frames, medium=medium, beam=beam))
-        write_sweep(folder / f"{name}.h5", sweep)
+
+def simulated(file):
+    """Simulate the sweep of a file."""
+    sweep = simulate(SimulationSettings(**{"vectors": 48, **SIMULATED[file]}))[0].sweep
+    if "-" not in file:
         return sweep
-
-    simulation = write("tissue", preset="tissue", length_mm=8.0, seed=4)
-    write("tissue-0.15", 0.15, preset="tissue", length_mm=5.0, seed=11)
-    write("tissue-0.7", 0.7, preset="tissue", length_mm=5.0, seed=21)
-    write("reversal", vectors=40, preset="reversal", length_mm=6.0, seed=22)
-    write("rotation", preset="rotation", length_mm=6.0, seed=6)
-    tissue = load_sweep(folder / "tissue.h5")
-    noise = replace(simulation.frames, medium=Nothing(), snr_db=20.0)
-    write_sweep(folder / "noise.h5", replace(tissue, frames=Sum(tissue.frames, noise)))
-    depth = np.arange(tissue.grid.samples) * tissue.grid.sample_spacing_mm
-    still = CLUTTER * np.exp(-depth / CLUTTER_MM) * load_sweep(data_folder / "phantom.h5").frames[0]
-    still = np.broadcast_to(np.rint(still).astype(np.int16), tissue.frames.shape)
-    write_sweep(folder / "clutter.h5", replace(tissue, frames=Sum(tissue.frames, still)))
+    attenuation = float(file.split("-")[1])
+    medium = replace(sweep.frames.medium, attenuation_db_cm_mhz=attenuation)
+    beam = tabulate_beam(sweep.frames.beam.probe, attenuation_db_cm_mhz=attenuation)
+    return replace(sweep, frames=replace(sweep.frames, medium=medium, beam=beam))
 
 
 class Nothing:
@@ -166,9 +162,17 @@ CASES = {
 }
 """File, what is done to its sweep, and curves. The crossing is `crossing_tissue`'s, of 24 mm."""
 
+SLOW_FILES = (*SIMULATED.keys() - {"tissue"}, "noise", "clutter")
+"""Simulated for slow tests alone, as are the crossing and images: their curves are of a turned phantom."""
+
+
+def is_slow(case):
+    """Whether a case is for the slow tests."""
+    return not CASES[case] or CASES[case][0] in SLOW_FILES or "grey" in CASES[case]
+
 
 class AccuracySet:
-    """The sweeps of a folder that `simulate_set` has filled, tracked when they are asked for.
+    """Sweeps that are simulated to a folder, unless they are in it, and tracked when they are asked for.
 
     With a seed each is first `rounded_otherwise`.
     """
@@ -180,14 +184,32 @@ class AccuracySet:
 
     def sweep(self, name):
         file, change = (*CASES[name], None)[:2]
-        folder = self.folder
         if name.startswith("independent"):
-            folder = INDEPENDENT
-        elif file == "phantom":
-            folder = self.data_folder
-        sweep = load_sweep(folder / f"{file}.h5")
+            sweep = load_sweep(INDEPENDENT / f"{file}.h5")
+        else:
+            sweep = self.load(file)
         sweep = sweep if self.seed is None else rounded_otherwise(sweep, self.seed)
         return sweep if change is None else change(sweep)
+
+    def load(self, file):
+        if file == "phantom":
+            return load_sweep(self.data_folder / "phantom.h5")
+        folder = made_in(
+            self.folder, file, lambda folder: write_sweep(folder / "sweep.h5", self._simulated(file))
+        )
+        return load_sweep(folder / "sweep.h5")
+
+    def _simulated(self, file):
+        if file in SIMULATED:
+            return simulated(file)
+        tissue = self.load("tissue")
+        if file == "noise":
+            frames = replace(simulated("tissue").frames, medium=Nothing(), snr_db=20.0)
+        else:
+            depth = np.arange(tissue.grid.samples) * tissue.grid.sample_spacing_mm
+            still = CLUTTER * np.exp(-depth / CLUTTER_MM) * self.load("phantom").frames[0]
+            frames = np.broadcast_to(np.rint(still).astype(np.int16), tissue.frames.shape)
+        return replace(tissue, frames=Sum(tissue.frames, frames))
 
     def _curves(self, kind, name):
         if kind == "sheet":

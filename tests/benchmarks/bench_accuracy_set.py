@@ -20,7 +20,6 @@ from accuracy_set import (
     AccuracySet,
     Errors,
     read_table,
-    simulate_set,
 )
 
 RUNS = (None, 1, 2)
@@ -67,9 +66,7 @@ def main():
     before, lines, surprises = read_table() if TABLE.exists() else {}, [], []
     with tempfile.TemporaryDirectory() as scratch:
         folder = options.keep or Path(scratch) / "sweeps"
-        if not (folder.is_dir() or options.quick):
-            folder.mkdir(parents=True)
-            simulate_set(folder, bench.DATA)
+        folder.mkdir(parents=True, exist_ok=True)
         runs = [AccuracySet(folder, bench.DATA, seed) for seed in RUNS]
         for case in (case for case in CASES if options.cases in case):
             if case.startswith("independent") and not INDEPENDENT.is_dir():

@@ -192,7 +192,7 @@ def run_tests(name, selection, folder):
     environment = os.environ | {"PYTHONPATH": paths, VARIABLE: name, "SPECKLE3D_ACCURACY_SWEEPS": str(folder)}
     command = [
         sys.executable,
-        *["-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "mutants", "-x"],
+        *["-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "mutants", "-x", "-m", ""],
         *selection,
     ]
     process = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
@@ -210,11 +210,7 @@ def main():
     alive = []
     with tempfile.TemporaryDirectory() as scratch:
         folder = (options.keep or Path(scratch) / "sweeps").resolve()
-        if not folder.is_dir():
-            from accuracy_set import simulate_set
-
-            folder.mkdir(parents=True)
-            simulate_set(folder, ROOT / "data")
+        folder.mkdir(parents=True, exist_ok=True)
         for name in options.names or MUTANTS:
             code, output = run_tests("", MUTANTS[name].selection, folder)
             if code:
