@@ -105,7 +105,7 @@ def test_a_signal_in_a_finalizer_is_heard():
 
     def work():
         Finalizer()
-        time.sleep(5.0)
+        time.sleep(1.0)
 
     with stoppable() as heard, pytest.raises(ToldToStopError):
         work()

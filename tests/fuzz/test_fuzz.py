@@ -16,7 +16,7 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-CASES = 200
+CASES = 100
 MEMORY_BYTES, CASE_S = 2**31, 60
 """Room for the package and what it loads, and a hundred times what a case takes."""
 

@@ -10,6 +10,7 @@ from patch_kernels import patch_coherences, patch_correlations
 from speckle3d.kernels.statistics import correlation_variance
 from speckle3d.matching.patches import lay_patches
 
+pytestmark = pytest.mark.slow
 PATCHES = lay_patches(speckle.GRID)
 
 

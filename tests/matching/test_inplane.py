@@ -13,7 +13,7 @@ from speckle3d.matching.intensity import Echo, two_way_wavenumber
 from speckle3d.matching.matcher import FrameMatcher, ImageSettings
 
 GRID = speckle.GRID
-SPECTRA = [speckle.gaussian, speckle.triangle]
+SPECTRA = [speckle.gaussian, pytest.param(speckle.triangle, marks=pytest.mark.slow)]
 WAVENUMBER_PER_MM = two_way_wavenumber(speckle.RF)
 
 

@@ -57,6 +57,7 @@ def test_frames_of_one_moment_each_are_not_doubted(grey):
     assert structure_openness(matches.texture) == 0.0
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not INDEPENDENT.is_dir(), reason="no sweeps of another physics at hand")
 def test_an_even_hand_over_tissue_is_not_doubted():
     matches = matches_of(b_mode(load_sweep(INDEPENDENT / "tissue_reverse.h5")))

@@ -35,6 +35,7 @@ def texts(pair, tmp_path_factory):
     return folder / "estimate.tum", folder / "reference.tum"
 
 
+@pytest.mark.slow
 def test_pose_errors_are_evos(texts):
     metrics = pytest.importorskip("evo.core.metrics", reason="evo is not installed")
     files = pytest.importorskip("evo.tools.file_interface", reason="evo is not installed")

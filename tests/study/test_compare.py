@@ -75,6 +75,7 @@ def test_one_number_for_a_length_in_every_output(study):
         assert line.split()[4] == f"{1.96 * row['sigma_mm']:.2f}"
 
 
+@pytest.mark.slow
 def test_a_second_start_does_nothing_again_but_what_is_missing(study, sweeps, tmp_path):
     shutil.copytree(study.directory, tmp_path / "again")
     before = numbers(study.directory)

@@ -16,6 +16,9 @@ from speckle3d.study.images import GreyImages
 RATE_HZ = 50.0
 
 
+pytestmark = pytest.mark.slow
+
+
 @pytest.fixture(scope="module")
 def recording(back):
     """Tissue passed forward and back; the simulated images, not the sensor."""
@@ -42,7 +45,6 @@ def test_delay_of_simulated_tissue(recording, offset_s):
     assert delay.standard_error_s < 0.002
 
 
-@pytest.mark.slow
 def test_the_standard_error_knows_the_trackers_jitter(recording):
     exact = delay_from_images(recording_with(recording, 0.02), RigidTransform.identity(), 0.1)
     noisy = [

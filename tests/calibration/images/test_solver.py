@@ -6,6 +6,8 @@ from calibration.images.similarity import prepare
 from calibration.images.solver import calibrate_images
 from speckle3d.core.errors import InsufficientDataError
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def scene():
@@ -23,7 +25,7 @@ def calibration(scene, crossing):
     return calibrate_images(crossing, start)
 
 
-@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("seed", [0, 1])
 def test_far_starts_reach_the_truth(scene, crossing, calibration, seed):
     start = displace(scene[2], np.random.default_rng(seed))
     result = calibration if seed == 0 else calibrate_images(crossing, start)
@@ -47,7 +49,6 @@ def test_errors_are_within_what_the_covariance_says(scene, calibration):
     assert (spread < [0.15, 0.3, 0.15]).all()
 
 
-@pytest.mark.slow
 def test_sweeps_of_different_things(scene):
     with pytest.raises(InsufficientDataError):
         calibrate_images(prepare(scene[0], crossing_sweeps(1, frames=20)[1]), scene[2])
