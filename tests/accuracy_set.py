@@ -69,7 +69,6 @@ SIMULATED = {
 
 
 def simulated(file):
-    """Simulate the sweep of a file."""
     sweep = simulate(SimulationSettings(**{"vectors": 48, **SIMULATED[file]}))[0].sweep
     if "-" not in file:
         return sweep
@@ -167,7 +166,6 @@ SLOW_FILES = (*SIMULATED.keys() - {"tissue"}, "noise", "clutter")
 
 
 def is_slow(case):
-    """Whether a case is for the slow tests."""
     return not CASES[case] or CASES[case][0] in SLOW_FILES or "grey" in CASES[case]
 
 

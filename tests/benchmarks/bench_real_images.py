@@ -1,7 +1,7 @@
 """Length by what real images have: shadow, no contact, text, unknown compression, averages, moving tissue.
 
-Run: ``python tests/benchmarks/bench_real_images.py [--seeds 3] [--length-mm 6] [--signal rf|bmode]``, by a data
-sheet's curves or, with ``--curves phantom``, by those measured over a phantom.
+Run: ``python tests/benchmarks/bench_real_images.py [--seeds 3] [--length-mm 6] [--signal rf|bmode]``, by
+curves of a data sheet or, with ``--curves phantom``, of a phantom.
 """
 
 from dataclasses import dataclass, replace

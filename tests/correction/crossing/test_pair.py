@@ -13,6 +13,8 @@ from speckle3d.correction.crossing.pair import solve_crossing
 from speckle3d.correction.crossing.stack import ImageStack
 from speckle3d.correction.crossing.sweep import CrossingSweep
 
+pytestmark = pytest.mark.slow
+
 
 @cache
 def pair_of(**case):
@@ -27,7 +29,6 @@ def errors(poses, truth):
     return 100 * np.log(length[0] / length[1]), np.rad2deg((turns[1].inv() * turns[0]).as_rotvec())[0]
 
 
-@pytest.mark.slow
 def test_finds_lengths_that_were_a_fifth_wrong():
     pair = pair_of(seed=4)
     before = [errors(s.poses, t)[0] for s, t in zip((pair.first, pair.second), pair.truth, strict=True)]
@@ -46,7 +47,6 @@ def test_finds_lengths_that_were_a_fifth_wrong():
     assert np.linalg.norm(away.apply(GRID.centre_mm) - GRID.centre_mm) < 1.0
 
 
-@pytest.mark.slow
 def test_finds_which_sweep_went_the_other_way():
     pair = pair_of(seed=381, mirror=True)
     solution = solve_crossing(pair.first, pair.second)
@@ -54,7 +54,6 @@ def test_finds_which_sweep_went_the_other_way():
     assert abs(errors(solution.second.poses, pair.truth[1])[0]) < 2.0
 
 
-@pytest.mark.slow
 def test_a_sensor_tells_the_turns():
     pair = pair_of(seed=1, with_sensor=True)
     solution = solve_crossing(pair.first, pair.second)
@@ -65,14 +64,12 @@ def test_a_sensor_tells_the_turns():
         assert abs(tilt) < 0.6
 
 
-@pytest.mark.slow
 def test_refuses_other_tissue():
     first_pair, second_pair = pair_of(seed=4), pair_of(seed=1, with_sensor=True)
     with pytest.raises((MismatchError, InsufficientDataError)):
         solve_crossing(first_pair.first, replace(second_pair.second, orientation=None))
 
 
-@pytest.mark.slow
 def test_claims_for_tissue_that_moved_a_little():
     pair = pair_of(seed=200, moved_mm=0.3)
     solution = solve_crossing(pair.first, pair.second)
@@ -84,7 +81,6 @@ def test_claims_for_tissue_that_moved_a_little():
         assert abs(errors(side.poses, truth)[0]) < 2 * 100 * side.length_sigma
 
 
-@pytest.mark.slow
 def test_structure_that_slides_sideways_feigns_little_length_where_sweeps_cross_obliquely():
     pair = pair_of(seed=12, angle_deg=45.0)
     plain, other = (replace(side, sideways_per_mm=0.05) for side in (pair.first, pair.second))
@@ -105,7 +101,6 @@ REFUSED = {
 }
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("advice", REFUSED)
 def test_refuses_what_determines_no_length_and_says_what_to_do(advice):
     pair = pair_of(**REFUSED[advice])
