@@ -32,7 +32,7 @@ from speckle3d.tracking import track
 
 TABLE = Path(__file__).parent / "accuracy" / "table.toml"
 SWEEPS_FOLDER = os.environ.get("SPECKLE3D_ACCURACY_SWEEPS")
-"""Folder for the simulated sweeps, for those who run the tests again and again."""
+"""For the simulated sweeps, of those who test again and again."""
 INDEPENDENT = Path(__file__).resolve().parents[2] / "shared" / "independent"
 SHORT_FRAMES = 28
 """Of 3.5 mm."""
@@ -65,7 +65,7 @@ SIMULATED = {
     "reversal": {"preset": "reversal", "length_mm": 6.0, "seed": 22, "vectors": 40},
     "rotation": {"preset": "rotation", "length_mm": 6.0, "seed": 6},
 }
-"""By file. A number behind the name is the attenuation, dB/cm/MHz."""
+"""By file; a number is attenuation, dB/cm/MHz."""
 
 
 def simulated(file):
@@ -162,7 +162,7 @@ CASES = {
 """File, what is done to its sweep, and curves. The crossing is `crossing_tissue`'s, of 24 mm."""
 
 SLOW_FILES = (*SIMULATED.keys() - {"tissue"}, "noise", "clutter")
-"""Simulated for slow tests alone, as are the crossing and images: their curves are of a turned phantom."""
+"""Simulated for slow tests alone; so are curves of images."""
 
 
 def is_slow(case):

@@ -14,7 +14,7 @@ LEAST_PERCENT, LEAST_DEG = 0.3, 0.1
 
 TABLE = read_table()
 ROWS = [pytest.param(row, marks=[pytest.mark.slow] * is_slow(row.split(" | ")[0])) for row in TABLE]
-every_row = pytest.mark.parametrize("row", ROWS, scope="module")  # the tests of a row together
+every_row = pytest.mark.parametrize("row", ROWS, scope="module")
 
 
 @pytest.fixture(scope="session")

@@ -37,8 +37,8 @@ def texts(pair, tmp_path_factory):
 
 @pytest.mark.slow
 def test_pose_errors_are_evos(texts):
-    metrics = pytest.importorskip("evo.core.metrics", reason="evo is not installed")
-    files = pytest.importorskip("evo.tools.file_interface", reason="evo is not installed")
+    metrics = pytest.importorskip("evo.core.metrics")
+    files = pytest.importorskip("evo.tools.file_interface")
     estimate, true = (files.read_tum_trajectory_file(str(path)) for path in texts)
     estimate.align_origin(true)
     ours = compare_trajectories(load_estimate(texts[0]), load_reference(texts[1]))
