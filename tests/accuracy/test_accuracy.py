@@ -33,12 +33,8 @@ def errors(accuracy_set, row):
 
 
 @every_row
-def test_length_is_as_accurate_as_measured(row, errors):
+def test_length_and_tilt_are_as_accurate_as_measured(row, errors):
     assert abs(errors.length_percent) <= max(ROOM * abs(TABLE[row]["length_percent"]), LEAST_PERCENT)
-
-
-@every_row
-def test_tilt_is_as_accurate_as_measured(row, errors):
     assert abs(errors.tilt_deg) <= max(ROOM * abs(TABLE[row]["tilt_deg"]), LEAST_DEG)
 
 

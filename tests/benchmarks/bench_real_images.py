@@ -1,7 +1,6 @@
 """Length by what real images have: shadow, no contact, text, unknown compression, averages, moving tissue.
 
-Run: ``python tests/benchmarks/bench_real_images.py [--seeds 3] [--length-mm 6] [--signal rf|bmode]``, by
-curves of a data sheet or, with ``--curves phantom``, of a phantom.
+Run: ``python tests/benchmarks/bench_real_images.py [--seeds 3] [--length-mm 6] [--signal rf|bmode]``.
 """
 
 from dataclasses import dataclass, replace
@@ -16,8 +15,6 @@ from sweep_examples import frames_of
 from speckle3d.core.errors import Speckle3DError
 from speckle3d.core.sweep import Sweep
 from speckle3d.io.family.curves import read_curves
-from speckle3d.io.load import load_sweep
-from speckle3d.phantom_curves import calibrate_curves
 from speckle3d.sheet_curves import data_sheet_curves
 from speckle3d.simulation.presets import SimulationSettings, simulate
 from speckle3d.simulation.receiver import received
@@ -116,20 +113,17 @@ def main():
     parser.add_argument("--length-mm", type=float, default=6.0)
     parser.add_argument("--vectors", type=int, default=36)
     parser.add_argument("--signal", choices=("rf", "bmode"), default="rf")
-    parser.add_argument("--curves", choices=("sheet", "phantom"), default="sheet")
+    parser.add_argument("--curves", help="file; by default curves of a data sheet")
     options = bench.parse_options(parser, seeds=1, length_mm=1.5, vectors=20)
     size = {"length_mm": options.length_mm, "vectors": options.vectors, "samples": 2600}
-    rows, measured = {}, None
-    if options.curves == "phantom":
-        is_grey, phantom = options.signal == "bmode", load_sweep(bench.DATA / "phantom.h5")
-        measured = calibrate_curves([grey(phantom)]) if is_grey else read_curves(bench.DATA / "curves.h5")
+    rows, curves = {}, options.curves and read_curves(options.curves)
     for seed in range(options.first_seed, options.first_seed + options.seeds):
         sweep = simulate(SimulationSettings(preset="tissue", seed=seed, **size))[0].sweep
         centre = sweep.grid.centre_mm
         for name, case in cases(sweep, options.signal == "bmode").items():
             true = np.ptp((case.truth[0].inv() * case.truth).apply(centre)[:, 2])
             try:
-                tracking = track(replace(case, truth=None), measured or data_sheet_curves(SHEET, case))
+                tracking = track(replace(case, truth=None), curves or data_sheet_curves(SHEET, case))
             except Speckle3DError:
                 rows.setdefault(name, []).append((np.nan, np.nan, np.nan))
                 continue

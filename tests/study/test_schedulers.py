@@ -7,8 +7,9 @@ from cluster_jobs import double, failure_text, suicide
 
 from speckle3d.study.schedulers import scheduler_for
 
+pytestmark = pytest.mark.slow
 
-@pytest.mark.slow
+
 def test_a_job_that_kills_its_worker_stops_no_other():
     with scheduler_for(None, 2) as where:
         results = list(where.run(suicide, [0, 1, 2, 3], failure_text))
@@ -17,7 +18,6 @@ def test_a_job_that_kills_its_worker_stops_no_other():
     assert sorted(r for r in results if isinstance(r, int)) == [0, 2, 3]
 
 
-@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")
 def test_a_cluster_gives_the_same_results():
     dask = pytest.importorskip("distributed", reason="needs Dask (extra cluster)")

@@ -23,6 +23,7 @@ WIDEST = 2.0
 EVERY = 4
 """Samples are scored at 71 Hz: the RMS is the same to 0.001 degrees."""
 
+pytestmark = [pytest.mark.realdata, pytest.mark.slow]
 kinds = pytest.mark.parametrize("methods", [ONLINE, OFFLINE], ids=["on-line", "off-line"])
 
 
@@ -61,31 +62,24 @@ def ratios(folder, name, methods):
     return np.divide(own_values, vqf_values)
 
 
-@pytest.mark.realdata
 @kinds
 def test_beside_a_magnet_the_error_is_less_than_vqfs(folder, methods):
     # Measured 0.47 on line, 0.60 off line.
     assert (ratios(folder, "28_disturbed_stationary_magnet_A", methods) <= 0.8).all()
 
 
-@pytest.mark.realdata
-@pytest.mark.slow
 @kinds
 def test_mean_error_is_a_fifth_less_than_vqfs(folder, methods):
     vqf_values, own_values = (errors_of(folder, method).mean(axis=0) for method in methods)
     assert (own_values <= GAIN * vqf_values).all(), (own_values, vqf_values)
 
 
-@pytest.mark.realdata
-@pytest.mark.slow
 @kinds
 def test_no_trial_is_much_worse_than_with_vqf(folder, methods):
     by_trial = {name: ratios(folder, name, methods) for name in trials_in(folder)}
     assert {name: ratio.round(2).tolist() for name, ratio in by_trial.items() if ratio.max() > WORSE} == {}
 
 
-@pytest.mark.realdata
-@pytest.mark.slow
 @kinds
 @pytest.mark.parametrize("column", [0, 2], ids=["heading", "inclination"])
 def test_claimed_sigma_fits_the_errors(folder, methods, column):
