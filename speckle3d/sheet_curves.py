@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator
 
 from speckle3d.config import Config
 from speckle3d.core.arrays import FloatArray
@@ -67,6 +67,14 @@ class ProbeSheet(BaseModel):
     )
     attenuation_tolerance: float = Field(0.2, ge=0, le=2, description="Either way, dB/cm/MHz.")
     speed_of_sound_m_s: float = Field(SPEED_M_S, gt=300, le=4000)
+
+    @field_validator("elevation_focus_mm")
+    @classmethod
+    def _check_focus(cls, value: float, info: ValidationInfo) -> float:
+        height = info.data.get("elevation_aperture_mm", 0.0)
+        if value < height:
+            raise ValueError(f"expected a focus below the aperture's {height:g} mm: are the two exchanged?")
+        return value
 
     @field_validator("band_mhz")
     @classmethod

@@ -251,7 +251,7 @@ def _gravity_from_vertical(sensor: OrientationSensor, readings: Rotation) -> flo
         return float("nan")
     up = np.median(readings.apply(sensor.accelerometer_m_s2), axis=0)
     size = float(np.linalg.norm(up))
-    return float(np.degrees(np.arccos(min(1.0, abs(float(up[2])) / size)))) if size > 0 else float("nan")
+    return float(np.degrees(np.arccos(np.clip(up[2] / size, -1.0, 1.0)))) if size > 0 else float("nan")
 
 
 def _steps(poses: RigidTransform, targets: RigidTransform) -> FloatArray:

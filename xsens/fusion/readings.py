@@ -117,7 +117,7 @@ def usable_samples(log: ImuLog) -> tuple[IntArray, Samples, list[str], float]:
             f"{median_s:.4g} s: times in milliseconds?"
         )
     against, scale_error = contradictions(log)
-    fatal = ["gravity", "gyroscope", "accelerometer's axis", "accelerometer"]
+    fatal = ["accelerometer's axis", "gravity", "gyroscope", "accelerometer"]
     if against.get("accelerometer") != "":  # nor does it agree: either may be wrong
         fatal += ["own orientation", "magnetometer"]
     for name in fatal:
