@@ -27,10 +27,9 @@ _WINDOW_S = 0.25
 """Over 0.1 s a hand that rocks twice a second about a point 0.1 m away is accused by its acceleration; over
 0.5 s a wrong gyroscope carries a fast hand's readings so far apart that their mean tells little."""
 
-_MOVING_RAD_S, _VISIBLE, _ACROSS = 0.05, 0.25, 0.05
+_MOVING_RAD_S, _VISIBLE = 0.05, 0.25
 """Smallest RMS rate that is compared, three degrees per second, and share of the gyroscope's in all: errors
-of scale and axes make 3 to 5 % of the latter appear in any direction. What exceeds that with the wrong sign
-contradicts all the same."""
+of scale and axes make 3 to 5 % of the latter appear in any direction."""
 
 _ERRORS = 4.0
 """Standard errors, by the scatter of the windows, by which a share must be off."""
@@ -226,8 +225,7 @@ def _against_gyroscope(name: str, turns: _Turns) -> tuple[str | None, float]:
         scatter = (turn * (turns.missed - off * turn)).sum(axis=1)
         error, share = _ERRORS * np.sqrt((scatter**2).sum()) / square, 1.0 + off
         rate = _rms(turn) / _WINDOW_S
-        is_reversed = rate > _MOVING_RAD_S and (share + error) * rate < -_ACROSS * turns.rate_rad_s
-        if not is_reversed and rate * max(share, 1.0) < max(_MOVING_RAD_S, _VISIBLE * turns.rate_rad_s):
+        if rate * max(share, 1.0) < max(_MOVING_RAD_S, _VISIBLE * turns.rate_rad_s):
             continue
         if share + error < low or share - error > high:
             doubt = "are rate, axes and signs as they are told"
