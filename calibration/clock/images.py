@@ -24,6 +24,7 @@ from calibration.clock.offset import SEARCH_S, ClockOffset, SmoothReadings, cove
 from calibration.images.similarity import LEAST_OVERLAP, Comparison, spread_patches
 from calibration.images.stacks import read_stack
 from calibration.points import Recording
+from calibration.settings import ImageFit
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.images import spread_frames
@@ -60,6 +61,7 @@ def delay_from_images(
     recording: Recording,
     sensor_from_image: RigidTransform,
     search_s: float = SEARCH_S,
+    tracker_mm: float = ImageFit().tracker_mm,
     progress: Progress | None = None,
 ) -> ClockOffset:
     """Find the delay at which images of either way correlate best with cuts of the other.
@@ -72,6 +74,8 @@ def delay_from_images(
         A rough one is enough.
     search_s : float
         Delays within it of the recording's own are tried.
+    tracker_mm : float
+        What the tracker, or tissue that moved, displaces one way against the other by.
 
     Raises
     ------
@@ -137,8 +141,8 @@ def delay_from_images(
         raise InsufficientDataError(
             f"expected correlations with a top, got none near the best delay, {delays[best]:+.3f} s: {doubts}"
         )
-    error = float(np.hypot(scatter, _from_jitter(steady, times - seconds, sensor_from_image, centre_mm)))
-    return ClockOffset(seconds, error, float(np.nanmean(fine, axis=1).max()))
+    unseen = _from_tracker(steady, times - seconds, sensor_from_image, centre_mm, tracker_mm)
+    return ClockOffset(seconds, float(np.hypot(scatter, unseen)), float(np.nanmean(fine, axis=1).max()))
 
 
 def _there_and_back(path: FloatArray) -> tuple[int, FloatArray]:
@@ -170,13 +174,17 @@ def _middle(share: FloatArray, number: int) -> IntArray:
     return inner[spread_frames(inner.size, number)]
 
 
-def _from_jitter(
-    steady: SmoothReadings, times_s: FloatArray, sensor_from_image: RigidTransform, centre_mm: FloatArray
+def _from_tracker(
+    steady: SmoothReadings,
+    times_s: FloatArray,
+    sensor_from_image: RigidTransform,
+    centre_mm: FloatArray,
+    tracker_mm: float,
 ) -> float:
-    """Standard error due to the tracker's jitter, which comparing images cannot show.
+    """Standard error due to the tracker, which comparing images cannot show.
 
-    Jitter puts both ways' mean positions off; the delay that makes up for it is their difference over twice
-    the speed.
+    Its jitter, and what it displaces one way against the other by, put both ways' mean positions off; the
+    delay that makes up for it is their difference over twice the speed.
     """
     read_s = steady.time_s
     during = (read_s >= times_s[0]) & (read_s <= times_s[-1])
@@ -186,7 +194,7 @@ def _from_jitter(
     )
     along = _direction(smooth)
     path = float(np.abs(np.diff(smooth @ along)).sum())
-    sigma = float(np.std((raw - smooth) @ along) / np.sqrt(during.sum()))
+    sigma = float(np.hypot(np.std((raw - smooth) @ along) / np.sqrt(during.sum()), tracker_mm / 2.0))
     return sigma * float(times_s[-1] - times_s[0]) / path if path > 0.0 else np.inf
 
 

@@ -40,15 +40,15 @@ def recording_with(recording, offset_s, jitter_mm=0.0, seed=0):
 # Two milliseconds is the target; the poses here are interpolated between frames 40 ms apart.
 @pytest.mark.parametrize("offset_s", [0.065, -0.03])
 def test_delay_of_simulated_tissue(recording, offset_s):
-    delay = delay_from_images(recording_with(recording, offset_s), RigidTransform.identity(), 0.15)
+    delay = delay_from_images(recording_with(recording, offset_s), RigidTransform.identity(), 0.15, 0.0)
     assert delay.seconds == pytest.approx(offset_s, abs=0.002)
     assert delay.standard_error_s < 0.002
 
 
 def test_the_standard_error_knows_the_trackers_jitter(recording):
-    exact = delay_from_images(recording_with(recording, 0.02), RigidTransform.identity(), 0.1)
+    exact = delay_from_images(recording_with(recording, 0.02), RigidTransform.identity(), 0.1, 0.0)
     noisy = [
-        delay_from_images(recording_with(recording, 0.02, 0.2, seed), RigidTransform.identity(), 0.1)
+        delay_from_images(recording_with(recording, 0.02, 0.2, seed), RigidTransform.identity(), 0.1, 0.0)
         for seed in (1, 2, 3)
     ]
     # 0.2 mm in 100 readings at 10 mm/s: 0.2 * 2 / 10 / 20 = 2 ms, less what counts for the bootstrap too.
