@@ -307,9 +307,9 @@ class Region:
             try:
                 kind, *words = part.split()
                 inside &= _shape_mask(places, kind, [list(map(float, word.split(","))) for word in words])
-            except ValueError as error:
+            except ValueError:
                 raise InvalidInputError(
-                    f"region: expected {REGION_HELP}, joined by ' and ', got {self.text!r}: {error}"
+                    f"region: expected {REGION_HELP}, joined by ' and ', got {self.text!r}"
                 ) from None
         return inside
 
@@ -335,11 +335,12 @@ def polygon_mask(places: FloatArray, corners: npt.ArrayLike, name: str = "polygo
     InvalidInputError
         If corners are too few.
     """
-    outline = np.round(np.asarray(corners, dtype=float), 6)
+    outline = np.round(np.array(corners, float), 6)
     if outline.shape[1:] != (2,) or len(outline) < 3:
         raise InvalidInputError(f"{name}: expected shape (k, 2) with k of 3 or more, got {outline.shape}")
-    measure = extra_module("skimage.measure", "calibrate", "a region")
-    inside = measure.points_in_poly(np.round(places.reshape(-1, 2), 6), outline)
+    inside = extra_module("skimage.measure", "calibrate", "a region").points_in_poly(
+        np.round(places.reshape(-1, 2), 6), outline
+    )
     return np.asarray(inside.reshape(places.shape[:2]))
 
 
@@ -348,7 +349,7 @@ def _shape_mask(places: FloatArray, kind: str, pairs: list[list[float]]) -> Bool
     if kind == "polygon":
         return polygon_mask(places, pairs)
     if kind == "rectangle":
-        (left, top), (right, bottom) = pairs
+        (left, top), (right, bottom) = np.sort(pairs, 0)
         grid = ImageGrid(2, 2, right - left, bottom - top, top, first_vector_mm=left)
     elif kind == "fan":
         (x, y), angles_deg, (nearest, farthest) = pairs
