@@ -44,6 +44,8 @@ of it are to stay below 5 mm and 5 degrees."""
 _LET_PASS = 2.0
 """Share of `LIMITS` that errors may reach, were residuals those of a phantom that fits, for a misfit
 to be the phantom's."""
+_SHARED = 2.0
+"""Errors over those of independent residuals above which most of them is what frames share."""
 _UNKNOWN, _UNKNOWN_RAD, _UNKNOWN_MM = 0.3, 1.0, 300.0
 """Standard deviations before anything is measured: of a pixel size as a share of it, of angles and places."""
 
@@ -64,8 +66,8 @@ UP_AND_DOWN = "move the probe up and down (the phantom then appears at other dep
 MOTIONS = (TILT, YAW, ROLL, SIDEWAYS, UP_AND_DOWN)
 
 DOUBTS = (
-    "do images and readings belong together (one clock, one order, right-handed, in mm), and are the "
-    "phantom, its wires and their numbers the ones named?"
+    "do images and readings belong together (one clock, one order, right-handed, in mm), did phantom and "
+    "sensor stay where they were, and are the phantom, its wires and their numbers the ones named?"
 )
 _WORDS = (
     "the distance between columns", "the distance between rows",
@@ -154,7 +156,8 @@ def judge(solution: Solution) -> Adequacy:
     no_size = not dots and UP_AND_DOWN in lacking and "s_x" in solution.free
     no_size &= solution.prior.known_pixel_mm is None
     inadequate = bool(excess > limit or not condition <= MAX_CONDITION or ambiguous or no_size)
-    noisy = rms > usual and not lacking
+    # Errors that frames share, as where phantom or sensor moved, no further motion of the probe mends.
+    noisy = not lacking and (rms > usual or bool((errors > _SHARED * white).any()))
     missing = tuple(lacking) if weak or inadequate else ()
     if (weak or inadequate) and not lacking:
         doubt = f"the images miss the phantom by {_size(rms, angular)} (RMS); {DOUBTS}"
