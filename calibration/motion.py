@@ -44,8 +44,6 @@ of it are to stay below 5 mm and 5 degrees."""
 _LET_PASS = 2.0
 """Share of `LIMITS` that errors may reach, were residuals those of a phantom that fits, for a misfit
 to be the phantom's."""
-_SHARED = 2.0
-"""Errors over those of independent residuals above which most of them is what frames share."""
 _UNKNOWN, _UNKNOWN_RAD, _UNKNOWN_MM = 0.3, 1.0, 300.0
 """Standard deviations before anything is measured: of a pixel size as a share of it, of angles and places."""
 
@@ -156,8 +154,7 @@ def judge(solution: Solution) -> Adequacy:
     no_size = not dots and UP_AND_DOWN in lacking and "s_x" in solution.free
     no_size &= solution.prior.known_pixel_mm is None
     inadequate = bool(excess > limit or not condition <= MAX_CONDITION or ambiguous or no_size)
-    # Errors that frames share, as where phantom or sensor moved, no further motion of the probe mends.
-    noisy = not lacking and (rms > usual or bool((errors > _SHARED * white).any()))
+    noisy = rms > usual and not lacking
     missing = tuple(lacking) if weak or inadequate else ()
     if (weak or inadequate) and not lacking:
         doubt = f"the images miss the phantom by {_size(rms, angular)} (RMS); {DOUBTS}"
