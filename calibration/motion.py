@@ -156,8 +156,8 @@ def judge(solution: Solution) -> Adequacy:
     inadequate = bool(excess > limit or not condition <= MAX_CONDITION or ambiguous or no_size)
     noisy = rms > usual and not lacking
     missing = tuple(lacking) if weak or inadequate else ()
+    doubt = f"the images miss the phantom by {_size(rms, angular)} (RMS); {DOUBTS}"
     if (weak or inadequate) and not lacking:
-        doubt = f"the images miss the phantom by {_size(rms, angular)} (RMS); {DOUBTS}"
         missing = (doubt if noisy else min(extent_of, key=extent_of.__getitem__),)
     state = f"standard error {_size(error, angular)}" + ("" if angular else " at the image's corners")
     if not angular and np.argmax(errors / LIMITS) == 1:
@@ -173,6 +173,7 @@ def judge(solution: Solution) -> Adequacy:
     if missing:
         deviations = np.sqrt(np.maximum(np.diag(independent), np.diag(solution.full_covariance)))
         verdict += f". Least certain is {least_certain(solution, deviations)}: {'; and '.join(missing)}"
+        verdict += "" if lacking or noisy else f". If you did, {doubt}"
     verdict += f"; {solution.assumed}" if solution.assumed else ""
     return Adequacy(error, missing, inadequate, verdict)
 
