@@ -41,6 +41,10 @@ def as_calibration(
         worst = float(np.abs(solution.residuals[solution.points.frame == number]).max())
         size = f"{np.rad2deg(worst):.1f} degrees" if angular else f"{worst:.1f} mm"
         reasons[int(number)] = f"contradicts the other frames by {size}"
+    unlike = [number for number, reason in reasons.items() if "the other frames" in reason]
+    numbers = np.union1d(solution.points.frames, unlike)
+    # A tenth: fewer frames may be of a probe that was lifted.
+    moved = np.isin(numbers[-(numbers.size // 10) :], unlike).mean() > 0.5
     chain, pose = solution.chain, IMAGE_POSE[:3] if angular else IMAGE_POSE
     return Calibration(
         method=method,
@@ -55,7 +59,8 @@ def as_calibration(
         condition_number=solution.condition_number,
         frames=FramesUsed(frames.given, tuple(solution.points_used.frames.tolist()), reasons),
         time_offset_s=time_offset_s,
-        verdict=solution.adequacy.verdict,
+        verdict=solution.adequacy.verdict
+        + "; most of the last frames contradict the others: did sensor or phantom move?" * bool(moved),
     )
 
 
