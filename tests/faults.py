@@ -111,6 +111,7 @@ FAULTS = {
         lambda rotations, rng: Rotation.from_quat(rotations.as_quat(scalar_first=False), scalar_first=True)
     ),
     "orientation inverted": _readings(lambda rotations, rng: rotations.inv()),
+    "orientation in a world upside down": _readings(lambda r, rng: Rotation.from_euler("x", np.pi) * r),
     "orientation mirrored": _quaternions([1.0, -1.0, -1.0, 1.0]),
     "orientation x of the other sign": _quaternions([1.0, -1.0, 1.0, 1.0]),
     "orientation random": _readings(lambda rotations, rng: Rotation.random(len(rotations), rng=rng)),

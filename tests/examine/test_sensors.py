@@ -22,6 +22,7 @@ AGAINST_THEMSELVES = {
     "tracker random": "scrambled",
     "orientation stored xyzw": "xyzw",
     "orientation inverted": "inverted",
+    "orientation in a world upside down": "not vertical",
     "orientation mirrored": "handedness",
     "orientation x of the other sign": "axes",
     "orientation random": "scrambled",

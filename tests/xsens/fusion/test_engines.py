@@ -105,8 +105,9 @@ def test_readings_in_other_units_raise():
     _, log = swing(5.0)
     with pytest.raises(InvalidInputError, match=r"10 s.*milliseconds"):
         orient(replace(log, time_s=1e3 * log.time_s))
-    with pytest.raises(InvalidInputError, match="m/s"):
-        orient(replace(log, accelerometer_m_s2=log.accelerometer_m_s2 / 9.81))
+    for factor in (9.81, 2.0):
+        with pytest.raises(InvalidInputError, match="m/s"):
+            orient(replace(log, accelerometer_m_s2=log.accelerometer_m_s2 / factor))
 
 
 def test_a_knock_does_not_tilt_it():
