@@ -16,7 +16,7 @@ def made_in(root, name, make):
     with open(root / f"{name}.lock", "w", encoding="utf-8") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         if not marker.exists():
-            folder.mkdir()
+            folder.mkdir(exist_ok=True)
             make(folder)
             marker.touch()
     return folder

@@ -17,7 +17,7 @@ from xsens.logs.samples import ImuLog, finite_rows, median, median_norm, row_nor
 
 FORCE_M_S2 = (8.0, 12.5)
 """Limits of the median of the accelerometer's norm if it is in m/s^2 and of the right range: BROAD's trials
-have 9.82 to 9.95, two MT9 of ten years 9.0 and 9.4."""
+have 9.82 to 9.95, two sensors out of calibration 9.0 and 9.4."""
 
 FASTEST_RAD_S = 60.0
 """The widest range of the sensors' gyroscopes ends at 35 rad/s about an axis, and a hand's ordinary movement

@@ -156,6 +156,7 @@ def clock(
     from calibration.clock.images import delay_from_images
     from calibration.clock.line import delay_from_lines, line_signal
     from calibration.detection.lines import detect_lines
+    from calibration.settings import ImageFit
     from speckle3d.calibrating.recordings import open_recording
     from speckle3d.examine.sensors import spikes
 
@@ -188,7 +189,8 @@ def clock(
         frames = len(recording.frame_time_s)
         words = (
             f"images of the way forward correlate by {delay.followed:.2f} with those of the way back\n"
-            "in the error: 0.15 mm by which tracker or tissue may differ between them; faster, it counts less"
+            f"in the error: {ImageFit().tracker_mm:g} mm by which tracker or tissue may differ between them; "
+            "faster, it counts less"
         )
     else:
         times, columns = recording.frame_time_s, recording.images.shape[1]
