@@ -6,8 +6,8 @@ from pathlib import Path
 from calibration.points import Recording
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.streams import TimedPoses, TimedRotations
-from speckle3d.core.sweep import BModeSettings, Sweep
-from speckle3d.imaging.voxels.settings import Levels
+from speckle3d.core.sweep import BModeSettings, OrientationSensor, Sweep
+from speckle3d.examine.sensors import doubts_of_gravity
 from speckle3d.io.import_settings import ImportSettings, MissingSettingsError
 from speckle3d.io.load import IMAGE, SIZED, kind_of, load_sweep
 from speckle3d.io.load import open_recording as open_sweep
@@ -50,8 +50,9 @@ def open_recording(
     pictures, grid = sweep.frames, sweep.grid
     is_grey = isinstance(sweep.signal, BModeSettings)
     if not is_grey or grid.fan is not None:
-        levels: Levels = "stored" if is_grey else "log"
-        grey = GreyImages(sweep, DYNAMIC_RANGE_DB, clipped=False, levels=levels, outside=outside)
+        grey = GreyImages(
+            sweep, DYNAMIC_RANGE_DB, clipped=False, levels="stored" if is_grey else "log", outside=outside
+        )
         pictures, grid = grey, grey.grid
     mounting = None if sweep.tracker is None else sweep.tracker.sensor_from_image
     return Recording(pictures, grid, sweep.frame_time_s, readings, offset_s, images.name, mounting)
@@ -59,8 +60,8 @@ def open_recording(
 
 def _load(path: Path, pixel_mm: tuple[float, float] | None, transform: str | None) -> Sweep:
     column, row = pixel_mm or (None, None)
-    sizes = {"column_pitch_mm": column, "row_spacing_mm": row}
-    options = validated(sizes | {"tracker_transform": transform}, "--pixel-mm", ImportSettings)
+    given = {"column_pitch_mm": column, "row_spacing_mm": row, "tracker_transform": transform}
+    options = validated(given, "--pixel-mm", ImportSettings)
     require_unsaid(path, options)
     try:
         return load_sweep(path, options.model_copy(update={"dynamic_range_db": DYNAMIC_RANGE_DB}))
@@ -93,6 +94,9 @@ def _readings(sweep: Sweep, path: Path, sensor: str) -> tuple[TimedPoses | Timed
         raise InsufficientDataError(
             f"{path}: expected readings of the {sensor} there or in --poses, got {content}"
         )
+    if isinstance(stream, OrientationSensor):
+        for doubt in doubts_of_gravity(stream):
+            warnings.warn(f"{path}: {doubt}", stacklevel=2)
     return stream.readings, stream.time_offset_s
 
 
@@ -103,11 +107,10 @@ def _readings_of(path: Path, sensor: str, transform: str | None) -> tuple[TimedP
     if (tracker := recording.tracker) is None:
         if recording.fault is not None and not recording.remarks:
             raise recording.fault
-        reason = "; ".join(recording.remarks) or "none"
-        raise InvalidInputError(f"{path}: expected poses, as ProbeToTrackerTransform, got {reason}")
+        reasons = "; ".join(recording.remarks) or "none"
+        raise InvalidInputError(f"{path}: expected poses, as ProbeToTrackerTransform, got {reasons}")
     for remark in recording.remarks:
         warnings.warn(f"{path}: {remark}", stacklevel=2)
-    readings: TimedPoses | TimedRotations = tracker.readings
-    if sensor == "orientation":
-        readings = TimedRotations(readings.time_s, tracker.readings.world_from_sensor.rotation)
-    return readings, tracker.time_offset_s
+    poses = tracker.readings
+    turns = TimedRotations(poses.time_s, poses.world_from_sensor.rotation)
+    return turns if sensor == "orientation" else poses, tracker.time_offset_s

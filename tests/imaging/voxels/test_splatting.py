@@ -47,7 +47,7 @@ def index_of(voxel_grid, poses, skew=0.0):
     return (points / voxel_grid.spacing_mm).reshape(len(poses), GRID.vectors, GRID.samples, 3)
 
 
-@settings(max_examples=40)
+@settings(max_examples=20)
 @given(
     seed=st.integers(0, 2**32 - 1),
     splat=st.sampled_from(SPLATS),
