@@ -11,6 +11,7 @@ from speckle3d.examine.sensors import doubts_of_gravity
 from speckle3d.io.import_settings import ImportSettings, MissingSettingsError
 from speckle3d.io.load import IMAGE, SIZED, kind_of, load_sweep
 from speckle3d.io.load import open_recording as open_sweep
+from speckle3d.io.pose_paths import without_jumps
 from speckle3d.io.toml import validated
 from speckle3d.study.images import GreyImages
 
@@ -54,14 +55,17 @@ def open_recording(
             sweep, DYNAMIC_RANGE_DB, clipped=False, levels="stored" if is_grey else "log", outside=outside
         )
         pictures, grid = grey, grey.grid
-    mounting = None if sweep.tracker is None else sweep.tracker.sensor_from_image
+    mounting = sweep.tracker.sensor_from_image if sweep.tracker else None
     return Recording(pictures, grid, sweep.frame_time_s, readings, offset_s, images.name, mounting)
 
 
 def _load(path: Path, pixel_mm: tuple[float, float] | None, transform: str | None) -> Sweep:
     column, row = pixel_mm or (None, None)
-    given = {"column_pitch_mm": column, "row_spacing_mm": row, "tracker_transform": transform}
-    options = validated(given, "--pixel-mm", ImportSettings)
+    options = validated(
+        {"column_pitch_mm": column, "row_spacing_mm": row, "tracker_transform": transform},
+        "--pixel-mm",
+        ImportSettings,
+    )
     require_unsaid(path, options)
     try:
         return load_sweep(path, options.model_copy(update={"dynamic_range_db": DYNAMIC_RANGE_DB}))
@@ -86,7 +90,7 @@ def require_unsaid(path: Path, options: ImportSettings) -> None:
 
 
 def _readings(sweep: Sweep, path: Path, sensor: str) -> tuple[TimedPoses | TimedRotations, float]:
-    stream = sweep.orientation if sensor == "orientation" else sweep.tracker
+    stream = getattr(sweep, sensor)
     if stream is None:
         content = "none (of a file of PLUS, --transform names others)"
         if sweep.tracker is not None:
@@ -109,8 +113,8 @@ def _readings_of(path: Path, sensor: str, transform: str | None) -> tuple[TimedP
             raise recording.fault
         reasons = "; ".join(recording.remarks) or "none"
         raise InvalidInputError(f"{path}: expected poses, as ProbeToTrackerTransform, got {reasons}")
-    for remark in recording.remarks:
+    poses, notes = without_jumps(tracker.readings)
+    for remark in (*recording.remarks, *notes):
         warnings.warn(f"{path}: {remark}", stacklevel=2)
-    poses = tracker.readings
     turns = TimedRotations(poses.time_s, poses.world_from_sensor.rotation)
     return turns if sensor == "orientation" else poses, tracker.time_offset_s

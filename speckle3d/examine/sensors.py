@@ -15,7 +15,6 @@ from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import DECISIVE, Doubt, MismatchError
 from speckle3d.core.geometry import nearest_rotation, rigid
 from speckle3d.core.leastsquares import MAD_TO_SIGMA, robust_sigma
-from speckle3d.core.streams import TimedPoses, TimedRotations
 from speckle3d.core.sweep import OrientationSensor, Sweep, Tracker
 
 REFUTED = 2.0
@@ -83,7 +82,7 @@ def repair_readings(sweep: Sweep) -> tuple[Sweep, tuple[Doubt, ...]]:
         sensor = getattr(sweep, name)
         if sensor is None:
             continue
-        wild = spikes(sensor.readings)
+        wild = spikes(sensor)
         if wild.any():
             evidence = f"{int(wild.sum())} of {wild.size} readings jump away from those around them and back"
             where = frames_at(sensor, np.flatnonzero(wild), sweep.frame_time_s)
@@ -261,9 +260,9 @@ def _steps(poses: RigidTransform, targets: RigidTransform) -> FloatArray:
     return np.stack([(poses.rotation.inv() * targets.rotation).magnitude(), distance])
 
 
-def spikes(readings: TimedPoses | TimedRotations) -> BoolArray:
+def spikes(sensor: OrientationSensor | Tracker) -> BoolArray:
     """Mask of readings far off the median of those around them, shape (m,)."""
-    poses = rigid(readings.world_from_sensor)
+    poses = rigid(sensor.readings.world_from_sensor)
     place = median_filter(poses.translation, (SMOOTH, 1), mode="mirror")
     matrix = median_filter(poses.rotation.as_matrix(), (SMOOTH, 1, 1), mode="mirror")
     turn = Rotation.from_matrix(nearest_rotation(matrix))

@@ -130,7 +130,7 @@ def checked_path(sweep: Sweep, chain: str) -> tuple[Sweep, list[str]]:
     tracker = sweep.tracker
     if tracker is None:
         return sweep, []
-    readings, notes = _without_jumps(tracker.readings)
+    readings, notes = without_jumps(tracker.readings)
     times = sweep.frame_time_s - tracker.time_offset_s
     reach = readings.covers(times)
     between = np.count_nonzero(reach & ~np.isin(times, readings.time_s))
@@ -149,7 +149,7 @@ def checked_path(sweep: Sweep, chain: str) -> tuple[Sweep, list[str]]:
     return replace(sweep, tracker=replace(tracker, readings=readings)), notes
 
 
-def _without_jumps(readings: TimedPoses) -> tuple[TimedPoses, list[str]]:
+def without_jumps(readings: TimedPoses) -> tuple[TimedPoses, list[str]]:
     """Keep the largest part of a path in which a hand reaches each pose from the one before.
 
     Where that leaves out more than a fifth of what a tool in sight can have, poses are single placements and

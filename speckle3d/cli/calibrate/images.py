@@ -158,7 +158,6 @@ def clock(
     from calibration.detection.lines import detect_lines
     from calibration.settings import ImageFit
     from speckle3d.calibrating.recordings import open_recording
-    from speckle3d.examine.sensors import spikes
 
     if by == "images" and sensor != "tracker":
         raise InvalidInputError(f"--by images: expected --sensor tracker, which knows places, got {sensor}")
@@ -169,12 +168,6 @@ def clock(
         )
     outside = nan if by == "images" else 0.0
     recording = open_recording(images, scan.poses, scan.pixel_mm, sensor, scan.transform, outside)
-    readings: Any = recording.readings
-    if (far := spikes(readings)).any():
-        note(f"{far.sum()} of {far.size} readings far from those around them are left out")
-        poses = readings.world_from_sensor[~far]
-        readings = replace(readings, time_s=readings.time_s[~far], world_from_sensor=poses)
-        recording = replace(recording, readings=readings)
     if by == "images":
         if start is not None:
             offset_s = recording.time_offset_s if start.time_offset_s is None else start.time_offset_s
@@ -198,7 +191,7 @@ def clock(
             lines = detect_lines(recording.images, recording.pixel_mm, None, scan.corners, progress)
             frames = len(lines)
             signal = line_signal(lines.pixels, recording.pixel_mm, (columns - 1) / 2)
-            around_s = recording.time_offset_s
+            readings, around_s = recording.readings, recording.time_offset_s
             delay = delay_from_lines(signal, times[lines.frame], readings, around_s, search_s)
         words = f"the sensor explains {100 * delay.followed:.0f} % of the line's motion in {frames} frames"
     if start is not None and out is not None:
