@@ -108,7 +108,7 @@ def _readings_of(path: Path, sensor: str, transform: str | None) -> tuple[TimedP
     if kind_of(path) != IMAGE:
         return _readings(load_sweep(path), path, sensor)
     recording = open_sweep(path, ImportSettings(tracker_transform=transform))
-    if (tracker := recording.tracker) is None:
+    if not (tracker := recording.tracker):
         if recording.fault is not None and not recording.remarks:
             raise recording.fault
         reasons = "; ".join(recording.remarks) or "none"
